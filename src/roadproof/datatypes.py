@@ -1,0 +1,113 @@
+"""The nouns that pass between simulators, controllers and rollouts.
+
+Convention:
+    Right-handed world, metres, radians, z up; yaw 0 looks along x, y points left. `steer` is in [−1, 1] and
+    positive to the right. Images are RGB, (H, W, 3) uint8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+import numpy as np
+from jaxtyping import UInt8
+
+from roadproof.errors import SimulatorError
+
+
+class Command(IntEnum):
+    """What the route asks at the next junction, with CARLA's codes."""
+
+    FOLLOW = 2
+    LEFT = 3
+    RIGHT = 4
+    STRAIGHT = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """What a driver does to the car for one step.
+
+    Args:
+        steer: −1 (full left) to 1 (full right).
+        throttle: 0 to 1.
+        brake: 0 to 1.
+
+    Raises:
+        SimulatorError: a value is not finite. Values outside their range are the caller's to clip (`clipped`).
+    """
+
+    steer: float
+    throttle: float = 0.0
+    brake: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("steer", "throttle", "brake"):
+            if not math.isfinite(getattr(self, name)):
+                raise SimulatorError(
+                    f"control {name} is {getattr(self, name)}, expected a finite number; check the controller"
+                )
+
+    def clipped(self) -> Control:
+        """The same control with every value inside its range."""
+        return Control(
+            steer=min(max(self.steer, -1.0), 1.0),
+            throttle=min(max(self.throttle, 0.0), 1.0),
+            brake=min(max(self.brake, 0.0), 1.0),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """Where the car is (centre of its rear-to-front axis, on the ground) and how it moves, in the world frame."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_rad: float
+    speed_mps: float
+
+
+class EventKind(StrEnum):
+    """What can go wrong on a drive, in the words of the 2019 CARLA challenge."""
+
+    COLLISION_STATIC = "collision-static"
+    COLLISION_VEHICLE = "collision-vehicle"
+    COLLISION_PEDESTRIAN = "collision-pedestrian"
+    WRONG_LANE = "wrong-lane"
+    SIDEWALK = "sidewalk"
+    OFF_ROAD = "off-road"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One event of a drive: what, with whom or where (free text), and when."""
+
+    kind: EventKind
+    time_s: float
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What a simulator shows after a reset or a step.
+
+    Args:
+        frame: the controller's input, (H, W, 3) uint8 RGB.
+        state: the vehicle's state in the world.
+        command: what the route asks next.
+        time_s: seconds since the reset.
+        events: what happened since the last observation.
+        done: the goal is reached, or the time limit has passed.
+        picture: the full camera picture, where it was asked for.
+    """
+
+    frame: UInt8[np.ndarray, "h w 3"]
+    state: VehicleState
+    command: Command
+    time_s: float
+    events: tuple[Event, ...] = ()
+    done: bool = False
+    picture: UInt8[np.ndarray, "hc wc 3"] | None = None

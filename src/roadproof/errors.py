@@ -1,0 +1,44 @@
+"""What can go wrong, each as one clear line: which value, what was expected, what to do.
+
+The command line prints the message of a `RoadproofError` and ends with code 2; it never shows a traceback for one.
+"""
+
+
+class RoadproofError(Exception):
+    """Anything roadproof refuses to do; its message is one line meant for the user."""
+
+
+class GeometryError(RoadproofError, ValueError):
+    """Points, poses or homographies that do not describe a view of the canvas."""
+
+
+class ColourError(RoadproofError, ValueError):
+    """Colour samples or transforms that cannot be fitted or applied."""
+
+
+class PatternError(RoadproofError, ValueError):
+    """A pattern, its figures or their bounds are not valid."""
+
+
+class RecordingError(RoadproofError, ValueError):
+    """A recording on disk is incomplete, damaged or inconsistent."""
+
+
+class ControllerError(RoadproofError, ValueError):
+    """A controller cannot be loaded or does not do what attacks need of it."""
+
+
+class DeviceError(RoadproofError, RuntimeError):
+    """The device or precision asked for is not there."""
+
+
+class OutputError(RoadproofError, OSError):
+    """A result cannot be written where it was asked to go."""
+
+
+class SimulatorError(RoadproofError, RuntimeError):
+    """A simulator could not be started, was misused or stopped answering."""
+
+
+class ScenarioError(RoadproofError, ValueError):
+    """A scenario, its map or its route is not valid."""

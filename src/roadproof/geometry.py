@@ -1,0 +1,346 @@
+"""Where the canvas is in the picture: cameras, crop and resize, homographies.
+
+Convention:
+    World: right-handed, metres, z up; yaw 0 looks along x, y points left. Camera pictures and canvases: x right,
+    y down, pixel centres at integers, so that a picture of W columns spans [−0.5, W − 0.5]. A homography named
+    `b_from_a` maps column vectors (x, y, 1) of a to b; `image_from_canvas` has a positive third coordinate for what
+    is in front of the camera. Everything here is float64 numpy: calibration is data, never differentiated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+from roadproof.datatypes import VehicleState
+from roadproof.errors import GeometryError
+
+CANVAS_SIZE_PX = 400
+
+Points = Float[np.ndarray, "*n 2"]
+Homography = Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CameraModel:
+    """A pinhole camera without distortion, and where it sits on the car.
+
+    Args:
+        width_px: columns of the picture.
+        height_px: rows of the picture.
+        fov_deg: horizontal field of view, degrees, in (0, 180).
+        forward_m: metres ahead of the vehicle's origin.
+        left_m: metres to its left.
+        up_m: metres above the ground.
+        pitch_deg: positive looks up; CARLA's imitation agent looks down by −15.
+
+    Raises:
+        GeometryError: a size is not positive or the field of view is outside (0, 180).
+    """
+
+    width_px: int
+    height_px: int
+    fov_deg: float
+    forward_m: float = 0.0
+    left_m: float = 0.0
+    up_m: float = 1.4
+    pitch_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.width_px < 1 or self.height_px < 1:
+            raise GeometryError(f"camera picture is {self.width_px}×{self.height_px}, expected at least 1×1 pixels")
+        if not 0.0 < self.fov_deg < 180.0:
+            raise GeometryError(f"camera fov_deg is {self.fov_deg}, expected a value between 0 and 180")
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels, the same in x and y."""
+        return self.width_px / 2 / math.tan(math.radians(self.fov_deg) / 2)
+
+    @property
+    def intrinsics(self) -> Homography:
+        """Picture from camera axes (x right, y down, z forward), (3, 3)."""
+        f = self.focal_px
+        return np.array([[f, 0, (self.width_px - 1) / 2], [0, f, (self.height_px - 1) / 2], [0, 0, 1.0]])
+
+    def image_from_world(self, state: VehicleState) -> Float[np.ndarray, "3 4"]:
+        """Projection of homogeneous world points (X, Y, Z, 1), in metres; the third coordinate is the depth in metres.
+
+        Args:
+            state: the pose of the vehicle that carries the camera.
+        """
+        sy, cy = math.sin(state.yaw_rad), math.cos(state.yaw_rad)
+        sp, cp = math.sin(math.radians(self.pitch_deg)), math.cos(math.radians(self.pitch_deg))
+        forward = np.array([cy, sy, 0.0])
+        left = np.array([-sy, cy, 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        camera_from_world = np.stack([-left, sp * forward - cp * up, cp * forward + sp * up])
+        ground = np.array([state.x_m, state.y_m, state.z_m])
+        centre = ground + self.forward_m * forward + self.left_m * left + self.up_m * up
+        return self.intrinsics @ np.column_stack([camera_from_world, -camera_from_world @ centre])
+
+
+Resampling = Literal["antialiased-bilinear", "area"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CropResize:
+    """How a controller's input is made from the camera picture: cut a box, then resize it.
+
+    Args:
+        left_px: first column kept.
+        top_px: first row kept.
+        right_px: one past the last column kept.
+        bottom_px: one past the last row kept.
+        width_px: columns of the input.
+        height_px: rows of the input.
+        resampling: "antialiased-bilinear" (Pillow's BILINEAR: a tent as wide as two input pixels) or "area" (a box as
+            wide as one).
+
+    Raises:
+        GeometryError: the box or the input is empty.
+    """
+
+    left_px: int
+    top_px: int
+    right_px: int
+    bottom_px: int
+    width_px: int
+    height_px: int
+    resampling: Resampling = "antialiased-bilinear"
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.left_px < self.right_px and 0 <= self.top_px < self.bottom_px):
+            box = (self.left_px, self.top_px, self.right_px, self.bottom_px)
+            raise GeometryError(f"crop box (left, top, right, bottom) is {box}, expected a box that is not empty")
+        if self.width_px < 1 or self.height_px < 1:
+            raise GeometryError(f"controller input is {self.width_px}×{self.height_px}, expected at least 1×1 pixels")
+
+    @property
+    def input_from_camera(self) -> Homography:
+        """The exact affine map of pixel centres from the camera picture to the controller's input."""
+        sx = self.width_px / (self.right_px - self.left_px)
+        sy = self.height_px / (self.bottom_px - self.top_px)
+        return np.array(
+            [
+                [sx, 0.0, sx * (0.5 - self.left_px) - 0.5],
+                [0.0, sy, sy * (0.5 - self.top_px) - 0.5],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+
+    def __call__(self, picture: UInt8[np.ndarray, "hc wc 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """The controller's input made from a camera picture.
+
+        Raises:
+            GeometryError: the picture is smaller than the crop box.
+        """
+        height, width = picture.shape[:2]
+        if height < self.bottom_px or width < self.right_px:
+            raise GeometryError(
+                f"camera picture is {width}×{height}, expected at least {self.right_px}×{self.bottom_px} for the crop"
+            )
+        box = (self.left_px, self.top_px, self.right_px, self.bottom_px)
+        method = Image.Resampling.BOX if self.resampling == "area" else Image.Resampling.BILINEAR
+        return np.asarray(Image.fromarray(picture).crop(box).resize((self.width_px, self.height_px), method))
+
+
+CIL_CAMERA = CameraModel(width_px=800, height_px=600, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
+"""The camera of CARLA's imitation-learning agent."""
+
+CIL_INPUT = CropResize(left_px=0, top_px=115, right_px=800, bottom_px=510, width_px=200, height_px=88)
+"""What that agent's network sees of it: rows 115…509, resized to 200×88."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CanvasPlacement:
+    """Where the canvas lies on the road.
+
+    Args:
+        x_m: world x of its centre.
+        y_m: world y of its centre.
+        z_m: height of the road there.
+        yaw_rad: direction of travel, towards the canvas' far edge (y = 0).
+        width_m: extent across the road.
+        length_m: extent along the road.
+
+    Raises:
+        GeometryError: an extent is not positive.
+    """
+
+    x_m: float
+    y_m: float
+    z_m: float = 0.0
+    yaw_rad: float = 0.0
+    width_m: float = 7.6
+    length_m: float = 9.5
+
+    def __post_init__(self) -> None:
+        if not (self.width_m > 0 and self.length_m > 0):
+            raise GeometryError(f"canvas is {self.width_m} m × {self.length_m} m, expected both extents above 0")
+
+    @property
+    def world_from_canvas(self) -> Float[np.ndarray, "4 3"]:
+        """Homogeneous world points (X, Y, Z, 1) from canvas pixels (x, y, 1)."""
+        forward = np.array([math.cos(self.yaw_rad), math.sin(self.yaw_rad), 0.0, 0.0])
+        right = np.array([forward[1], -forward[0], 0.0, 0.0])
+        per_x = right * (self.width_m / CANVAS_SIZE_PX)
+        per_y = -forward * (self.length_m / CANVAS_SIZE_PX)
+        centre = np.array([self.x_m, self.y_m, self.z_m, 1.0])
+        return np.column_stack([per_x, per_y, centre - (CANVAS_SIZE_PX - 1) / 2 * (per_x + per_y)])
+
+
+def homography_from_pose(camera: CameraModel, state: VehicleState, canvas: CanvasPlacement) -> Homography:
+    """`image_from_canvas` for a known camera, vehicle pose and canvas; its third coordinate is the depth in metres."""
+    return camera.image_from_world(state) @ canvas.world_from_canvas
+
+
+def apply_homography(b_from_a: Float[np.ndarray, "*b 3 3"], points: Float[np.ndarray, "*b n 2"]) -> Points:
+    """Map points of a to b. Points at infinity come out as inf or NaN, without a warning."""
+    mapped = points @ np.swapaxes(b_from_a[..., :2], -1, -2) + b_from_a[..., None, :, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return mapped[..., :2] / mapped[..., 2:]
+
+
+def homography_jacobian(b_from_a: Homography, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+    """Derivative of the mapped points: entry [n, i, j] is ∂b_i/∂a_j at point n."""
+    w = points @ b_from_a[2, :2] + b_from_a[2, 2]
+    mapped = apply_homography(b_from_a, points)
+    return (b_from_a[:2, :2] - mapped[:, :, None] * b_from_a[2, :2]) / w[:, None, None]
+
+
+def homography_from_points(
+    canvas: Float[np.ndarray, "n 2"],
+    image: Float[np.ndarray, "m 2"],
+    *,
+    outlier_px: float | None = None,
+    seed: int = 0,
+) -> Homography:
+    """`image_from_canvas` from corresponding points, by the normalised direct linear transform.
+
+    Args:
+        canvas: points on the canvas, px.
+        image: where they were seen, camera px; all of them in front of the camera.
+        outlier_px: where given, correspondences further than this from the best of 500 seeded four-point fits are
+            left out (RANSAC); otherwise all count, as in the paper.
+        seed: of the four-point draws.
+
+    Returns:
+        The homography, scaled to unit Frobenius norm, with a positive third coordinate at the points.
+
+    Raises:
+        GeometryError: fewer than four points, values that are not finite, points (nearly) on a line, points that lie
+            on both sides of the camera, or no four points that agree with a fourth of the rest.
+
+    References:
+        Hartley and Zisserman, Multiple View Geometry, algorithms 4.2 and 4.6; the paper's supplement, calibration.
+    """
+    if len(canvas) != len(image):
+        raise GeometryError(f"{len(canvas)} canvas points but {len(image)} image points, expected as many of both")
+    if len(canvas) < 4:
+        raise GeometryError(f"{len(canvas)} correspondences, expected at least 4 to fit a homography")
+    if not (np.isfinite(canvas).all() and np.isfinite(image).all()):
+        raise GeometryError("a correspondence is NaN or infinite; drop points that were not detected before the fit")
+    if outlier_px is not None:
+        keep = _ransac_inliers(canvas, image, outlier_px, np.random.default_rng(seed))
+        canvas, image = canvas[keep], image[keep]
+    fitted, well_posed = _direct_linear_transform(canvas[None], image[None])
+    if not well_posed[0]:
+        raise GeometryError(
+            f"the {len(canvas)} correspondences lie (nearly) on a line; spread them over the canvas in both directions"
+        )
+    homography = fitted[0]
+    depth = canvas @ homography[2, :2] + homography[2, 2]
+    if depth.mean() < 0:
+        homography, depth = -homography, -depth
+    if (depth <= 0).any():
+        raise GeometryError(
+            f"{int((depth <= 0).sum())} of {len(canvas)} points would lie behind the camera; "
+            "give visible points only, or reject outliers"
+        )
+    return homography
+
+
+def _direct_linear_transform(
+    canvas: Float[np.ndarray, "b n 2"], image: Float[np.ndarray, "b n 2"]
+) -> tuple[Float[np.ndarray, "b 3 3"], Bool[np.ndarray, " b"]]:
+    """Batched DLT of unknown sign, unit norm, and whether the points determined it."""
+    to_canvas, canvas_n = _normalised(canvas)
+    to_image, image_n = _normalised(image)
+    x, y = image_n[..., 0:1], image_n[..., 1:2]
+    one = np.concatenate([canvas_n, np.ones_like(x)], axis=-1)
+    zero = np.zeros_like(one)
+    rows = np.concatenate(
+        [np.concatenate([one, zero, -x * one], axis=-1), np.concatenate([zero, one, -y * one], axis=-1)], axis=-2
+    )
+    padded = rows if rows.shape[-2] >= 9 else np.concatenate([rows, np.zeros_like(rows[:, :1])], axis=-2)
+    _, spread, vt = np.linalg.svd(padded, full_matrices=False)
+    normalised = vt[:, -1].reshape(-1, 3, 3)
+    # A line of points leaves a second null vector or a map that squashes the plane onto a line.
+    shape = np.linalg.svd(normalised, compute_uv=False)
+    well_posed = (spread[:, 7] > 1e-6 * spread[:, 0]) & (shape[:, 2] > 1e-6 * shape[:, 0])
+    fitted = np.linalg.inv(to_image) @ normalised @ to_canvas
+    return fitted / np.linalg.norm(fitted, axis=(-2, -1), keepdims=True), well_posed
+
+
+def _normalised(points: Float[np.ndarray, "b n 2"]) -> tuple[Float[np.ndarray, "b 3 3"], Float[np.ndarray, "b n 2"]]:
+    """Hartley's normalisation: mean zero, mean distance √2; and the similarity that does it."""
+    centre = points.mean(axis=1)
+    distance = np.linalg.norm(points - centre[:, None], axis=-1).mean(axis=1)
+    scale = math.sqrt(2) / np.maximum(distance, 1e-12)
+    similarity = np.zeros((len(points), 3, 3))
+    similarity[:, 0, 0] = similarity[:, 1, 1] = scale
+    similarity[:, :2, 2] = -scale[:, None] * centre
+    similarity[:, 2, 2] = 1.0
+    return similarity, (points - centre[:, None]) * scale[:, None, None]
+
+
+def _ransac_inliers(
+    canvas: Float[np.ndarray, "n 2"], image: Float[np.ndarray, "n 2"], outlier_px: float, rng: np.random.Generator
+) -> Bool[np.ndarray, " n"]:
+    draws = rng.random((500, len(canvas))).argsort(axis=1)[:, :4]
+    fitted, well_posed = _direct_linear_transform(canvas[draws], image[draws])
+    every = np.broadcast_to(canvas, (len(fitted), *canvas.shape))
+    error = np.linalg.norm(apply_homography(fitted, every) - image, axis=-1)
+    inlier = (error < outlier_px) & well_posed[:, None]
+    best = inlier[inlier.sum(axis=1).argmax()]
+    if best.sum() < max(4, len(canvas) / 4):
+        raise GeometryError(
+            f"no homography agrees with more than {int(best.sum())} of {len(canvas)} correspondences "
+            f"within {outlier_px} px; check the detections"
+        )
+    return best
+
+
+def reprojection_errors_px(
+    image_from_canvas: Homography, canvas: Float[np.ndarray, "n 2"], image: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " n"]:
+    """Distance in camera px between where each canvas point is seen and where the homography puts it."""
+    return np.linalg.norm(apply_homography(image_from_canvas, canvas) - image, axis=-1)
+
+
+def check_image_from_canvas(image_from_canvas: Homography) -> None:
+    """Refuse a matrix that cannot be the view of a canvas from above.
+
+    A road seen from above is never mirrored, so the determinant of a homography of the right sign is positive.
+
+    Raises:
+        GeometryError: values that are not finite, rank below three, or the wrong sign.
+    """
+    if not np.isfinite(image_from_canvas).all():
+        raise GeometryError("homography has NaN or infinite entries")
+    # Balanced first: pixels and the third row differ by orders of magnitude without any fault.
+    scaled = image_from_canvas / np.maximum(np.abs(image_from_canvas).max(axis=1, keepdims=True), 1e-300)
+    determinant = np.linalg.det(scaled / np.maximum(np.abs(scaled).max(axis=0, keepdims=True), 1e-300))
+    if abs(determinant) < 1e-9:
+        raise GeometryError("homography has rank below 3: the canvas would be seen as a line or a point")
+    if determinant < 0:
+        raise GeometryError(
+            "homography has the wrong sign (negative determinant): multiply it by −1 so that the third coordinate is "
+            "positive in front of the camera, and check that the canvas is not mirrored"
+        )

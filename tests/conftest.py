@@ -1,0 +1,37 @@
+"""What every test needs: shapes checked at run time, and the shared development data where it is at hand."""
+
+import os
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+# Before any test imports roadproof: every annotated shape and type is checked by beartype.
+install_import_hook("roadproof", "beartype.beartype")
+
+DATA = Path(os.environ.get("ROADPROOF_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def _shared(name: str) -> Path:
+    folder = DATA / name
+    if not folder.is_dir():
+        pytest.skip(f"development data {name} is not at {folder}; set ROADPROOF_DATA to the folder that holds it")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def carla_data() -> Path:
+    """Real CARLA recordings of one left turn, with calibration."""
+    return _shared("carla-left-70-63")
+
+
+@pytest.fixture(scope="session")
+def pilotnet_data() -> Path:
+    """Weights and reference outputs of a PilotNet trained by others."""
+    return _shared("pilotnet-udacity")
+
+
+@pytest.fixture(scope="session")
+def opendrive_data() -> Path:
+    """CARLA's Town01 and Town02 as OpenDRIVE."""
+    return _shared("opendrive")

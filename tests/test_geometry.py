@@ -1,0 +1,173 @@
+"""Geometry against closed forms, hand-made cameras and the real CARLA homographies."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from roadproof.datatypes import VehicleState
+from roadproof.errors import GeometryError
+from roadproof.geometry import (
+    CIL_CAMERA,
+    CIL_INPUT,
+    CameraModel,
+    CanvasPlacement,
+    CropResize,
+    apply_homography,
+    check_image_from_canvas,
+    homography_from_points,
+    homography_from_pose,
+    homography_jacobian,
+    reprojection_errors_px,
+)
+
+ORIGIN = VehicleState(x_m=0.0, y_m=0.0, z_m=0.0, yaw_rad=0.0, speed_mps=0.0)
+CORNERS = np.array([[0.0, 0.0], [399.0, 0.0], [399.0, 399.0], [0.0, 399.0]])
+
+
+def ahead(distance_m: float = 12.0, **kwargs: float) -> np.ndarray:
+    return homography_from_pose(CIL_CAMERA, ORIGIN, CanvasPlacement(x_m=distance_m, y_m=0.0, **kwargs))
+
+
+def test_focal_length_is_that_of_carlas_agent():
+    assert CIL_CAMERA.focal_px == pytest.approx(335.64, abs=0.005)
+
+
+def test_a_point_on_the_optical_axis_is_in_the_middle_of_the_picture():
+    reach = CIL_CAMERA.up_m / math.tan(math.radians(15.0))
+    point = np.array([CIL_CAMERA.forward_m + reach, 0.0, 0.0, 1.0])
+    u, v, depth = CIL_CAMERA.image_from_world(ORIGIN) @ point
+    assert (u / depth, v / depth) == pytest.approx((399.5, 299.5))
+    assert depth == pytest.approx(math.hypot(reach, CIL_CAMERA.up_m))
+
+
+def test_left_in_the_world_is_left_in_the_picture_and_near_is_low():
+    far_left, far_right, near_right, near_left = apply_homography(ahead(), CORNERS)
+    assert far_left[0] < far_right[0]
+    assert near_left[0] < far_left[0]
+    assert near_right[1] > far_right[1]
+
+
+def test_the_view_does_not_change_when_car_and_canvas_move_together():
+    yaw = 0.7
+    state = VehicleState(x_m=5.0, y_m=-3.0, z_m=0.2, yaw_rad=yaw, speed_mps=0.0)
+    moved = CanvasPlacement(x_m=5 + 12 * math.cos(yaw), y_m=-3 + 12 * math.sin(yaw), z_m=0.2, yaw_rad=yaw)
+    np.testing.assert_allclose(homography_from_pose(CIL_CAMERA, state, moved), ahead(), atol=1e-9)
+
+
+def test_canvas_centre_is_at_its_placement():
+    world = CanvasPlacement(x_m=3.0, y_m=4.0, z_m=0.5, yaw_rad=1.0).world_from_canvas @ [199.5, 199.5, 1.0]
+    np.testing.assert_allclose(world, [3.0, 4.0, 0.5, 1.0])
+
+
+def test_input_pixel_centres_are_the_centres_of_their_footprints():
+    # Input pixel 0 covers camera columns 0…3, whose centre is 1.5; row 0 covers 395/88 rows from 114.5.
+    camera_from_input = np.linalg.inv(CIL_INPUT.input_from_camera)
+    u, v, _ = camera_from_input @ [0.0, 0.0, 1.0]
+    assert (u, v) == pytest.approx((1.5, 395 / 88 / 2 + 114.5))
+
+
+@pytest.mark.parametrize("resampling", ["antialiased-bilinear", "area"])
+def test_resizing_a_ramp_agrees_with_the_affine_map(resampling):
+    crop = CropResize(
+        left_px=20, top_px=40, right_px=220, bottom_px=216, width_px=50, height_px=44, resampling=resampling
+    )
+    ramp = np.broadcast_to(np.arange(256, dtype=np.uint8)[None, :, None], (256, 256, 3))
+    columns = crop(np.ascontiguousarray(ramp))[5, 1:-1, 0].astype(float)
+    camera_from_input = np.linalg.inv(crop.input_from_camera)
+    expected = camera_from_input[0, 0] * np.arange(1, 49) + camera_from_input[0, 2]
+    np.testing.assert_allclose(columns, expected, atol=0.51)
+
+
+def test_resizing_is_pillows_antialiased_bilinear():
+    picture = np.random.default_rng(0).integers(0, 256, (600, 800, 3), dtype=np.uint8)
+    expected = Image.fromarray(picture[115:510]).resize((200, 88), Image.Resampling.BILINEAR)
+    np.testing.assert_array_equal(CIL_INPUT(picture), np.asarray(expected))
+
+
+@given(st.integers(4, 60), st.integers(0, 10_000))
+@settings(max_examples=50, deadline=None, derandomize=True)
+def test_a_homography_is_recovered_from_exact_points(count, seed):
+    rng = np.random.default_rng(seed)
+    # The far half of the canvas is in front of the camera from every one of these poses.
+    truth = ahead(rng.uniform(11.0, 25.0))
+    canvas = np.concatenate([CORNERS, rng.uniform(0, 399, (count - 4, 2))])
+    fitted = homography_from_points(canvas, apply_homography(truth, canvas))
+    assert reprojection_errors_px(fitted, canvas, apply_homography(truth, canvas)).max() < 1e-6
+    np.testing.assert_allclose(fitted, truth / np.linalg.norm(truth), atol=1e-9)
+
+
+def test_outliers_are_left_out_when_asked():
+    rng = np.random.default_rng(1)
+    canvas = rng.uniform(0, 399, (60, 2))
+    image = apply_homography(ahead(), canvas) + rng.normal(0, 0.2, (60, 2))
+    clean = apply_homography(ahead(), canvas)
+    image[:12] += 80.0
+    assert reprojection_errors_px(homography_from_points(canvas, image), canvas, clean).max() > 5
+    fitted = homography_from_points(canvas, image, outlier_px=2.0, seed=3)
+    assert reprojection_errors_px(fitted, canvas, clean).max() < 0.6
+    np.testing.assert_array_equal(fitted, homography_from_points(canvas, image, outlier_px=2.0, seed=3))
+
+
+def test_the_jacobian_is_the_derivative():
+    points = np.random.default_rng(2).uniform(50, 350, (20, 2))
+    jacobian = homography_jacobian(ahead(), points)
+    for axis, step in enumerate(np.eye(2) * 1e-4):
+        slope = (apply_homography(ahead(), points + step) - apply_homography(ahead(), points - step)) / 2e-4
+        np.testing.assert_allclose(jacobian[:, :, axis], slope, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("canvas", "image", "message"),
+    [
+        (CORNERS[:3], CORNERS[:3], "at least 4"),
+        (CORNERS, CORNERS[:3], "as many"),
+        (np.linspace([0, 0], [399, 200], 10), np.linspace([100, 300], [400, 400], 10), "on a line"),
+        (CORNERS, np.where(CORNERS > 0, np.nan, 0.0), "NaN"),
+    ],
+)
+def test_degenerate_points_are_refused(canvas, image, message):
+    with pytest.raises(GeometryError, match=message):
+        homography_from_points(canvas, image)
+
+
+def test_points_behind_the_camera_are_refused():
+    under_the_car = homography_from_pose(CIL_CAMERA, ORIGIN, CanvasPlacement(x_m=1.0, y_m=0.0))
+    canvas = np.random.default_rng(0).uniform(0, 399, (30, 2))
+    with pytest.raises(GeometryError, match="behind the camera"):
+        homography_from_points(canvas, apply_homography(under_the_car, canvas))
+
+
+def test_homographies_of_wrong_sign_or_rank_are_refused():
+    check_image_from_canvas(ahead())
+    with pytest.raises(GeometryError, match="wrong sign"):
+        check_image_from_canvas(-ahead())
+    with pytest.raises(GeometryError, match="rank"):
+        check_image_from_canvas(np.outer([1.0, 2.0, 3.0], [0.1, 0.2, 1.0]))
+    with pytest.raises(GeometryError, match="NaN"):
+        check_image_from_canvas(np.full((3, 3), np.nan))
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"width_px": 0}, {"fov_deg": 180.0}, {"fov_deg": float("nan")}], ids=lambda kwargs: next(iter(kwargs))
+)
+def test_impossible_cameras_are_refused(kwargs):
+    with pytest.raises(GeometryError):
+        CameraModel(**({"width_px": 800, "height_px": 600, "fov_deg": 100.0} | kwargs))
+
+
+def test_a_picture_smaller_than_the_crop_is_refused():
+    with pytest.raises(GeometryError, match="at least 800×510"):
+        CIL_INPUT(np.zeros((100, 100, 3), np.uint8))
+
+
+def test_real_homographies_have_the_right_sign_and_look_at_the_road(carla_data):
+    for trajectory in ("t1", "t2", "t3"):
+        stored = np.load(carla_data / trajectory / "homographies.npz", allow_pickle=False)
+        for homography in stored["H"][stored["consistent"].astype(bool)]:
+            check_image_from_canvas(homography)
+            depth = homography[2] @ [199.5, 100.0, 1.0]
+            assert depth > 0
