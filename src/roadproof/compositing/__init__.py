@@ -1,0 +1,6 @@
+"""From a pattern to the frames a camera would have recorded with it on the road."""
+
+from roadproof.compositing.composite import Compositor as Compositor
+from roadproof.compositing.composite import composite as composite
+from roadproof.compositing.view import CanvasView as CanvasView
+from roadproof.compositing.view import view_canvas as view_canvas

@@ -1,0 +1,114 @@
+"""Painting a pattern into recorded frames, differentiably: the forward process of the paper (eq. composite).
+
+With the visibility V_k of figure k in a pixel (`patterns.visibilities`), the share s of the pixel that lies on the
+canvas, and the colour transform seen = gain ⊙ response(painted) + offset,
+
+    I(n; Φ) = (1 − s ∑_k V_k) I(n) + s ∑_k V_k (gain ⊙ r_k + offset)  =  I + A ⊙ ∑_k V_k r_k + B ∑_k V_k
+
+where A = s·gain and B = s·(offset − I) are fixed for every pixel. So only pixels inside the canvas' projection are
+computed, and a figure costs one multiply-add a pixel once its visibility is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.compositing.rectangles import PaintedRectangles
+from roadproof.compositing.view import CanvasView
+from roadproof.coverage import Shape
+from roadproof.patterns import Pattern, coverages, visibilities
+
+
+def composite(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b f 3 h w"]:
+    """The frames of a view with a pattern (or a batch of patterns) painted on the canvas.
+
+    Differentiable in the pattern's boxes and colours, exactly.
+
+    Args:
+        pattern: on the device and in the precision of the view.
+        view: frames and their view of the canvas.
+
+    Returns:
+        Frames in [0, 1]; the bare road is copied bit for bit.
+    """
+    batch = pattern.boxes.shape[:-2]
+    flat = Pattern(pattern.shapes, pattern.boxes.flatten(0, -3), pattern.colours.flatten(0, -3))
+    frames = Compositor([view], len(flat.boxes) if batch else 1)([flat])
+    return frames.view(*batch, *view.clean_frames.shape)
+
+
+class Compositor:
+    """Composites batches of patterns into several views at once, over and over, into one batch of frames.
+
+    The frames are kept between calls and only the canvas' pixels are written anew, so each call overwrites what the
+    last one returned: use a result, backward pass included, before asking for the next.
+
+    Args:
+        views: the sets of frames, all of one size.
+        copies: how many patterns are painted into each of them.
+        dtype: precision of the frames returned; the view's own by default.
+    """
+
+    def __init__(self, views: Sequence[CanvasView], copies: int, *, dtype: torch.dtype | None = None) -> None:
+        self._views = tuple(views)
+        self._copies = copies
+        self._frames = torch.cat([view.frames.to(dtype).repeat(copies, 1, 1, 1) for view in views])
+
+    def __call__(self, patterns: Sequence[Pattern]) -> Float[Tensor, "n 3 h w"]:
+        """The frames, view after view, pattern after pattern.
+
+        Args:
+            patterns: for each view a batch of `copies` patterns.
+        """
+        colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
+        return cast("Tensor", _Pasted.apply(self, *colours))
+
+    def slots(self, frames: Tensor) -> list[Float[Tensor, "c p 3"]]:
+        """For each view the flattened pixels of its share of a batch of frames, (copies, F·H·W, 3), as a view of it."""
+        counts = [self._copies * len(view.frames) for view in self._views]
+        parts = cast("tuple[Tensor, ...]", frames.split(counts))
+        return [part.reshape(self._copies, -1, 3) for part in parts]
+
+    def paste(self, colours: Sequence[Tensor]) -> Float[Tensor, "n 3 h w"]:
+        """Write the colours of the canvas' pixels, one (copies, P, 3) a view, into the frames."""
+        for slot, view, colour in zip(self.slots(self._frames), self._views, colours, strict=True):
+            slot.index_copy_(1, view.index, colour.to(slot.dtype))
+        return self._frames.permute(0, 3, 1, 2)
+
+    def pick(self, frames: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
+        """The canvas' pixels of a batch of frames: the transpose of `paste`."""
+        slots = self.slots(frames.permute(0, 2, 3, 1))
+        return [slot.index_select(1, view.index) for slot, view in zip(slots, self._views, strict=True)]
+
+
+class _Pasted(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, compositor: Compositor, *colours: Tensor) -> Tensor:  # noqa: ANN401
+        ctx.compositor = compositor
+        ctx.dtype = colours[0].dtype
+        return compositor.paste(colours)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        return (None, *(part.to(ctx.dtype) for part in ctx.compositor.pick(grad_outputs[0])))
+
+
+def canvas_colours(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b p 3"]:
+    """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
+    seen = view.colour.response(pattern.colours)
+    if any(shape is not Shape.RECTANGLE for shape in pattern.shapes):
+        return blend(visibilities(coverages(pattern, view.footprints)), seen, view)
+    batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
+    painted = PaintedRectangles.apply(pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3), view)
+    return cast("Tensor", painted).view(*batch, *view.clean.shape)
+
+
+def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasView) -> Tensor:
+    """Eq. composite on the canvas' pixels, (*b, P, 3), clipped to [0, 1], as plain tensor operations."""
+    share = visibility.sum(-2)[..., None]
+    return (view.clean + view.gain * (visibility.mT @ seen) + view.bias * share).clamp(0.0, 1.0)

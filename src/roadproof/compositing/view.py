@@ -1,0 +1,124 @@
+"""What a set of recorded frames shows of the canvas: everything that does not depend on the pattern."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from roadproof.coverage import Footprints, Shape, coverage
+from roadproof.errors import GeometryError
+from roadproof.geometry import CANVAS_SIZE_PX, CropResize
+from roadproof.photometry import ColourTransform, PixelMaps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CanvasView:
+    """Recorded frames and the P pixels of theirs through which the canvas shows.
+
+    Args:
+        frames: clean frames, (F, H, W, 3), in [0, 1].
+        index: where in the flattened frames those pixels are, (P,).
+        footprints: of those pixels on the canvas.
+        clean: their clean colours, (P, 3).
+        gain: A = s·gain, (P, 3), with s the share of the pixel that lies on the canvas.
+        bias: B = s·(offset − clean), (P, 3).
+        colour: painted → seen.
+    """
+
+    frames: Float[Tensor, "f h w 3"]
+    index: Int[Tensor, " p"]
+    footprints: Footprints
+    clean: Float[Tensor, "p 3"]
+    gain: Float[Tensor, "p 3"]
+    bias: Float[Tensor, "p 3"]
+    colour: ColourTransform
+
+    @property
+    def clean_frames(self) -> Float[Tensor, "f 3 h w"]:
+        """The frames as a controller takes them."""
+        return self.frames.permute(0, 3, 1, 2)
+
+
+def view_canvas(
+    frames: UInt8[np.ndarray, "f h w 3"],
+    image_from_canvas: Float[np.ndarray, "f 3 3"],
+    view: CropResize,
+    colour: ColourTransform,
+    *,
+    maps: PixelMaps | None = None,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> CanvasView:
+    """Prepare frames for compositing.
+
+    Args:
+        frames: clean frames at the controller's input.
+        image_from_canvas: one homography a frame, canvas px to camera px.
+        view: how the input was made from the camera picture.
+        colour: painted → seen.
+        maps: gain and offset of every pixel of the frames, in place of the smooth shading of `colour`.
+        device: where to composite.
+        dtype: precision of compositing; float64 for gradient checks.
+
+    Raises:
+        GeometryError: no frame shows the canvas.
+    """
+    index, centre, jacobian = canvas_pixels(image_from_canvas, view)
+    footprints = Footprints.of(centre, jacobian, view.resampling, device=device, dtype=dtype)
+    levels = torch.as_tensor(frames, device=device).to(dtype) / 255
+    place = torch.as_tensor(index, device=device)
+    clean = levels.reshape(-1, 3)[place]
+    if maps is None:
+        gain, offset = colour.gain_and_offset(torch.as_tensor(_camera_points(index, view)))
+    else:
+        gain, offset = (part.reshape(-1, 3)[torch.as_tensor(index)] for part in (maps.gain, maps.offset))
+    gain, offset = (part.to(device=device, dtype=dtype) for part in (gain, offset))
+    middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
+    whole = torch.tensor([middle, middle, size, size, 0.0], device=device, dtype=dtype)
+    share = coverage(Shape.RECTANGLE, whole, footprints)[:, None]
+    return CanvasView(levels, place, footprints, clean, share * gain, share * (offset - clean), colour)
+
+
+def canvas_pixels(
+    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
+) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p 2"], Float[np.ndarray, "p 2 2"]]:
+    """Pixels of the controller's input whose footprint touches the canvas, in front of the camera.
+
+    Args:
+        image_from_canvas: one homography a frame, canvas px to camera px.
+        view: how the input is made from the camera picture.
+
+    Returns:
+        Index into the flattened (F, H, W) pixels, canvas coordinates of their centres, and ∂canvas/∂pixel.
+
+    Raises:
+        GeometryError: no frame shows the canvas.
+    """
+    canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
+    columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
+    pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
+    mapped = np.swapaxes(canvas_from_input @ pixels, 1, 2)
+    # The inverse keeps the sign: its third coordinate, too, is positive in front of the camera.
+    frame, pixel = np.nonzero(mapped[..., 2] > 0)
+    w = mapped[frame, pixel, 2:]
+    centre = mapped[frame, pixel, :2] / w
+    inverse = canvas_from_input[frame]
+    jacobian = (inverse[:, :2, :2] - centre[:, :, None] * inverse[:, 2:, :2]) / w[:, :, None]
+    # The widest filter reaches one pixel to every side; the canvas spans [−0.5, size − 0.5].
+    reach = np.abs(jacobian).sum(-1)
+    touches = ((centre > -0.5 - reach) & (centre < CANVAS_SIZE_PX - 0.5 + reach)).all(-1)
+    if not touches.any():
+        raise GeometryError("no frame shows the canvas; check the homographies, or record nearer to it")
+    index = frame[touches] * (view.height_px * view.width_px) + pixel[touches]
+    return index, centre[touches], jacobian[touches]
+
+
+def _camera_points(index: Int[np.ndarray, " p"], view: CropResize) -> Float[np.ndarray, "p 2"]:
+    """Camera coordinates of the pixels at an index into flattened frames."""
+    rows, columns = np.divmod(index % (view.height_px * view.width_px), view.width_px)
+    camera_from_input = np.linalg.inv(view.input_from_camera)
+    return np.stack([columns, rows], -1) * np.diag(camera_from_input)[:2] + camera_from_input[:2, 2]

@@ -1,0 +1,47 @@
+"""What an attack and a drive need of a controller."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from roadproof.datatypes import Control
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """A camera-driven controller: differentiable for attacks, and able to drive.
+
+    Any object with these three members is one; nothing has to be inherited. `check_controller` proves that it keeps
+    the promises below.
+
+    Convention:
+        Frames are RGB. `steer` is positive to the right. `command` holds CARLA's codes (`datatypes.Command`).
+    """
+
+    @property
+    def input_size(self) -> tuple[int, int] | None:
+        """(height, width) of the frames it takes, or None when it takes any size."""
+        ...
+
+    def steer(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, " b"]:
+        """Steering of each frame by itself, differentiable in the frames.
+
+        Args:
+            frames: RGB in [0, 1].
+            speed_mps: speed of the car at each frame.
+            command: what the route asks at each frame.
+
+        Returns:
+            Steering in about [−1, 1], not clipped, in the frames' dtype.
+        """
+        ...
+
+    def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
+        """What the car shall do now; every value of the control is inside its range."""
+        ...

@@ -1,0 +1,102 @@
+"""Networks that only steer, made into controllers: their frames prepared, their speed held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor, nn
+
+from roadproof.controllers.frames import FramePreparation, one_frame_batch
+from roadproof.datatypes import Control
+from roadproof.errors import ControllerError
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CruiseControl:
+    """Holds a speed: throttle, or brake, in proportion to how much is missing.
+
+    Args:
+        target_mps: the speed to hold; CARLA's agent takes its turns at 5.5 to 7.
+        gain_per_mps: throttle for each m/s missing.
+        hold: throttle at the target speed, against drag.
+
+    Raises:
+        ControllerError: a target that is not positive.
+    """
+
+    target_mps: float = 6.0
+    gain_per_mps: float = 0.25
+    hold: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not self.target_mps > 0:
+            raise ControllerError(f"target speed is {self.target_mps} m/s, expected a value above 0")
+
+    def control(self, steer: float, speed_mps: float) -> Control:
+        """The control that steers so and approaches the target speed."""
+        effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
+        return Control(steer=steer, throttle=max(effort, 0.0), brake=max(-effort, 0.0)).clipped()
+
+
+class SteeringController(nn.Module):
+    """A `Controller` around a network that answers with one steering value a frame.
+
+    Args:
+        network: takes the `inputs`, in order, and answers with shape (b,) or (b, 1).
+        preparation: how the network's frames are made from those of a recording.
+        inputs: what the network takes: "frames", and "speed_mps" and "command" if it wants them.
+        cruise: how the speed is held when driving.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        preparation: FramePreparation,
+        inputs: Sequence[str] = ("frames",),
+        cruise: CruiseControl | None = None,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.preparation = preparation
+        self.inputs = tuple(inputs)
+        self.cruise = cruise or CruiseControl()
+
+    @property
+    def input_size(self) -> tuple[int, int] | None:
+        """(height, width) of the frames it takes, or None when it takes any size."""
+        return self.preparation.frame_size
+
+    def steer(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, " b"]:
+        """Steering, positive to the right and not clipped; see `Controller.steer`.
+
+        Raises:
+            ControllerError: frames of the wrong size, or an answer that is not one value a frame.
+        """
+        tensors = chain(self.network.parameters(), self.network.buffers())
+        dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), frames.dtype)
+        values = {
+            "frames": self.preparation(frames).to(dtype),
+            "speed_mps": speed_mps.to(dtype),
+            "command": command.to(torch.int64),
+        }
+        answer: Tensor = self.network(*(values[name] for name in self.inputs))
+        if answer.shape not in ((len(frames),), (len(frames), 1)):
+            raise ControllerError(
+                f"network answers {len(frames)} frames with shape {tuple(answer.shape)}, "
+                "expected one steering value a frame"
+            )
+        return answer.reshape(-1).to(frames.dtype)
+
+    def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
+        """Steer by the network, hold the speed by `cruise`."""
+        with torch.no_grad():
+            steer = self.steer(*one_frame_batch(self, frame, speed_mps, command)).item()
+        return self.cruise.control(steer, speed_mps)

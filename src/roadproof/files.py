@@ -1,0 +1,64 @@
+"""Files that are never half written, and JSON that says what it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+from roadproof.errors import OutputError, RoadproofError
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file beside `path`, then move it into place.
+
+    Raises:
+        OutputError: the folder cannot be made or written, or the disk is full; nothing is left behind.
+    """
+    part: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+        os.close(handle)
+        part = Path(name)
+        write(part)
+        part.chmod(0o644)
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {path}: {error.strerror or error}; choose a folder that can be written"
+        ) from None
+    finally:
+        if part is not None:
+            part.unlink(missing_ok=True)
+
+
+def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:
+    """Read a JSON file that names its format and version.
+
+    Args:
+        path: the file.
+        file_format: what its "format" must be.
+        version: the newest "version" understood.
+        error: what to raise.
+
+    Raises:
+        error: the file is missing, is not JSON, or is of another format or a newer version.
+    """
+    try:
+        content: Any = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as reason:
+        raise error(f"cannot read {path}: {reason.strerror or reason}") from None
+    except ValueError as reason:
+        raise error(f"{path} is not valid JSON ({reason})") from None
+    if not isinstance(content, dict):
+        raise error(f"{path} holds no JSON object, expected a {file_format} file")
+    fields = cast("dict[str, Any]", content)
+    if fields.get("format") != file_format:
+        raise error(f"{path} has format {fields.get('format')!r}, expected {file_format!r}")
+    if not isinstance(fields.get("version"), int) or fields["version"] > version:
+        raise error(f"{path} has version {fields.get('version')!r}, this roadproof reads up to {version}; update it")
+    return fields

@@ -1,0 +1,215 @@
+"""Painted patterns: ordered figures on the canvas, the published parameters, rasters, files.
+
+Convention:
+    Canvas px, x right, y down, y = 0 the far edge. A figure is a shape in a box: centre x, centre y, width, length,
+    rotation in degrees, clockwise on the picture. The last figure is painted on top. Colours are RGB in [0, 1], the
+    paint's own, before any camera has seen it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from roadproof.coverage import Footprints, Shape, coverage
+from roadproof.errors import PatternError
+from roadproof.files import read_json, write_atomically
+from roadproof.geometry import CANVAS_SIZE_PX
+
+FORMAT = "roadproof-pattern"
+FORMAT_VERSION = 1
+
+_MIDDLE = CANVAS_SIZE_PX / 2
+_BOX_NAMES = ("x_px", "y_px", "width_px", "length_px", "rotation_deg")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pattern:
+    """K figures, painted in order; leading dimensions, where there are any, count patterns of the same shapes.
+
+    Args:
+        shapes: what each figure is, K of them.
+        boxes: centre x, centre y, width, length in canvas px, rotation in degrees clockwise, (*b, K, 5).
+        colours: RGB of the paint in [0, 1], (*b, K, 3).
+
+    Raises:
+        PatternError: no figure, unequal numbers of shapes, boxes and colours, or values that are not finite.
+    """
+
+    shapes: tuple[Shape, ...]
+    boxes: Float[Tensor, "*b k 5"]
+    colours: Float[Tensor, "*b k 3"]
+
+    def __post_init__(self) -> None:
+        counts = (len(self.shapes), self.boxes.shape[-2], self.colours.shape[-2])
+        if len(set(counts)) != 1 or counts[0] < 1:
+            raise PatternError(f"{counts[0]} shapes, {counts[1]} boxes, {counts[2]} colours; expected K ≥ 1 of each")
+
+    def __getitem__(self, index: int | tuple[int, ...]) -> Pattern:
+        """One pattern of a batch."""
+        return Pattern(self.shapes, self.boxes[index], self.colours[index])
+
+    @property
+    def painted_share(self) -> Float[Tensor, "*b"]:
+        """Sum of the figures' areas over the canvas' area: an upper bound of what is painted."""
+        fill = torch.tensor([_FILL[shape] for shape in self.shapes], device=self.boxes.device, dtype=self.boxes.dtype)
+        return (fill * self.boxes[..., 2] * self.boxes[..., 3]).sum(-1) / CANVAS_SIZE_PX**2
+
+
+_FILL = {Shape.RECTANGLE: 1.0, Shape.ELLIPSE: torch.pi / 4, Shape.TRIANGLE: 0.5, Shape.DIAMOND: 0.5}
+
+
+def boxes_from_published(
+    values: Float[Tensor, "*b k 4"], *, rotate_about: Literal["figure", "canvas"] = "figure"
+) -> Float[Tensor, "*b k 5"]:
+    """Boxes from the published rectangle parameters.
+
+    Args:
+        values: rotation (degrees, 0…180), position (px, 0…380), width (px, 0…100) and length (px, 0…70) as the
+            released code names them: the rectangle is 5 + width wide, its left edge is at position + 10, and it ends
+            5 + length short of both ends of the canvas.
+        rotate_about: "figure", its own centre, as the released code does; "canvas", the canvas' centre, as the
+            paper's text says.
+
+    References:
+        The paper's supplement, "Canvas"; shape_fly_simulator.py of the released code.
+    """
+    rotation_deg, position, inner_width, inset = values.unbind(-1)
+    width = 5 + inner_width
+    length = CANVAS_SIZE_PX - 2 * (5 + inset)
+    x = position + 10 + width / 2
+    y = torch.full_like(x, _MIDDLE)
+    if rotate_about == "canvas":
+        angle = torch.deg2rad(rotation_deg)
+        arm = x - _MIDDLE
+        x, y = _MIDDLE + arm * torch.cos(angle), _MIDDLE + arm * torch.sin(angle)
+    return torch.stack([x, y, width, length, rotation_deg], -1)
+
+
+def rectangles_from_published(
+    values: Sequence[Sequence[float]], *, rotate_about: Literal["figure", "canvas"] = "figure"
+) -> Pattern:
+    """A pattern from K rows of published parameters.
+
+    Args:
+        values: per rectangle rotation, position, width, length and, where it is not black, r, g, b in 0…255.
+        rotate_about: see `boxes_from_published`.
+
+    Raises:
+        PatternError: a row has neither 4 nor 7 values.
+    """
+    lengths = {len(row) for row in values}
+    if len(lengths) != 1 or not lengths <= {4, 7}:
+        raise PatternError(f"published rectangles have rows of {sorted(lengths)} values, expected 4 (black) or 7 each")
+    rows = torch.tensor(values, dtype=torch.float32)
+    colours = rows[:, 4:] / 255 if rows.shape[1] == 7 else torch.zeros(len(rows), 3)
+    boxes = boxes_from_published(rows[:, :4], rotate_about=rotate_about)
+    return Pattern((Shape.RECTANGLE,) * len(rows), boxes, colours)
+
+
+def coverages(pattern: Pattern, footprints: Footprints) -> Float[Tensor, "*b k p"]:
+    """The mask M of every figure at every footprint, in [0, 1]."""
+    if len(set(pattern.shapes)) == 1:
+        return coverage(pattern.shapes[0], pattern.boxes, footprints)
+    parts = [coverage(shape, pattern.boxes[..., k, :], footprints) for k, shape in enumerate(pattern.shapes)]
+    return torch.stack(parts, -2)
+
+
+def visibilities(masks: Float[Tensor, "*b k p"]) -> Float[Tensor, "*b k p"]:
+    """What of each figure is seen under those painted later: V_k = M_k ∏_{j>k} (1 − M_j).
+
+    A partition: together with the bare road, 1 − ∑ V = ∏ (1 − M), the shares sum to one also for fractional masks,
+    which the paper's recursion with V inside the product does not ensure. For binary masks both agree.
+    """
+    uncovered = torch.ones_like(masks[..., :1, :])
+    bare_above = torch.cumprod(torch.cat([uncovered, (1 - masks[..., 1:, :]).flip(-2)], -2), -2).flip(-2)
+    return masks * bare_above
+
+
+def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray, "s s 4"]:
+    """The pattern as an antialiased RGBA picture of the canvas (straight alpha).
+
+    Args:
+        pattern: one pattern, without batch dimensions.
+        size_px: rows and columns of the picture; the canvas has 400.
+
+    Raises:
+        PatternError: the pattern is a batch, or size_px is below 1.
+    """
+    if pattern.boxes.ndim != 2:
+        raise PatternError(f"raster takes one pattern, got a batch of shape {tuple(pattern.boxes.shape[:-2])}")
+    if size_px < 1:
+        raise PatternError(f"raster size is {size_px} px, expected at least 1")
+    scale = CANVAS_SIZE_PX / size_px
+    rows, columns = np.mgrid[0:size_px, 0:size_px]
+    centre = (np.stack([columns.ravel(), rows.ravel()], -1) + 0.5) * scale - 0.5
+    jacobian = np.broadcast_to(np.eye(2) * scale, (size_px**2, 2, 2))
+    footprints = Footprints.of(centre, jacobian, "area")
+    single = Pattern(pattern.shapes, pattern.boxes.detach().cpu().float(), pattern.colours.detach().cpu().float())
+    seen = visibilities(coverages(single, footprints))
+    alpha = seen.sum(0)
+    colour = (single.colours.mT @ seen) / alpha.clamp_min(1e-6)
+    rgba = torch.cat([colour, alpha[None]]).clamp(0, 1).mul(255).round().to(torch.uint8)
+    return rgba.T.reshape(size_px, size_px, 4).numpy()
+
+
+def save_pattern(pattern: Pattern, path: Path) -> None:
+    """Write `path` (JSON: every figure by name and unit) and, beside it, its raster as PNG.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    boxes = cast("list[list[float]]", pattern.boxes.tolist())
+    colours = cast("list[list[float]]", pattern.colours.tolist())
+    figures: list[dict[str, Any]] = [
+        {"shape": str(shape), **dict(zip(_BOX_NAMES, box, strict=True)), "rgb": rgb}
+        for shape, box, rgb in zip(pattern.shapes, boxes, colours, strict=True)
+    ]
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "canvas_px": CANVAS_SIZE_PX,
+        "figures": figures,
+    }
+    write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+    picture = Image.fromarray(raster(pattern))
+    write_atomically(path.with_suffix(".png"), lambda part: picture.save(part, format="PNG"))
+
+
+def load_pattern(path: Path) -> Pattern:
+    """Read a pattern written by `save_pattern`.
+
+    Raises:
+        PatternError: the file is missing, is not a pattern of this format, or a figure of it is not valid.
+    """
+    content = read_json(path, FORMAT, FORMAT_VERSION, PatternError)
+    figures = content.get("figures")
+    if not isinstance(figures, list) or not figures:
+        raise PatternError(f"{path}: 'figures' is missing or empty, expected at least one figure")
+    parsed = [_parse_figure(path, k, figure) for k, figure in enumerate(cast("list[Any]", figures))]
+    shapes, boxes, colours = zip(*parsed, strict=True)
+    return Pattern(tuple(shapes), torch.tensor(boxes), torch.tensor(colours))
+
+
+def _parse_figure(path: Path, k: int, figure: Any) -> tuple[Shape, list[float], list[float]]:  # noqa: ANN401
+    try:
+        shape = Shape(figure["shape"])
+        box = [float(figure[name]) for name in _BOX_NAMES]
+        rgb = [float(value) for value in figure["rgb"]]
+    except (KeyError, TypeError, ValueError) as error:
+        expected = ", ".join(("shape", *_BOX_NAMES, "rgb"))
+        raise PatternError(f"{path}: figure {k} is not valid ({error!r}); expected {expected}") from None
+    if len(rgb) != 3 or not np.isfinite([*box, *rgb]).all():
+        raise PatternError(f"{path}: figure {k} has values that are not finite, or rgb is not three numbers")
+    if min(rgb) < 0 or max(rgb) > 1 or box[2] <= 0 or box[3] <= 0:
+        raise PatternError(f"{path}: figure {k} needs rgb in [0, 1] and a width and length above 0")
+    return shape, box, rgb

@@ -1,0 +1,138 @@
+"""Where an attack looks: patterns as points of the unit cube, with their bounds.
+
+Every parameter is stored as a share of its range, in [0, 1], as the paper's authors do; one step of the optimiser then
+means the same in every direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.coverage import Shape
+from roadproof.errors import PatternError
+from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.patterns import Pattern, boxes_from_published
+
+Family = Literal["published", "published-canvas-centre", "free"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Parameter:
+    name: str
+    low: float
+    high: float
+    start_low: float  # random starts are uniform in [start_low, high]
+
+
+_PUBLISHED = (
+    _Parameter("rotation_deg", 0.0, 180.0, 20.0),
+    _Parameter("position_px", 0.0, 380.0, 0.0),
+    _Parameter("width_px", 0.0, 100.0, 20.0),
+    _Parameter("inset_px", 0.0, 70.0, 0.0),
+)
+_FREE = (
+    _Parameter("x_px", 0.0, float(CANVAS_SIZE_PX), 0.0),
+    _Parameter("y_px", 0.0, float(CANVAS_SIZE_PX), 0.0),
+    _Parameter("width_px", 5.0, 105.0, 25.0),
+    _Parameter("length_px", 20.0, 390.0, 20.0),
+    _Parameter("rotation_deg", 0.0, 180.0, 0.0),
+)
+_COLOUR_NAMES = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SearchSpace:
+    """All patterns of K figures that an attack may paint.
+
+    Args:
+        figures: K, how many figures.
+        family: "published", the paper's rectangles centred along the road, rotated about themselves as in the
+            released code (4 parameters); "published-canvas-centre", rotated about the canvas' centre as in the text;
+            "free", any centre on the canvas (5 parameters).
+        shape: what every figure is; the published families are rectangles.
+        colour: whether the paint's colour is searched (3 parameters more); otherwise all figures are black.
+        albedo: lowest and highest value of a colour channel; real paint is neither 0 nor 1.
+        max_painted_share: where given, widths shrink together until the figures' areas sum to at most this share of
+            the canvas.
+
+    Raises:
+        PatternError: a bound makes no sense.
+    """
+
+    figures: int
+    family: Family = "published"
+    shape: Shape = Shape.RECTANGLE
+    colour: bool = True
+    albedo: tuple[float, float] = (0.0, 1.0)
+    max_painted_share: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.figures < 1:
+            raise PatternError(f"number of figures is {self.figures}, expected 1 or more")
+        if self.family != "free" and self.shape is not Shape.RECTANGLE:
+            raise PatternError(f"the {self.family} family has rectangles only; use the free family for a {self.shape}")
+        if not 0.0 <= self.albedo[0] < self.albedo[1] <= 1.0:
+            raise PatternError(f"albedo is {self.albedo}, expected 0 ≤ lowest < highest ≤ 1")
+        if self.max_painted_share is not None and not 0.0 < self.max_painted_share <= 1.0:
+            raise PatternError(f"max_painted_share is {self.max_painted_share}, expected a value in (0, 1]")
+
+    @property
+    def _shape_parameters(self) -> tuple[_Parameter, ...]:
+        return _FREE if self.family == "free" else _PUBLISHED
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters of one figure, in order."""
+        return tuple(p.name for p in self._shape_parameters) + (_COLOUR_NAMES if self.colour else ())
+
+    @property
+    def shape_ranges(self) -> tuple[float, ...]:
+        """Highest minus lowest value of each shape parameter, in px or degrees."""
+        return tuple(p.high - p.low for p in self._shape_parameters)
+
+    def random(self, batch: tuple[int, ...], generator: torch.Generator) -> Float[Tensor, "*b k n"]:
+        """Points drawn as the authors draw their starts: uniform, but no slivers and (published) no rotation below 20°.
+
+        Drawn on the CPU, so that the same seed gives the same starts on every device.
+        """
+        unit = torch.rand(*batch, self.figures, len(self.names), generator=generator)
+        start_low = [(p.start_low - p.low) / (p.high - p.low) for p in self._shape_parameters]
+        low = torch.tensor(start_low + [0.0] * (len(self.names) - len(start_low)))
+        return low + (1 - low) * unit
+
+    def project(self, unit: Float[Tensor, "*b k n"]) -> Float[Tensor, "*b k n"]:
+        """The nearest point inside the bounds: clipped, but a free rotation wraps round (0° and 180° are the same)."""
+        clipped = unit.clamp(0.0, 1.0)
+        if self.family != "free" or self.shape is Shape.TRIANGLE:
+            return clipped
+        return torch.cat([clipped[..., :4], unit[..., 4:5] % 1.0, clipped[..., 5:]], -1)
+
+    def pattern(self, unit: Float[Tensor, "*b k n"]) -> Pattern:
+        """The pattern at a point, differentiable in it."""
+        parameters = self._shape_parameters
+        low = unit.new_tensor([p.low for p in parameters])
+        natural = low + unit[..., : len(parameters)] * unit.new_tensor(self.shape_ranges)
+        boxes = natural if self.family == "free" else self._published_boxes(natural)
+        if self.shape is Shape.TRIANGLE:
+            # A triangle looks the same only after a full turn.
+            boxes = torch.cat([boxes[..., :4], 2 * boxes[..., 4:]], -1)
+        darkest, brightest = self.albedo
+        shares = unit[..., len(parameters) :] if self.colour else torch.zeros_like(unit[..., :3])
+        pattern = Pattern((self.shape,) * self.figures, boxes, darkest + shares * (brightest - darkest))
+        return pattern if self.max_painted_share is None else _shrunk(pattern, self.max_painted_share)
+
+    def _published_boxes(self, natural: Float[Tensor, "*b k 4"]) -> Float[Tensor, "*b k 5"]:
+        rotate_about = "canvas" if self.family == "published-canvas-centre" else "figure"
+        return boxes_from_published(natural, rotate_about=rotate_about)
+
+
+def _shrunk(pattern: Pattern, max_painted_share: float) -> Pattern:
+    excess = (pattern.painted_share / max_painted_share).clamp_min(1.0)
+    x, y, width, length, rotation_deg = pattern.boxes.unbind(-1)
+    boxes = torch.stack([x, y, width / excess[..., None], length, rotation_deg], -1)
+    return Pattern(pattern.shapes, boxes, pattern.colours)
