@@ -1,7 +1,8 @@
 """Fitting a colour transform, and how far to trust it.
 
-A seen value at the end of the scale counts only where the model says it should be visible, so a saturated channel neither
-bends the fit nor is forgotten by it. The loss is pseudo-Huber: quadratic for small errors, linear for large ones.
+A seen value at the end of the scale counts only where the model says it should be visible, so a saturated channel
+neither bends the fit nor is forgotten by it. The loss is pseudo-Huber: quadratic for small errors,
+linear for large ones.
 """
 
 from __future__ import annotations
@@ -19,15 +20,19 @@ from roadproof.photometry.responses import (
     SATURATED,
     AffineResponse,
     FilmResponse,
-    FittedResponse,
     fit_affine,
     saturated,
 )
-from roadproof.photometry.samples import ColourSamples
+from roadproof.photometry.samples import ColourSamples, distinct
 from roadproof.photometry.transform import ColourTransform, RadialShading, squared_radius
 
 _LARGE = 8 / 255
 _ITERATIONS = 100
+_STEP = 1e-6
+# Logarithms of exposure, contrast and encoding, for pictures encoded twice and once.
+_FILM_STARTS = ((-1.5, -1.5, -1.5, 0.4, 0.0), (0.0, 0.0, 0.0, 0.3, 0.9))
+
+FittedKind = type[AffineResponse] | type[FilmResponse]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -68,7 +73,7 @@ class ColourFit:
 def fit_colour(
     samples: ColourSamples,
     *,
-    response: type[AffineResponse] | type[FilmResponse] | None = None,
+    response: FittedKind | None = None,
     shading: bool | None = None,
 ) -> ColourFit:
     """Fit painted → seen, choosing by cross-validation what is not said.
@@ -109,7 +114,7 @@ def _best(fits: list[ColourFit | ColourError]) -> ColourFit:
     return ColourFit(done[0].transform, done[0].report, tuple(fit.report for fit in done[1:]))
 
 
-def _fit(samples: ColourSamples, kind: type[FittedResponse], shade: bool) -> ColourFit | ColourError:
+def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | ColourError:
     try:
         transform = _solve(samples, kind, shade)
     except ColourError as error:
@@ -125,7 +130,7 @@ def _fit(samples: ColourSamples, kind: type[FittedResponse], shade: bool) -> Col
             left_out = None
             break
     shown = residual if left_out is None else left_out
-    colours, which = torch.unique(samples.painted, dim=0, return_inverse=True)
+    colours, which = distinct(samples.painted)
     by_colour = torch.zeros(len(colours), dtype=torch.float64).index_add(0, which, shown.mean(1)) / which.bincount()
     worst = int(by_colour.argmax())
     report = FitReport(
@@ -148,10 +153,11 @@ def _errors(transform: ColourTransform, samples: ColourSamples) -> Float[Tensor,
 
 
 def _triple(values: Tensor) -> tuple[float, float, float]:
-    return cast("tuple[float, float, float]", tuple(values.tolist()))
+    red, green, blue = cast("list[float]", values.tolist())
+    return red, green, blue
 
 
-def _solve(samples: ColourSamples, kind: type[FittedResponse], shade: bool) -> ColourTransform:
+def _solve(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourTransform:
     painted, seen = samples.painted.double(), samples.seen.double()
     if kind is AffineResponse:
         affine = fit_affine(painted, seen)
@@ -160,9 +166,9 @@ def _solve(samples: ColourSamples, kind: type[FittedResponse], shade: bool) -> C
         starts = [torch.cat([affine.matrix.reshape(-1), affine.offset])]
     else:
         _check_film(painted, seen)
-        starts = [torch.tensor(start, dtype=torch.float64) for start in kind.starts]
+        starts = [torch.tensor(start, dtype=torch.float64) for start in _FILM_STARTS]
     at = _shading_feature(samples) if shade else None
-    colours, which = torch.unique(painted, dim=0, return_inverse=True)
+    colours, which = distinct(painted)
     dark, bright = seen <= SATURATED, seen >= 1 - SATURATED
 
     def residuals(parameters: Tensor) -> Tensor:
@@ -185,12 +191,11 @@ def _solve(samples: ColourSamples, kind: type[FittedResponse], shade: bool) -> C
 
 
 def _check_film(painted: Tensor, seen: Tensor) -> None:
-    usable = int((~saturated(seen)).any(1).sum())
-    distinct = len(torch.unique(painted[(~saturated(seen)).any(1)], dim=0))
-    if distinct < 4 or bool(saturated(seen).all(0).any()):
+    usable = len(distinct(painted[(~saturated(seen)).any(1)])[0])
+    if usable < 4 or bool(saturated(seen).all(0).any()):
         raise ColourError(
-            f"{distinct} distinct painted colours in {usable} samples are seen unsaturated (some channel at neither 0 nor "
-            "255), expected at least 4, with every channel among them; paint more colours, or of middle brightness"
+            f"{usable} painted colours are seen unsaturated (a channel at neither 0 nor 255), expected at least 4, and "
+            "every channel among them; paint more colours, or colours of middle brightness"
         )
 
 
@@ -213,6 +218,12 @@ def _least_squares(residuals: Callable[[Tensor], Tensor], starts: list[Tensor]) 
     return best
 
 
+def _jacobian(residuals: Callable[[Tensor], Tensor], at: Tensor) -> Float[Tensor, "n p"]:
+    """By central differences: with a dozen parameters in double precision nothing is lost by it."""
+    steps = _STEP * torch.eye(len(at), dtype=at.dtype)
+    return torch.stack([(residuals(at + step) - residuals(at - step)) / (2 * _STEP) for step in steps], 1)
+
+
 def _descend(residuals: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, float]:
     def loss_of(value: Tensor) -> float:
         total = float(value @ value)
@@ -221,12 +232,12 @@ def _descend(residuals: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor,
     value = residuals(at)
     loss, damping = loss_of(value), 1e-2
     for _ in range(_ITERATIONS):
-        jacobian = cast("Tensor", torch.func.jacfwd(residuals)(at))
+        jacobian = _jacobian(residuals, at)
         normal, slope = jacobian.T @ jacobian, jacobian.T @ value
         scale = torch.diag(normal.diagonal() + 1e-9)
         better: Tensor | None = None
         while better is None and damping < 1e9:
-            moved = at - torch.linalg.solve(normal + damping * scale, slope)
+            moved = at - cast("Tensor", torch.linalg.solve(normal + damping * scale, slope))
             moved_value = residuals(moved)
             if loss_of(moved_value) < loss:
                 better = moved

@@ -9,7 +9,7 @@ Convention:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,22 +34,12 @@ _SOFT_CLIP = 1e-5
 _DARKEST = 1e-8
 
 
+@runtime_checkable
 class Response(Protocol):
     """Painted colour → flat seen colour, differentiable."""
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """The seen colour."""
-        ...
-
-
-class FittedResponse(Response, Protocol):
-    """A response made of a few numbers, all of which a fit may move."""
-
-    starts: ClassVar[tuple[tuple[float, ...], ...]]
-
-    @classmethod
-    def from_parameters(cls, parameters: Float[Tensor, " p"]) -> FittedResponse:
-        """The response of a flat vector of free parameters."""
         ...
 
 
@@ -67,8 +57,6 @@ class AffineResponse:
 
     matrix: Float[Tensor, "3 3"]
     offset: Float[Tensor, " 3"]
-
-    starts: ClassVar[tuple[tuple[float, ...], ...]] = ((0.7, 0.0, 0.0, 0.0, 0.7, 0.0, 0.0, 0.0, 0.7, 0.0, 0.0, 0.0),)
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """The seen colour."""
@@ -110,14 +98,11 @@ class FilmResponse:
     contrast: Float[Tensor, ""]
     encoding: Float[Tensor, ""]
 
-    # Logarithms of exposure, contrast, encoding; encoded twice and once.
-    starts: ClassVar[tuple[tuple[float, ...], ...]] = ((-1.5, -1.5, -1.5, 0.4, 0.0), (0.0, 0.0, 0.0, 0.3, 0.9))
-
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """The seen colour."""
         to_wide = torch.tensor(_AP1_FROM_SRGB, dtype=torch.float64)
         before = _saturation(_SATURATION_BEFORE) @ to_wide @ torch.diag(self.exposure.double())
-        after = torch.linalg.inv(to_wide) @ _saturation(_SATURATION_AFTER)
+        after = cast("Tensor", torch.linalg.inv(to_wide)) @ _saturation(_SATURATION_AFTER)
         contrast, encoding = self.contrast.to(painted), self.encoding.to(painted)
         light = (decode_srgb(painted) @ before.to(painted).mT).clamp_min(0.0) + _DARKEST
         curve = torch.sigmoid(contrast * light.log())
@@ -148,12 +133,12 @@ def fit_affine(
     for channel, name in enumerate(("red", "green", "blue")):
         value = seen[:, channel].double()
         usable = torch.ones_like(value, dtype=torch.bool) if keep_saturated else ~saturated(value)
-        if int(torch.linalg.matrix_rank(design[usable], rtol=1e-6)) < 4:
+        if int(cast("Tensor", torch.linalg.matrix_rank(design[usable], rtol=1e-6))) < 4:
             raise ColourError(
                 f"{int(usable.sum())} of {len(value)} seen {name} values are usable (not at 0 or 255) and they do not "
                 "determine an affine map; paint at least four colours that differ in every channel"
             )
-        rows.append(torch.linalg.lstsq(design[usable], value[usable]).solution)
+        rows.append(cast("Tensor", torch.linalg.lstsq(design[usable], value[usable]).solution))
     fitted = torch.stack(rows)
     return AffineResponse(fitted[:, :3].contiguous(), fitted[:, 3].contiguous())
 

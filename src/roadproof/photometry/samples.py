@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -44,7 +45,7 @@ class ColourSamples:
         for name, value in (("painted", self.painted), ("seen", self.seen)):
             if not bool(value.isfinite().all()):
                 raise ColourError(f"a {name} colour is NaN or infinite; drop colours that were not observed")
-            if count and not (0 <= float(value.min()) and float(value.max()) <= 1):
+            if count and not (float(value.min()) >= 0 and float(value.max()) <= 1):
                 raise ColourError(
                     f"{name} colours span {float(value.min()):g}…{float(value.max()):g}, expected 0…1; divide 8-bit "
                     "levels by 255"
@@ -61,7 +62,7 @@ class ColourSamples:
     def groups(self) -> Int[Tensor, " n"]:
         """The group of each sample, counted from 0."""
         key = self.painted if self.group is None else self.group[:, None]
-        return torch.unique(key, dim=0, return_inverse=True)[1]
+        return distinct(key)[1]
 
     def at(self, rows: Bool[Tensor, " n"]) -> ColourSamples:
         """Some of the samples."""
@@ -70,18 +71,23 @@ class ColourSamples:
         return ColourSamples(self.painted[rows], self.seen[rows], group, pixel, self.size_px)
 
 
+def distinct(rows: Float[Tensor, "n c"] | Int[Tensor, "n c"]) -> tuple[Tensor, Int[Tensor, " n"]]:
+    """The different rows, sorted, and which of them each row is."""
+    return cast("tuple[Tensor, Tensor]", torch.unique(rows, dim=0, return_inverse=True))
+
+
 def samples_from_pictures(
     painted: Float[Tensor, "n 3"],
-    pictures: UInt8[Tensor, "n h w 3"],
-    mask: Bool[Tensor, "h w"],
+    pictures: UInt8[Tensor, "m h w 3"],
+    mask: Bool[Tensor, "i j"],
     *,
-    group: Int[Tensor, " n"] | None = None,
+    group: Int[Tensor, " g"] | None = None,
     patch_px: int = 16,
 ) -> ColourSamples:
     """Samples from camera pictures of the canvas, each painted all over with one colour.
 
-    Pictures are averaged in square patches that lie wholly inside the mask: that takes out the renderer's dither and keeps
-    what is smooth.
+    Pictures are averaged in square patches that lie wholly inside the mask: that takes out the renderer's dither and
+    keeps what is smooth.
 
     Args:
         painted: the colour of each picture, in [0, 1].

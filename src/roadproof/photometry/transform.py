@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -25,8 +25,8 @@ Pair = tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]
 class RadialShading:
     """What a lens takes from the corners: gain 1 + g r² and offset o r², the same in every channel.
 
-    r is the distance from the middle of the camera picture in half widths. Two numbers, so that a fit to the part of the
-    picture where the canvas happened to lie holds in the rest of it.
+    r is the distance from the middle of the camera picture in half widths. Two numbers, so that a fit to the part of
+    the picture where the canvas happened to lie holds in the rest of it.
 
     Args:
         width_px: columns of the camera picture.
@@ -139,7 +139,7 @@ def _response_from_dict(fields: dict[str, Any]) -> Response:
 def _shading_from_dict(fields: dict[str, Any]) -> RadialShading:
     if fields["kind"] != "radial":
         raise ColourError(f"shading is of kind {fields['kind']!r}, expected 'radial'")
-    size = cast("list[int]", [int(fields[name]) for name in ("width_px", "height_px")])
+    size = [int(fields[name]) for name in ("width_px", "height_px")]
     gain, offset = float(_numbers(fields, "gain")), float(_numbers(fields, "offset"))
     if min(size) < 1 or not math.isfinite(gain + offset):
         raise ColourError(f"shading is for a {size[0]}×{size[1]} picture, expected at least 1×1 pixels")
