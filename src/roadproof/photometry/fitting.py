@@ -1,0 +1,253 @@
+"""Fitting a colour transform, and how far to trust it.
+
+A seen value at the end of the scale counts only where the model says it should be visible, so a saturated channel
+neither bends the fit nor is forgotten by it. The loss is pseudo-Huber: quadratic for small errors,
+linear for large ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.errors import ColourError
+from roadproof.photometry.responses import (
+    SATURATED,
+    AffineResponse,
+    FilmResponse,
+    fit_affine,
+    saturated,
+)
+from roadproof.photometry.samples import ColourSamples, distinct
+from roadproof.photometry.transform import ColourTransform, RadialShading, squared_radius
+
+_LARGE = 8 / 255
+_ITERATIONS = 100
+_STEP = 1e-6
+# Logarithms of exposure, contrast and encoding, for pictures encoded twice and once.
+_FILM_STARTS = ((-1.5, -1.5, -1.5, 0.4, 0.0), (0.0, 0.0, 0.0, 0.3, 0.9))
+
+FittedKind = type[AffineResponse] | type[FilmResponse]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FitReport:
+    """How well a colour transform predicts, in 8-bit levels, per sample and channel, after clipping.
+
+    Args:
+        model: what was fitted.
+        samples: how many samples it was fitted to.
+        saturated: share of their values that lay at the end of the scale.
+        residual: mean absolute error on those samples.
+        left_out: mean absolute error on groups left out of the fit in turn; none where the rest of the groups does not
+            determine the model.
+        left_out_channel: the same per channel.
+        worst: the painted colour with the largest mean error, in [0, 1]; left out where possible.
+        worst_error: its error.
+    """
+
+    model: str
+    samples: int
+    saturated: float
+    residual: float
+    left_out: float | None
+    left_out_channel: tuple[float, float, float] | None
+    worst: tuple[float, float, float]
+    worst_error: float
+
+
+@dataclass(frozen=True, slots=True)
+class ColourFit:
+    """A fitted colour transform, its report, and the reports of the models it was preferred to."""
+
+    transform: ColourTransform
+    report: FitReport
+    others: tuple[FitReport, ...] = ()
+
+
+def fit_colour(
+    samples: ColourSamples,
+    *,
+    response: FittedKind | None = None,
+    shading: bool | None = None,
+) -> ColourFit:
+    """Fit painted → seen, choosing by cross-validation what is not said.
+
+    Args:
+        samples: what was painted and seen.
+        response: the kind of response.
+        shading: whether to fit a radial shading; needs samples with pixels.
+
+    Returns:
+        The fit whose error on left-out groups is smallest, or, where that cannot be found, on the samples.
+
+    Raises:
+        ColourError: no samples, too few colours, too many saturated, or shading asked for without pixels.
+
+    References:
+        The paper, section on colour (C, b), for the affine response; the rest is our own.
+    """
+    if not len(samples):
+        raise ColourError("no colour samples; paint at least four colours and record them")
+    if shading and samples.pixel is None:
+        raise ColourError("shading needs to know where each colour was seen; give samples with pixels")
+    responses = (FilmResponse, AffineResponse) if response is None else (response,)
+    shadings = ((False, True) if samples.pixel is not None else (False,)) if shading is None else (shading,)
+    fits = [_fit(samples, kind, shade) for kind in responses for shade in shadings]
+    return _best(fits)
+
+
+def _best(fits: list[ColourFit | ColourError]) -> ColourFit:
+    done = [fit for fit in fits if isinstance(fit, ColourFit)]
+    if not done:
+        raise next(fit for fit in fits if isinstance(fit, ColourError))
+
+    def error(fit: ColourFit) -> tuple[bool, float]:
+        return fit.report.left_out is None, fit.report.residual if fit.report.left_out is None else fit.report.left_out
+
+    done.sort(key=error)
+    return ColourFit(done[0].transform, done[0].report, tuple(fit.report for fit in done[1:]))
+
+
+def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | ColourError:
+    try:
+        transform = _solve(samples, kind, shade)
+    except ColourError as error:
+        return error
+    residual = _errors(transform, samples)
+    left_out: Tensor | None = torch.full_like(residual, torch.nan)
+    groups = samples.groups
+    for group in range(int(groups.max()) + 1):
+        out = groups == group
+        try:
+            left_out[out] = _errors(_solve(samples.at(~out), kind, shade), samples.at(out))
+        except ColourError:
+            left_out = None
+            break
+    shown = residual if left_out is None else left_out
+    colours, which = distinct(samples.painted)
+    by_colour = torch.zeros(len(colours), dtype=torch.float64).index_add(0, which, shown.mean(1)) / which.bincount()
+    worst = int(by_colour.argmax())
+    report = FitReport(
+        model=("film" if kind is FilmResponse else "affine") + (" + radial shading" if shade else ""),
+        samples=len(samples),
+        saturated=float(saturated(samples.seen).double().mean()),
+        residual=float(residual.mean()),
+        left_out=None if left_out is None else float(left_out.mean()),
+        left_out_channel=None if left_out is None else _triple(left_out.mean(0)),
+        worst=_triple(colours[worst]),
+        worst_error=float(by_colour[worst]),
+    )
+    return ColourFit(transform, report)
+
+
+def _errors(transform: ColourTransform, samples: ColourSamples) -> Float[Tensor, "n 3"]:
+    """Absolute errors in 8-bit levels."""
+    pixel = torch.zeros(len(samples), 2, dtype=torch.float64) if samples.pixel is None else samples.pixel
+    return 255 * (transform(samples.painted.double(), pixel.double()) - samples.seen).abs()
+
+
+def _triple(values: Tensor) -> tuple[float, float, float]:
+    red, green, blue = cast("list[float]", values.tolist())
+    return red, green, blue
+
+
+def _solve(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourTransform:
+    painted, seen = samples.painted.double(), samples.seen.double()
+    if kind is AffineResponse:
+        affine = fit_affine(painted, seen)
+        if not shade:
+            return ColourTransform(affine)
+        starts = [torch.cat([affine.matrix.reshape(-1), affine.offset])]
+    else:
+        _check_film(painted, seen)
+        starts = [torch.tensor(start, dtype=torch.float64) for start in _FILM_STARTS]
+    at = _shading_feature(samples) if shade else None
+    colours, which = distinct(painted)
+    dark, bright = seen <= SATURATED, seen >= 1 - SATURATED
+
+    def residuals(parameters: Tensor) -> Tensor:
+        flat = parameters if at is None else parameters[:-2]
+        predicted = kind.from_parameters(flat)(colours)[which]
+        if at is not None:
+            predicted = predicted * (1 + parameters[-2] * at) + parameters[-1] * at
+        error = predicted - seen
+        error = torch.where(dark, error.clamp_min(0.0), torch.where(bright, error.clamp_max(0.0), error)).reshape(-1)
+        # r ↦ sign(r) √ρ(r) with ρ the pseudo-Huber loss, written so that it is smooth at 0.
+        return error * (2 / (1 + (1 + (error / _LARGE).square()).sqrt())).sqrt()
+
+    padding = torch.zeros(0 if at is None else 2, dtype=torch.float64)
+    parameters = _least_squares(residuals, [torch.cat([start, padding]) for start in starts])
+    if at is None or samples.size_px is None:
+        return ColourTransform(kind.from_parameters(parameters))
+    width, height = samples.size_px
+    shading = RadialShading(width_px=width, height_px=height, gain=float(parameters[-2]), offset=float(parameters[-1]))
+    return ColourTransform(kind.from_parameters(parameters[:-2]), shading)
+
+
+def _check_film(painted: Tensor, seen: Tensor) -> None:
+    usable = len(distinct(painted[(~saturated(seen)).any(1)])[0])
+    if usable < 4 or bool(saturated(seen).all(0).any()):
+        raise ColourError(
+            f"{usable} painted colours are seen unsaturated (a channel at neither 0 nor 255), expected at least 4, and "
+            "every channel among them; paint more colours, or colours of middle brightness"
+        )
+
+
+def _shading_feature(samples: ColourSamples) -> Float[Tensor, "n 1"]:
+    assert samples.pixel is not None
+    assert samples.size_px is not None
+    return squared_radius(samples.pixel.double(), *samples.size_px)[:, None]
+
+
+def _least_squares(residuals: Callable[[Tensor], Tensor], starts: list[Tensor]) -> Tensor:
+    """The best end of Levenberg and Marquardt's method from several starts.
+
+    Raises:
+        ColourError: no start leads to finite residuals.
+    """
+    ends = [_descend(residuals, start) for start in starts]
+    best, loss = min(ends, key=lambda end: end[1])
+    if not loss < float("inf"):
+        raise ColourError("the colour fit does not converge; check that painted and seen colours belong together")
+    return best
+
+
+def _jacobian(residuals: Callable[[Tensor], Tensor], at: Tensor) -> Float[Tensor, "n p"]:
+    """By central differences: with a dozen parameters in double precision nothing is lost by it."""
+    steps = _STEP * torch.eye(len(at), dtype=at.dtype)
+    return torch.stack([(residuals(at + step) - residuals(at - step)) / (2 * _STEP) for step in steps], 1)
+
+
+def _descend(residuals: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, float]:
+    def loss_of(value: Tensor) -> float:
+        total = float(value @ value)
+        return total if total == total else float("inf")
+
+    value = residuals(at)
+    loss, damping = loss_of(value), 1e-2
+    for _ in range(_ITERATIONS):
+        jacobian = _jacobian(residuals, at)
+        normal, slope = jacobian.T @ jacobian, jacobian.T @ value
+        scale = torch.diag(normal.diagonal() + 1e-9)
+        better: Tensor | None = None
+        while better is None and damping < 1e9:
+            moved = at - cast("Tensor", torch.linalg.solve(normal + damping * scale, slope))
+            moved_value = residuals(moved)
+            if loss_of(moved_value) < loss:
+                better = moved
+            else:
+                damping *= 4
+        if better is None:
+            break
+        value = residuals(better)
+        gained, at, loss = loss - loss_of(value), better, loss_of(value)
+        damping /= 8
+        if gained < 1e-10 * loss:
+            break
+    return at, loss

@@ -1,0 +1,118 @@
+"""Per-pixel gain and offset of a drive, from two drives over uniformly painted canvases.
+
+What a smooth model cannot know, such as the shadow of a tree across the canvas, two pictures of every frame show: with
+one light and one dark paint all over, seen = gain ⊙ response(painted) + offset has two equations a pixel. The same
+two pictures show where the canvas is seen, occlusion included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from roadproof.errors import ColourError
+from roadproof.photometry.responses import AffineResponse, Response
+
+_SEEN = 6 / 255
+_BORDER_PX = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PixelMaps:
+    """Colour of every pixel of a drive at the controller's input, seen = gain ⊙ response(painted) + offset.
+
+    Args:
+        gain: (F, H, W, 3); 1 where the canvas is not seen.
+        offset: (F, H, W, 3); 0 where the canvas is not seen.
+        visible: share of the pixel through which the canvas is seen, (F, H, W), in [0, 1].
+        response: what gain and offset apply to.
+    """
+
+    gain: Float[Tensor, "f h w 3"]
+    offset: Float[Tensor, "f h w 3"]
+    visible: Float[Tensor, "f h w"]
+    response: Response
+
+    def __post_init__(self) -> None:
+        if self.gain.shape != self.offset.shape or self.gain.shape[:3] != self.visible.shape:
+            shapes = [tuple(part.shape) for part in (self.gain, self.offset, self.visible)]
+            raise ColourError(
+                f"gain, offset and visible have shapes {shapes}, expected (F, H, W, 3) twice and (F, H, W)"
+            )
+        for name in ("gain", "offset", "visible"):
+            if not bool(getattr(self, name).isfinite().all()):
+                raise ColourError(f"{name} of the pixel maps has NaN or infinite values")
+
+
+def pixel_maps_from_two_paints(
+    light_frames: UInt8[Tensor, "f h w 3"],
+    dark_frames: UInt8[Tensor, "g i j 3"],
+    *,
+    light: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    dark: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    response: Response | None = None,
+) -> PixelMaps:
+    """Gain, offset and visibility of every pixel from two replays of one drive.
+
+    Pixels that the canvas fills only in part take gain and offset from their neighbours inside it.
+
+    Args:
+        light_frames: the drive with the whole canvas painted `light`.
+        dark_frames: the same frames with it painted `dark`.
+        light: a paint light enough to see and not so light that it saturates, in [0, 1].
+        dark: a paint darker in every channel, in [0, 1].
+        response: what gain and offset apply to; by default the painted colour itself.
+
+    Raises:
+        ColourError: frames of different shapes, no difference between them, paints too much alike, or a light paint
+            that saturates half of what is seen of it.
+    """
+    if light_frames.shape != dark_frames.shape:
+        raise ColourError(
+            f"light frames have shape {tuple(light_frames.shape)} and dark ones {tuple(dark_frames.shape)}; replay the "
+            "same frames with both paints"
+        )
+    response = AffineResponse.identity() if response is None else response
+    light_colour, dark_colour = response(torch.tensor([light, dark], dtype=torch.float64)).float()
+    if not bool((light_colour - dark_colour > 0.1).all()):
+        raise ColourError(f"light paint {light} and dark paint {dark} differ too little; use e.g. white and black")
+    bright, dim = light_frames.float() / 255, dark_frames.float() / 255
+    apart = (bright - dim).mean(-1)
+    seen = apart > _SEEN
+    if not bool(seen.any()):
+        raise ColourError(
+            "light and dark frames do not differ anywhere; check that the paint shows, and the same frames"
+        )
+    if float((light_frames[seen] == 255).float().mean()) > 0.5:
+        raise ColourError(f"more than half of what is seen of the light paint {light} is saturated; use a darker one")
+    slope = (bright - dim) / (light_colour - dark_colour)
+    level = dim - slope * dark_colour
+    inside = seen & ~_dilate(~seen)
+    near = _dilate(inside, _BORDER_PX)
+    known = torch.where(inside[..., None], torch.cat([slope, level], -1), 0.0)
+    filled = _filled(known, inside)
+    own = (inside | (seen & ~near))[..., None]
+    gain = torch.where(own, slope, torch.where(near[..., None], filled[..., :3], 1.0))
+    offset = torch.where(own, level, torch.where(near[..., None], filled[..., 3:], 0.0))
+    expected = (gain * (light_colour - dark_colour)).mean(-1).clamp_min(_SEEN)
+    visible = torch.where(own[..., 0], 1.0, torch.where(near, (apart / expected).clamp(0.0, 1.0), 0.0))
+    return PixelMaps(gain, offset, visible, response)
+
+
+def _dilate(mask: Tensor, radius_px: int = 1) -> Tensor:
+    return max_pool2d(mask.float()[:, None], 2 * radius_px + 1, 1, radius_px)[:, 0] > 0
+
+
+def _filled(values: Float[Tensor, "f h w c"], known: Tensor) -> Float[Tensor, "f h w c"]:
+    """Means of the known values around each pixel, the nearest ring that has any."""
+    filled = values
+    for radius in range(_BORDER_PX, 0, -1):
+        size = 2 * radius + 1
+        share = avg_pool2d(known.float()[:, None], size, 1, radius)
+        mean = avg_pool2d(values.permute(0, 3, 1, 2), size, 1, radius) / share.clamp_min(1e-6)
+        filled = torch.where((share > 0).permute(0, 2, 3, 1), mean.permute(0, 2, 3, 1), filled)
+    return filled
