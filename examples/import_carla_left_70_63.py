@@ -11,10 +11,11 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
-from roadproof.photometry import ColourTransform
+from roadproof.photometry import ColourFit, fit_colour, samples_from_pictures
 from roadproof.recordings import Push, Recording, RecordingSet, save_recordings
 
 DRIVES = {"t1": Push.CLEAN, "t2": Push.RIGHT, "t3": Push.LEFT}
@@ -38,20 +39,36 @@ def read_drive(folder: Path, push: Push) -> Recording:
     )
 
 
+def read_colours(folder: Path) -> ColourFit:
+    """Fit painted → seen to the authors' renders of the canvas in one colour after another."""
+    with (folder / "colours.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    pictures = [np.asarray(Image.open(folder / "real" / f"{row['index']}.png").convert("RGB")) for row in rows]
+    samples = samples_from_pictures(
+        torch.tensor([[float(row[channel]) / 255 for channel in "rgb"] for row in rows], dtype=torch.float64),
+        torch.tensor(np.stack(pictures)),
+        torch.tensor(np.asarray(Image.open(folder / "inner_mask.png").convert("L")) > 0),
+        group=torch.tensor([(int(row["index"]) - 1) // 2 for row in rows]),  # a bright and a dark shade of each hue
+    )
+    return fit_colour(samples)
+
+
 def main() -> None:
     """Read, fit, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     args = parser.parse_args()
+    colours = read_colours(args.data / "colour")
     recordings = RecordingSet(
         camera=CIL_CAMERA,
         view=CIL_INPUT,
-        colour=ColourTransform(),
+        colour=colours.transform,
         recordings=tuple(read_drive(args.data / name, push) for name, push in DRIVES.items()),
         origin="CARLA 0.8.2, Town01, start 70, goal 63; github.com/jinghanY/physicalAttackImageComposition",
     )
     save_recordings(recordings, args.out)
+    print(f"colour: {colours.report.model}, {colours.report.left_out:.1f} levels off on hues left out of the fit")
     print(f"{args.out}: " + ", ".join(f"{r.name} {len(r.frames)} frames" for r in recordings.recordings))
 
 

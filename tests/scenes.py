@@ -2,8 +2,8 @@
 
 import numpy as np
 import torch
-from references import approach
 
+from references import approach
 from roadproof.datatypes import Control
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.photometry import AffineResponse, ColourTransform

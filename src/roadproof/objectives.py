@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -85,9 +86,7 @@ def _parse_group(text: str) -> Group:
     return Group(pushes, Direction(sides[0]))
 
 
-def divergence(
-    shift: Float[Tensor, "*b f"], lengths: Sequence[int], direction: Direction
-) -> Float[Tensor, "*b"]:
+def divergence(shift: Float[Tensor, "*b f"], lengths: Sequence[int], direction: Direction) -> Float[Tensor, "*b"]:
     """δ, per frame: how far steering moved where the attack wants it.
 
     Args:
@@ -108,5 +107,6 @@ def divergence(
         case Direction.LEFT:
             total = -shift.sum(-1)
         case Direction.EITHER:
-            total = torch.stack([drive.sum(-1).abs() for drive in shift.split(list(lengths), -1)]).sum(0)
+            drives = cast("tuple[Tensor, ...]", shift.split(list(lengths), -1))
+            total = torch.stack([drive.sum(-1).abs() for drive in drives]).sum(0)
     return total / shift.shape[-1]

@@ -3,7 +3,7 @@
     SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, drives
     SET/DRIVE/drive.npz        per frame: frame number, homography, speed, command, steer
     SET/DRIVE/frames/N.png     the controller's input, unpainted; or all of them in SET/DRIVE/frames.npy
-    SET/DRIVE/shading.npz      optional: gain and offset of every pixel (see `photometry.PixelMaps`)
+    SET/DRIVE/shading.npz      optional: gain, offset and visibility of every pixel (see `photometry.PixelMaps`)
 
 Nothing is pickled, and no path in a file leaves the folder.
 """
@@ -27,13 +27,13 @@ from PIL import Image
 from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
 from roadproof.files import read_json
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, check_image_from_canvas
-from roadproof.photometry import ColourTransform, PixelMaps
+from roadproof.photometry import ColourTransform, PixelMaps, Response
 
 FORMAT = "roadproof-recordings"
 FORMAT_VERSION = 1
 _UNITS = {
     "frames": "RGB uint8, the controller's input, unpainted",
-    "image_from_canvas": "homography, canvas px (x, y, 1) to camera px, pixel centres at integers, third coordinate > 0",
+    "image_from_canvas": "homography, canvas px (x, y, 1) to camera px, pixel centres at integers, third > 0",
     "speed_mps": "m/s",
     "command": "2 follow, 3 left, 4 right, 5 straight",
     "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
@@ -63,7 +63,7 @@ class Recording:
         speed_mps: m/s.
         command: CARLA's codes (`datatypes.Command`).
         steer: what the recorded controller answered to each frame; for information.
-        maps: per-pixel gain and offset of the paint, where they were calibrated.
+        maps: per-pixel gain and offset of the paint, where they were calibrated; to the response of the set's colour.
 
     Raises:
         RecordingError: lengths differ, a value is not finite, or a homography is not a view of the canvas.
@@ -160,7 +160,9 @@ def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = F
         part.chmod(0o755)
         part.replace(folder)
     except OSError as error:
-        raise OutputError(f"cannot write {folder}: {error.strerror or error}; choose a folder that can be written") from None
+        raise OutputError(
+            f"cannot write {folder}: {error.strerror or error}; choose a folder that can be written"
+        ) from None
     finally:
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)
@@ -185,10 +187,13 @@ def _manifest(recordings: RecordingSet) -> dict[str, Any]:
 
 def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
     folder.mkdir()
-    np.savez_compressed(folder / "drive.npz", **{field: getattr(recording, field) for field in _PER_FRAME})
+    fields: dict[str, Any] = {field: getattr(recording, field) for field in _PER_FRAME}
+    np.savez_compressed(folder / "drive.npz", **fields)
     if recording.maps is not None:
-        maps = {"gain": recording.maps.gain.numpy(), "offset": recording.maps.offset.numpy()}
-        np.savez_compressed(folder / "shading.npz", **maps)
+        maps = recording.maps
+        np.savez_compressed(
+            folder / "shading.npz", gain=maps.gain.numpy(), offset=maps.offset.numpy(), visible=maps.visible.numpy()
+        )
     if compact:
         np.save(folder / "frames.npy", recording.frames, allow_pickle=False)
         return
@@ -209,11 +214,12 @@ def load_recordings(folder: Path) -> RecordingSet:
         raise RecordingError(f"{folder} has no recordings.json; expected a set of recordings made by roadproof")
     manifest = read_json(folder / "recordings.json", FORMAT, FORMAT_VERSION, RecordingError)
     try:
+        colour = ColourTransform.from_dict(manifest["colour"])
         return RecordingSet(
             camera=CameraModel(**manifest["camera"]),
             view=CropResize(**manifest["crop_resize"]),
-            colour=ColourTransform.from_dict(manifest["colour"]),
-            recordings=tuple(_read_drive(folder, drive) for drive in manifest["drives"]),
+            colour=colour,
+            recordings=tuple(_read_drive(folder, drive, colour.response) for drive in manifest["drives"]),
             origin=str(manifest.get("origin", "")),
         )
     except (KeyError, TypeError) as error:
@@ -222,7 +228,7 @@ def load_recordings(folder: Path) -> RecordingSet:
         raise RecordingError(f"{folder / 'recordings.json'}: {error}") from None
 
 
-def _read_drive(root: Path, drive: dict[str, Any]) -> Recording:
+def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Recording:
     name = str(drive["name"])
     folder = root / name
     if Path(name).name != name or name in {"", ".", ".."}:
@@ -234,8 +240,6 @@ def _read_drive(root: Path, drive: dict[str, Any]) -> Recording:
     except ValueError:
         raise RecordingError(f"drive {name} has push {drive['push']!r}, expected one of {', '.join(Push)}") from None
     fields = _read_arrays(folder / "drive.npz", _PER_FRAME)
-    shading = folder / "shading.npz"
-    maps = _read_arrays(shading, ("gain", "offset")) if shading.exists() else None
     return Recording(
         name=name,
         push=push,
@@ -245,8 +249,18 @@ def _read_drive(root: Path, drive: dict[str, Any]) -> Recording:
         speed_mps=fields["speed_mps"].astype(np.float64),
         command=fields["command"],
         steer=fields["steer"].astype(np.float64),
-        maps=None if maps is None else PixelMaps(torch.tensor(maps["gain"]), torch.tensor(maps["offset"])),
+        maps=_read_maps(folder / "shading.npz", response),
     )
+
+
+def _read_maps(path: Path, response: Response) -> PixelMaps | None:
+    if not path.exists():
+        return None
+    gain, offset, visible = _read_arrays(path, ("gain", "offset", "visible")).values()
+    try:
+        return PixelMaps(torch.tensor(gain), torch.tensor(offset), torch.tensor(visible), response)
+    except ColourError as error:
+        raise RecordingError(f"{path}: {error}") from None
 
 
 def _read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from references import approach
-from scenes import PLAIN, road_frames
 
+from references import approach
 from roadproof.compositing import Compositor, composite, view_canvas
 from roadproof.compositing.composite import blend, canvas_colours
 from roadproof.coverage import Shape
@@ -14,6 +13,7 @@ from roadproof.geometry import CIL_INPUT
 from roadproof.patterns import Pattern, coverages, visibilities
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.search_space import SearchSpace
+from scenes import PLAIN, road_frames
 
 DIM = ColourTransform(AffineResponse(torch.eye(3) * 0.6, torch.full((3,), 0.05)))
 
@@ -29,9 +29,7 @@ def random_patterns(batch=(2,), figures=4, seed=0, dtype=torch.float64, **kwargs
 
 
 def whole_canvas(colour):
-    return Pattern(
-        (Shape.RECTANGLE,), torch.tensor([[199.5, 199.5, 400.0, 400.0, 0.0]]), torch.tensor([colour])
-    )
+    return Pattern((Shape.RECTANGLE,), torch.tensor([[199.5, 199.5, 400.0, 400.0, 0.0]]), torch.tensor([colour]))
 
 
 def test_the_hand_written_gradient_is_that_of_plain_tensor_operations():
@@ -40,8 +38,9 @@ def test_the_hand_written_gradient_is_that_of_plain_tensor_operations():
     unit.requires_grad_()
     pattern = space.pattern(unit)
     fast = canvas_colours(pattern, view)
-    seen = view.colour.response(pattern.colours)
-    plain = blend(visibilities(coverages(pattern, view.footprints)), seen, view)
+    again = space.pattern(unit)
+    seen = view.response(again.colours)
+    plain = blend(visibilities(coverages(again, view.footprints)), seen, view)
     torch.testing.assert_close(fast, plain, rtol=0, atol=1e-12)
     weight = torch.randn(plain.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     (by_hand,) = torch.autograd.grad((fast * weight).sum(), unit)
@@ -144,7 +143,7 @@ def test_pixel_maps_give_every_pixel_its_own_light():
     count = 2
     gain = torch.full((count, 88, 200, 3), 0.5)
     gain[:, :, 100:] = 0.25
-    maps = PixelMaps(gain, torch.zeros_like(gain))
+    maps = PixelMaps(gain, torch.zeros_like(gain), torch.ones(count, 88, 200), PLAIN.response)
     view = make_view(count, dtype=torch.float32, colour=PLAIN, maps=maps)
     frames = composite(whole_canvas([1.0, 1.0, 1.0]), view)
     row = frames[-1, 0, 60]

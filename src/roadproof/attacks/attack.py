@@ -33,7 +33,6 @@ def attack(
     restarts: int = 4,
     seed: int = 0,
     device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
     gradient: Gradient = "exact",
     random_patterns: int = 0,
     checkpoint: Path | None = None,
@@ -43,14 +42,13 @@ def attack(
 
     Args:
         recordings: the drives, with their view of the canvas and its colours.
-        controller: on `device`, in `dtype`.
+        controller: on `device`.
         space: the patterns allowed.
         groups: drives attacked together; the paper's two sides by default, of which the stronger is kept.
         schedule: the paper's by default.
         restarts: random starts of every group.
         seed: of the starts.
         device: where to search.
-        dtype: precision of the controller.
         gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
         random_patterns: random patterns a group that the self-check compares with; 0 for none.
         checkpoint: file that keeps the search after every step; an interrupted one goes on from it.
@@ -62,7 +60,7 @@ def attack(
     """
     schedule = schedule or Schedule()
     kind = PublishedSurrogate if gradient == "published" else Surrogate
-    surrogate = kind(recordings, controller, groups, device=device, dtype=dtype)
+    surrogate = kind(recordings, controller, groups, device=device)
     start = time.perf_counter()
     search = gradopt(
         surrogate, space, schedule=schedule, restarts=restarts, seed=seed, checkpoint=checkpoint, on_step=on_step

@@ -99,9 +99,7 @@ def _check_bounds(space: SearchSpace, search: Search) -> Check:
     )
 
 
-def _check_against_random(
-    surrogate: Surrogate, space: SearchSpace, search: Search, patterns: int, seed: int
-) -> Check:
+def _check_against_random(surrogate: Surrogate, space: SearchSpace, search: Search, patterns: int, seed: int) -> Check:
     _, by_chance = random_search(surrogate, space, patterns=patterns, seed=seed + 1)
     found, chance = float(search.best.max()), float(by_chance.max())
     passed = found > chance

@@ -39,9 +39,8 @@ class PublishedSurrogate(Surrogate):
         groups: Sequence[Group],
         *,
         device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(recordings, controller, groups, device=device, dtype=dtype)
+        super().__init__(recordings, controller, groups, device=device)
         drives = [group.select(recordings) for group in groups]
         self._published_views = [
             view_canvas_published(
@@ -84,11 +83,13 @@ class PublishedSurrogate(Surrogate):
 
     def _frames(self, space: SearchSpace, group: int, point: Float[Tensor, "k n"]) -> Float[Tensor, "f h w 3"]:
         if space.family != "published" or not space.colour or space.max_painted_share is not None:
-            raise PatternError("the published gradient needs coloured rectangles of the published family, no area limit")
+            raise PatternError(
+                "the published gradient needs coloured rectangles of the published family, no area limit"
+            )
         return composite_published(space.pattern(point), self._published_views[group])
 
     def _value(self, group: int, frames: Float[Tensor, "f h w 3"]) -> Float[Tensor, ""]:
-        steer = self._steer(frames.permute(0, 3, 1, 2).to(self.dtype), self._speed[group], self._command[group])
+        steer = self._steer(frames.permute(0, 3, 1, 2), self._speed[group], self._command[group])
         return divergence(steer - self.clean_steer[group], self.lengths[group], self.groups[group].direction)
 
     def _gradient(

@@ -106,7 +106,10 @@ class AttackResult:
                 space=_space(fields["space"]),
                 schedule=Schedule(**fields["schedule"] | {"drops": tuple(fields["schedule"]["drops"])}),
                 history=np.array(fields["history"], dtype=np.float64),
-                **{name: fields[name] for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed")},
+                **{
+                    name: fields[name]
+                    for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed")
+                },
             )
         except (KeyError, TypeError, ValueError) as error:
             raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None

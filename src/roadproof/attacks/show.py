@@ -47,19 +47,17 @@ def show_pattern(
     group: Group,
     *,
     device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
 ) -> tuple[ShownDrive, ...]:
     """Composite a pattern into the drives of a group and ask the controller.
 
     Args:
         pattern: one pattern.
         recordings: the drives.
-        controller: on `device`, in `dtype`.
+        controller: on `device`.
         group: which drives.
         device: where to composite.
-        dtype: precision of the controller.
     """
-    surrogate = Surrogate(recordings, controller, [group], device=device, dtype=dtype)
+    surrogate = Surrogate(recordings, controller, [group], device=device)
     view = surrogate.views[0]
     on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
     with torch.no_grad():
@@ -78,4 +76,3 @@ def show_pattern(
         )
         for drive, end in zip(drives, ends, strict=True)
     )
-

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -31,10 +32,9 @@ class Surrogate:
 
     Args:
         recordings: the drives.
-        controller: on `device`, in `dtype`.
+        controller: on `device`; it is given float32 frames, whatever it computes in.
         groups: drives attacked together; each has patterns of its own.
         device: where frames are composited.
-        dtype: precision of the frames the controller is given; compositing itself is float32.
 
     Raises:
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
@@ -48,7 +48,6 @@ class Surrogate:
         groups: Sequence[Group],
         *,
         device: torch.device | str = "cpu",
-        dtype: torch.dtype = torch.float32,
     ) -> None:
         height, width = recordings.view.height_px, recordings.view.width_px
         if controller.input_size not in (None, (height, width)):
@@ -59,20 +58,19 @@ class Surrogate:
             )
         self.groups = tuple(groups)
         self.controller = controller
-        self.dtype = dtype
         self.frames_evaluated = 0
         drives = [group.select(recordings) for group in groups]
         self.lengths = [[len(drive.frames) for drive in members] for members in drives]
         self.views = [_view(recordings, members, device) for members in drives]
-        self._speed = [_joined([drive.speed_mps for drive in members], device, dtype) for members in drives]
+        self._speed = [_joined([drive.speed_mps for drive in members], device, torch.float32) for members in drives]
         self._command = [_joined([drive.command for drive in members], device, torch.int64) for members in drives]
         with torch.no_grad():
             self.clean_steer = [
-                self._steer(view.clean_frames.to(dtype), speed, command)
+                self._steer(view.clean_frames, speed, command)
                 for view, speed, command in zip(self.views, self._speed, self._command, strict=True)
             ]
         if not all(bool(steer.isfinite().all()) for steer in self.clean_steer):
-            raise ControllerError("the controller answers NaN or infinity to clean frames; check its weights and dtype")
+            raise ControllerError("the controller answers NaN or infinity to clean frames; check its weights")
 
     @property
     def device(self) -> torch.device:
@@ -106,7 +104,7 @@ class Surrogate:
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         """δ per frame at points of a search space, without gradients, a bounded number of frames at a time."""
         with torch.no_grad():
-            return torch.cat([self.divergences(_patterns(space, part)) for part in unit.split(self.batch, dim=1)], 1)
+            return torch.cat([self.divergences(_patterns(space, part)) for part in self._batches(unit)], 1)
 
     def values_and_gradients(
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
@@ -121,7 +119,7 @@ class Surrogate:
         del coarse
         values: list[Tensor] = []
         gradients: list[Tensor] = []
-        for part in unit.split(self.batch, dim=1):
+        for part in self._batches(unit):
             leaf = part.detach().requires_grad_()
             value = self.divergences(_patterns(space, leaf))
             (gradient,) = torch.autograd.grad(value.sum(), leaf)
@@ -130,22 +128,22 @@ class Surrogate:
         return torch.cat(values, 1), torch.cat(gradients, 1)
 
     def fingerprint(self) -> str:
-        """Tells this surrogate from another: drives, calibration, controller (by its clean answers) and precision."""
-        digest = hashlib.sha256(repr((self.groups, self.lengths, self.dtype)).encode())
+        """Tells this surrogate from another: drives, calibration, controller (by its clean answers)."""
+        digest = hashlib.sha256(repr((self.groups, self.lengths)).encode())
         for view, steer in zip(self.views, self.clean_steer, strict=True):
             for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer):
                 digest.update(tensor.cpu().numpy().tobytes())
         return digest.hexdigest()
 
-    @property
-    def batch(self) -> int:
-        """Patterns a group evaluated at once."""
-        return max(1, MAX_FRAMES // sum(len(view.frames) for view in self.views))
+    def _batches(self, unit: Float[Tensor, "g r k n"]) -> tuple[Tensor, ...]:
+        """Parts of at most MAX_FRAMES frames, as even as can be; at least one pattern a group each."""
+        at_once = max(1, MAX_FRAMES // sum(len(view.frames) for view in self.views))
+        return cast("tuple[Tensor, ...]", unit.chunk(-(-unit.shape[1] // at_once), dim=1))
 
     def _compositor(self, copies: int) -> Compositor:
         kept = getattr(self, "_kept", None)
         if kept is None or kept[0] != copies:
-            self._kept = (copies, Compositor(self.views, copies, dtype=self.dtype))
+            self._kept = (copies, Compositor(self.views, copies))
         return self._kept[1]
 
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
@@ -158,15 +156,24 @@ def _patterns(space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> list[Patter
 
 
 def _view(recordings: RecordingSet, drives: Sequence[Recording], device: torch.device | str) -> CanvasView:
-    maps = [drive.maps for drive in drives if drive.maps is not None]
     return view_canvas(
         np.concatenate([drive.frames for drive in drives]),
         np.concatenate([drive.image_from_canvas for drive in drives]),
         recordings.view,
         recordings.colour,
-        maps=PixelMaps.concatenate(maps) if len(maps) == len(drives) else None,
+        maps=_joined_maps([drive.maps for drive in drives]),
         device=device,
     )
+
+
+def _joined_maps(parts: Sequence[PixelMaps | None]) -> PixelMaps | None:
+    maps = [part for part in parts if part is not None]
+    if len(maps) < len(parts):
+        return None
+    gain, offset, visible = (
+        torch.cat([getattr(part, name) for part in maps]) for name in ("gain", "offset", "visible")
+    )
+    return PixelMaps(gain, offset, visible, maps[0].response)
 
 
 def _joined(parts: Sequence[np.ndarray], device: torch.device | str, dtype: torch.dtype) -> Tensor:

@@ -25,7 +25,7 @@ def attack(
         str, typer.Option(help="Where figures may lie: published, published-canvas-centre or free.")
     ] = "published",
     shape: Annotated[str, typer.Option(help="rectangle, ellipse, triangle or diamond.")] = "rectangle",
-    black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,  # noqa: FBT002
+    black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
     albedo: Annotated[tuple[float, float], typer.Option(help="Darkest and brightest paint, 0 to 1.")] = (0.0, 1.0),
     max_painted_share: Annotated[
         float | None, typer.Option(help="Largest share of the canvas that may be painted.", show_default=False)
@@ -53,7 +53,7 @@ def attack(
     from roadproof.attacks import attack as run
     from roadproof.cli.options import choice
     from roadproof.cli.progress import progress
-    from roadproof.controllers import DTYPES, load_controller
+    from roadproof.controllers import load_controller
     from roadproof.coverage import Shape
     from roadproof.files import check_writable
     from roadproof.objectives import parse_groups
@@ -84,7 +84,6 @@ def attack(
             restarts=restarts,
             seed=seed,
             device=device,
-            dtype=DTYPES[dtype],
             gradient=choice(gradient, "gradient", GRADIENTS),
             random_patterns=random_patterns,
             checkpoint=checkpoint,
@@ -92,7 +91,7 @@ def attack(
         )
     result.save(out)
     winner = next(group for group in chosen if str(group) == result.group)
-    shown = show_pattern(result.pattern, drives, attacked, winner, device=device, dtype=DTYPES[dtype])
+    shown = show_pattern(result.pattern, drives, attacked, winner, device=device)
     _draw(result, shown, out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, space, out)

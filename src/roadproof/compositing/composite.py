@@ -51,13 +51,12 @@ class Compositor:
     Args:
         views: the sets of frames, all of one size.
         copies: how many patterns are painted into each of them.
-        dtype: precision of the frames returned; the view's own by default.
     """
 
-    def __init__(self, views: Sequence[CanvasView], copies: int, *, dtype: torch.dtype | None = None) -> None:
+    def __init__(self, views: Sequence[CanvasView], copies: int) -> None:
         self._views = tuple(views)
         self._copies = copies
-        self._frames = torch.cat([view.frames.to(dtype).repeat(copies, 1, 1, 1) for view in views])
+        self._frames = torch.cat([view.frames.repeat(copies, 1, 1, 1) for view in views])
 
     def __call__(self, patterns: Sequence[Pattern]) -> Float[Tensor, "n 3 h w"]:
         """The frames, view after view, pattern after pattern.
@@ -77,7 +76,7 @@ class Compositor:
     def paste(self, colours: Sequence[Tensor]) -> Float[Tensor, "n 3 h w"]:
         """Write the colours of the canvas' pixels, one (copies, P, 3) a view, into the frames."""
         for slot, view, colour in zip(self.slots(self._frames), self._views, colours, strict=True):
-            slot.index_copy_(1, view.index, colour.to(slot.dtype))
+            slot.index_copy_(1, view.index, colour)
         return self._frames.permute(0, 3, 1, 2)
 
     def pick(self, frames: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
@@ -90,22 +89,21 @@ class _Pasted(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, compositor: Compositor, *colours: Tensor) -> Tensor:  # noqa: ANN401
         ctx.compositor = compositor
-        ctx.dtype = colours[0].dtype
         return compositor.paste(colours)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        return (None, *(part.to(ctx.dtype) for part in ctx.compositor.pick(grad_outputs[0])))
+        return (None, *ctx.compositor.pick(grad_outputs[0]))
 
 
 def canvas_colours(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
-    seen = view.colour.response(pattern.colours)
+    seen = view.response(pattern.colours)
     if any(shape is not Shape.RECTANGLE for shape in pattern.shapes):
         return blend(visibilities(coverages(pattern, view.footprints)), seen, view)
     batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
-    painted = PaintedRectangles.apply(pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3), view)
-    return cast("Tensor", painted).view(*batch, *view.clean.shape)
+    boxes, seen = pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3)
+    return cast("Tensor", PaintedRectangles.apply(boxes, seen, view)).view(*batch, *view.clean.shape)
 
 
 def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasView) -> Tensor:

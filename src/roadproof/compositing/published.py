@@ -56,9 +56,7 @@ def view_canvas_published(
     return PublishedView(torch.as_tensor(frames, device=device).float() / 255, lookup, colour)
 
 
-def nearest_canvas_pixels(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
-) -> Int[np.ndarray, "f h w"]:
+def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize) -> Int[np.ndarray, "f h w"]:
     """The canvas pixel nearest to where every input pixel looks, row-major; CANVAS_SIZE_PX² where it is off the canvas.
 
     Convention:

@@ -79,8 +79,8 @@ class PaintedRectangles(torch.autograd.Function):
             leaf = boxes.detach().requires_grad_()
             rows = axis_rows(leaf).movedim(-2, 0)
             halves = leaf[..., 2:4].movedim(-1, 0) / 2
-        (grad_boxes,) = torch.autograd.grad((rows, halves), leaf, (grad_rows, grad_halves))
-        return cast("Tensor", grad_boxes), grad_seen, None
+        grads = cast("tuple[Tensor]", torch.autograd.grad((rows, halves), leaf, (grad_rows, grad_halves)))
+        return grads[0], grad_seen, None
 
 
 def _pieces(boxes: Tensor, view: CanvasView) -> Iterator[slice]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
-from roadproof.photometry import ColourTransform, PixelMaps
+from roadproof.photometry import ColourTransform, PixelMaps, Response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +26,7 @@ class CanvasView:
         clean: their clean colours, (P, 3).
         gain: A = s·gain, (P, 3), with s the share of the pixel that lies on the canvas.
         bias: B = s·(offset − clean), (P, 3).
-        colour: painted → seen.
+        response: painted → seen, before gain and bias.
     """
 
     frames: Float[Tensor, "f h w 3"]
@@ -35,7 +35,7 @@ class CanvasView:
     clean: Float[Tensor, "p 3"]
     gain: Float[Tensor, "p 3"]
     bias: Float[Tensor, "p 3"]
-    colour: ColourTransform
+    response: Response
 
     @property
     def clean_frames(self) -> Float[Tensor, "f 3 h w"]:
@@ -60,7 +60,8 @@ def view_canvas(
         image_from_canvas: one homography a frame, canvas px to camera px.
         view: how the input was made from the camera picture.
         colour: painted → seen.
-        maps: gain and offset of every pixel of the frames, in place of the smooth shading of `colour`.
+        maps: gain, offset and visibility of the canvas for every pixel of the frames, to the response of `colour`, in
+            place of its smooth shading.
         device: where to composite.
         dtype: precision of compositing; float64 for gradient checks.
 
@@ -74,13 +75,14 @@ def view_canvas(
     clean = levels.reshape(-1, 3)[place]
     if maps is None:
         gain, offset = colour.gain_and_offset(torch.as_tensor(_camera_points(index, view)))
+        middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
+        whole = torch.tensor([middle, middle, size, size, 0.0], device=device, dtype=dtype)
+        share = coverage(Shape.RECTANGLE, whole, footprints)
     else:
-        gain, offset = (part.reshape(-1, 3)[torch.as_tensor(index)] for part in (maps.gain, maps.offset))
-    gain, offset = (part.to(device=device, dtype=dtype) for part in (gain, offset))
-    middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
-    whole = torch.tensor([middle, middle, size, size, 0.0], device=device, dtype=dtype)
-    share = coverage(Shape.RECTANGLE, whole, footprints)[:, None]
-    return CanvasView(levels, place, footprints, clean, share * gain, share * (offset - clean), colour)
+        own = torch.as_tensor(index)
+        gain, offset, share = maps.gain.flatten(0, 2)[own], maps.offset.flatten(0, 2)[own], maps.visible.flatten()[own]
+    gain, offset, share = (part.to(device=device, dtype=dtype) for part in (gain, offset, share[:, None]))
+    return CanvasView(levels, place, footprints, clean, share * gain, share * (offset - clean), colour.response)
 
 
 def canvas_pixels(
