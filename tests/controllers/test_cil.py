@@ -1,5 +1,8 @@
 """CIL against the published sizes, a plain second writing of the network, and closed forms."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -125,6 +128,22 @@ def test_gradients_are_those_of_central_differences(lively):
     with torch.no_grad():
         after, before = (network.steer(leaf + s * direction, speed, command).item() for s in (step, -step))
     assert float((gradient * direction).sum()) == pytest.approx((after - before) / (2 * step), rel=1e-4)
+
+
+COMPILED = """
+import torch
+from roadproof.controllers import CIL
+network = CIL(width=0.05).eval().requires_grad_(False).folded()
+batch = torch.rand(4, 3, 88, 200), torch.rand(4), torch.tensor([2, 3, 4, 5])
+compiled = torch.compile(network.steer, backend="eager", fullgraph=True)
+torch.testing.assert_close(compiled(*batch), network.steer(*batch))
+"""
+
+
+def test_it_compiles_as_one_graph():
+    # In a process of its own: torch.compile does not look through the shape checks that the tests switch on.
+    done = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def _answering(network: CIL, steer: float, gas: float, brake: float) -> CIL:

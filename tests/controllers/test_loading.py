@@ -1,6 +1,7 @@
 """Specs: every kind loads and answers as the network it was made from; every mistake gets one clear line."""
 
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -101,6 +102,7 @@ def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
         "value = 4\n"
     )
     monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
     for spec in ("my_driver:make", "my_driver:Nested.make"):
         controller = load_controller(spec)
         assert isinstance(controller, CIL)
@@ -114,6 +116,7 @@ def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
     ):
         with pytest.raises(ControllerError, match=message):
             load_controller(spec)
+    assert sys.path == before
 
 
 def test_an_error_inside_a_factory_is_not_hidden(tmp_path, monkeypatch):

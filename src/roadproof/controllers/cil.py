@@ -40,6 +40,8 @@ _KERNEL_STRIDE_CHANNELS = (
 )  # fmt: skip
 _LAST_MAP = (2, 16)
 _BRANCHES = 4
+# Plain integers: torch.compile does not compare tensors with members of an enum.
+_FOLLOW, _LEFT, _RIGHT = int(Command.FOLLOW), int(Command.LEFT), int(Command.RIGHT)
 
 
 class CILOutput(NamedTuple):
@@ -204,8 +206,8 @@ class CIL(nn.Module):
 def branch_of(command: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
     """Index of the branch for CARLA's codes: follow (and 0, goal reached) 0, left 2, right 3, everything else 1."""
     branch = torch.ones_like(command, dtype=torch.int64)
-    branch = branch.masked_fill((command == Command.FOLLOW) | (command == 0), 0)
-    return branch.masked_fill(command == Command.LEFT, 2).masked_fill(command == Command.RIGHT, 3)
+    branch = branch.masked_fill((command == _FOLLOW) | (command == 0), 0)
+    return branch.masked_fill(command == _LEFT, 2).masked_fill(command == _RIGHT, 3)
 
 
 def _dense(inputs: int, outputs: int, *, dropout: float) -> tuple[nn.Module, ...]:

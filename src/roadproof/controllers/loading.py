@@ -180,12 +180,13 @@ def _from_python(module_name: str, factory_name: str) -> Controller:
 
 @contextmanager
 def _current_directory_importable() -> Generator[None, None, None]:
-    here = str(Path.cwd())
-    sys.path.append(here)
+    before = list(sys.path)
+    # Last, so that nothing in the folder hides an installed module.
+    sys.path.append(str(Path.cwd()))
     try:
         yield
     finally:
-        sys.path.remove(here)
+        sys.path[:] = before
 
 
 def _placed(controller: Controller | nn.Module, device: torch.device, dtype: torch.dtype) -> Controller:
