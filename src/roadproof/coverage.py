@@ -32,6 +32,9 @@ from roadproof.geometry import Resampling
 FOOTPRINT_VARIANCE: dict[Resampling, float] = {"antialiased-bilinear": 1.0, "area": 0.5}
 """Squared half-width, in picture px, of the tent that stands for each resampling filter."""
 
+MIN_VARIANCE = 1e-4
+"""Least σ², canvas px²: far footprints are so long that rounding could make it negative across them."""
+
 
 class Shape(StrEnum):
     """What fills the box of a figure."""
@@ -152,7 +155,7 @@ def _rectangle_coverage(box: Tensor, footprints: Footprints) -> Tensor:
 
 def _interval_share(u: Tensor, half: Tensor, variance: Tensor) -> Tensor:
     """Share of a tent at u that lies inside [−half, half]."""
-    sharpness = torch.rsqrt(variance)
+    sharpness = torch.rsqrt(variance.clamp_min(MIN_VARIANCE))
     return tent_share((half - u) * sharpness) + tent_share((half + u) * sharpness)
 
 
@@ -169,7 +172,7 @@ def _ellipse_coverage(box: Tensor, footprints: Footprints) -> Tensor:
     nu, nv = u / radius / half_width, v / radius / half_length
     nx, ny = c * nu - s * nv, s * nu + c * nv
     xx, xy2, yy = footprints.features[3:]
-    sharpness = torch.rsqrt(nx * nx * xx + nx * ny * xy2 + ny * ny * yy + 1e-12)
+    sharpness = torch.rsqrt((nx * nx * xx + nx * ny * xy2 + ny * ny * yy).clamp_min(MIN_VARIANCE))
     return tent_share((1 - radius) * sharpness) + tent_share((1 + radius) * sharpness)
 
 

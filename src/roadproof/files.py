@@ -36,6 +36,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             part.unlink(missing_ok=True)
 
 
+def check_writable(folder: Path) -> None:
+    """Find out before long work whether its results can be written.
+
+    Raises:
+        OutputError: the folder cannot be made or written.
+    """
+    probe = folder / ".writable"
+    write_atomically(probe, lambda part: part.write_bytes(b"\0"))
+    probe.unlink(missing_ok=True)
+
+
 def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:
     """Read a JSON file that names its format and version.
 

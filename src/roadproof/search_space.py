@@ -7,7 +7,7 @@ means the same in every direction.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.patterns import Pattern, boxes_from_published
 
 Family = Literal["published", "published-canvas-centre", "free"]
+FAMILIES: tuple[Family, ...] = get_args(Family)
 
 
 @dataclass(frozen=True, slots=True)

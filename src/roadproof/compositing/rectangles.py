@@ -26,7 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.view import CanvasView
-from roadproof.coverage import axis_rows
+from roadproof.coverage import MIN_VARIANCE, axis_rows
 
 _PIECE = 1 << 16
 """Figure-pixels handled at once on a CPU: a few such arrays fit the second-level cache of one core."""
@@ -95,7 +95,7 @@ class _Axis:
     """One side of the boxes: where each footprint is between its two edges."""
 
     def __init__(self, at: Tensor, variance: Tensor, half: Tensor) -> None:
-        self.sharpness = variance.rsqrt_()
+        self.sharpness = variance.clamp_min_(MIN_VARIANCE).rsqrt_()
         scaled_at, scaled_half = at * self.sharpness, half * self.sharpness
         self.from_high = (scaled_half - scaled_at).clamp_(-1.0, 1.0)
         self.from_low = scaled_half.add_(scaled_at).clamp_(-1.0, 1.0)

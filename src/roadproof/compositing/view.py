@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from roadproof.coverage import Footprints, Shape, coverage
@@ -103,18 +103,24 @@ def canvas_pixels(
     pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
     mapped = np.swapaxes(canvas_from_input @ pixels, 1, 2)
     # The inverse keeps the sign: its third coordinate, too, is positive in front of the camera.
-    frame, pixel = np.nonzero(mapped[..., 2] > 0)
-    w = mapped[frame, pixel, 2:]
-    centre = mapped[frame, pixel, :2] / w
-    inverse = canvas_from_input[frame]
-    jacobian = (inverse[:, :2, :2] - centre[:, :, None] * inverse[:, 2:, :2]) / w[:, :, None]
-    # The widest filter reaches one pixel to every side; the canvas spans [−0.5, size − 0.5].
-    reach = np.abs(jacobian).sum(-1)
-    touches = ((centre > -0.5 - reach) & (centre < CANVAS_SIZE_PX - 0.5 + reach)).all(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        centre = mapped[..., :2] / mapped[..., 2:]
+        inside = (mapped[..., 2] > 0) & ((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(-1)
+    touches = _dilated(inside.reshape(-1, view.height_px, view.width_px)).reshape(inside.shape) & (mapped[..., 2] > 0)
     if not touches.any():
         raise GeometryError("no frame shows the canvas; check the homographies, or record nearer to it")
-    index = frame[touches] * (view.height_px * view.width_px) + pixel[touches]
-    return index, centre[touches], jacobian[touches]
+    frame, pixel = np.nonzero(touches)
+    inverse, seen = canvas_from_input[frame], centre[frame, pixel]
+    slope = inverse[:, :2, :2] - seen[:, :, None] * inverse[:, 2:, :2]
+    jacobian = slope / mapped[frame, pixel, 2][:, None, None]
+    return frame * (view.height_px * view.width_px) + pixel, seen, jacobian
+
+
+def _dilated(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """A mask grown by one pixel to every side: as far as the widest filter reaches."""
+    padded = np.pad(mask, ((0, 0), (1, 1), (1, 1)))
+    rows = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]
+    return rows[:, :, :-2] | rows[:, :, 1:-1] | rows[:, :, 2:]
 
 
 def _camera_points(index: Int[np.ndarray, " p"], view: CropResize) -> Float[np.ndarray, "p 2"]:

@@ -1,8 +1,14 @@
 """Controllers: what is attacked and what drives."""
 
+from roadproof.controllers.cards import ControllerCard as ControllerCard
+from roadproof.controllers.checks import ControllerCheck as ControllerCheck
+from roadproof.controllers.checks import ControllerReport as ControllerReport
+from roadproof.controllers.checks import check_controller as check_controller
 from roadproof.controllers.cil import CIL as CIL
 from roadproof.controllers.cil import CILOutput as CILOutput
 from roadproof.controllers.frames import FramePreparation as FramePreparation
+from roadproof.controllers.loading import load_controller as load_controller
+from roadproof.controllers.loading import save_controller as save_controller
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA as PILOTNET_ON_CARLA
 from roadproof.controllers.pilotnet import PilotNet as PilotNet
 from roadproof.controllers.pilotnet import pilotnet_controller as pilotnet_controller

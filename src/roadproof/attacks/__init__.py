@@ -1,0 +1,11 @@
+"""Attacks: the search for the pattern that shifts a controller's steering most."""
+
+from roadproof.attacks.attack import GRADIENTS as GRADIENTS
+from roadproof.attacks.attack import attack as attack
+from roadproof.attacks.checks import Check as Check
+from roadproof.attacks.gradopt import Schedule as Schedule
+from roadproof.attacks.result import AttackResult as AttackResult
+from roadproof.attacks.result import Cost as Cost
+from roadproof.attacks.show import ShownDrive as ShownDrive
+from roadproof.attacks.show import show_pattern as show_pattern
+from roadproof.attacks.surrogate import Surrogate as Surrogate

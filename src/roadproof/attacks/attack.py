@@ -1,0 +1,87 @@
+"""The verb: attack recorded drives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+
+from roadproof.attacks.checks import check_search
+from roadproof.attacks.gradopt import Schedule, gradopt
+from roadproof.attacks.published import PublishedSurrogate
+from roadproof.attacks.result import AttackResult, Cost
+from roadproof.attacks.surrogate import Surrogate
+from roadproof.controllers import Controller
+from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import SearchSpace
+
+Gradient = Literal["exact", "published"]
+GRADIENTS: tuple[Gradient, ...] = get_args(Gradient)
+
+
+def attack(
+    recordings: RecordingSet,
+    controller: Controller,
+    space: SearchSpace,
+    *,
+    groups: Sequence[Group] = (RIGHT_GROUP, LEFT_GROUP),
+    schedule: Schedule | None = None,
+    restarts: int = 4,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+    gradient: Gradient = "exact",
+    random_patterns: int = 0,
+    checkpoint: Path | None = None,
+    on_step: Callable[[int, float], None] = lambda _iteration, _best: None,
+) -> AttackResult:
+    """Find the pattern that shifts a controller's steering most on recorded drives.
+
+    Args:
+        recordings: the drives, with their view of the canvas and its colours.
+        controller: on `device`, in `dtype`.
+        space: the patterns allowed.
+        groups: drives attacked together; the paper's two sides by default, of which the stronger is kept.
+        schedule: the paper's by default.
+        restarts: random starts of every group.
+        seed: of the starts.
+        device: where to search.
+        dtype: precision of the controller.
+        gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
+        random_patterns: random patterns a group that the self-check compares with; 0 for none.
+        checkpoint: file that keeps the search after every step; an interrupted one goes on from it.
+        on_step: called after every step with its number and the best shift so far.
+
+    Raises:
+        ControllerError: the controller takes other frames, or answers NaN.
+        RecordingError: a group names drives that the set lacks.
+    """
+    schedule = schedule or Schedule()
+    kind = PublishedSurrogate if gradient == "published" else Surrogate
+    surrogate = kind(recordings, controller, groups, device=device, dtype=dtype)
+    start = time.perf_counter()
+    search = gradopt(
+        surrogate, space, schedule=schedule, restarts=restarts, seed=seed, checkpoint=checkpoint, on_step=on_step
+    )
+    cost = Cost(controller_frames=surrogate.frames_evaluated, seconds=time.perf_counter() - start)
+    checks = check_search(surrogate, space, search, random_patterns=random_patterns, seed=seed)
+    winner, restart = divmod(int(search.best.argmax()), restarts)
+    pattern = space.pattern(search.best_unit[winner, restart].cpu())
+    return AttackResult(
+        pattern=pattern,
+        group=str(groups[winner]),
+        surrogate_shift=float(search.best[winner, restart]),
+        by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
+        history=search.history.double().numpy(),
+        stopped=search.stopped,
+        cost=cost,
+        checks=checks,
+        space=space,
+        schedule=schedule,
+        restarts=restarts,
+        seed=seed,
+    )

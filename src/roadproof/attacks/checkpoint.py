@@ -1,0 +1,40 @@
+"""Keeping a running search on disk, so that an interrupted one goes on where it was."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from roadproof.files import write_atomically
+
+
+def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None:
+    """Write the tensors of a search, marked with what search they belong to.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+    write_atomically(path, lambda part: save_file(tensors, part, {"identity": _digest(identity)}))
+
+
+def load_checkpoint(path: Path, identity: str, device: torch.device) -> dict[str, Tensor] | None:
+    """The tensors of a search, or None where there are none, or they belong to another search or are damaged."""
+    if not path.exists():
+        return None
+    try:
+        with safe_open(path, framework="pt") as stored:
+            if (stored.metadata() or {}).get("identity") != _digest(identity):
+                return None
+            return {name: stored.get_tensor(name).to(device) for name in stored.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError):
+        return None
+
+
+def _digest(identity: str) -> str:
+    return hashlib.sha256(identity.encode()).hexdigest()

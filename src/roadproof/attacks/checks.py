@@ -1,0 +1,113 @@
+"""The attack distrusts itself: why a search may have found less than there is, each with a line of advice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.attacks.gradopt import Search, random_search
+from roadproof.attacks.surrogate import Surrogate
+from roadproof.search_space import SearchSpace
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing looked at.
+
+    Args:
+        name: what.
+        passed: whether all is well.
+        finding: what was seen, in a sentence.
+        advice: what to do about it; empty where all is well.
+    """
+
+    name: str
+    passed: bool
+    finding: str
+    advice: str = ""
+
+
+def check_search(
+    surrogate: Surrogate, space: SearchSpace, search: Search, *, random_patterns: int, seed: int
+) -> tuple[Check, ...]:
+    """Look for the usual reasons why a gradient search disappoints.
+
+    Args:
+        surrogate: what was searched on.
+        space: where.
+        search: what came of it.
+        random_patterns: patterns of the random search it is compared with, a group; 0 leaves that check out.
+        seed: of those.
+    """
+    checks = [
+        _check_determinism(surrogate, space, search),
+        _check_gradients(surrogate, space, search),
+        _check_bounds(space, search),
+    ]
+    if random_patterns:
+        checks.append(_check_against_random(surrogate, space, search, random_patterns, seed))
+    return tuple(checks)
+
+
+def _check_determinism(surrogate: Surrogate, space: SearchSpace, search: Search) -> Check:
+    again = surrogate.values(space, search.best_unit)
+    drift = float((again - search.best).abs().max())
+    passed = drift <= 1e-3 * max(float(search.best.abs().max()), 1e-3)
+    return Check(
+        "deterministic controller",
+        passed,
+        f"the best patterns, shown again, differ by {drift:.2g} in divergence",
+        "" if passed else "the controller answers differently to the same frames: put it in eval mode, fix its seeds",
+    )
+
+
+def _check_gradients(surrogate: Surrogate, space: SearchSpace, search: Search) -> Check:
+    _, gradient = surrogate.values_and_gradients(space, search.best_unit)
+    _, at_start = surrogate.values_and_gradients(
+        space, space.random((len(surrogate.groups), 2), torch.Generator().manual_seed(0)).to(surrogate.device)
+    )
+    dead = sum(float(_zero_share(part)) for part in (gradient, at_start)) / 2
+    passed = dead < 0.5
+    return Check(
+        "non-zero gradients",
+        passed,
+        f"{dead:.0%} of the parameters have no gradient",
+        ""
+        if passed
+        else "the controller does not pass gradients on (argmax, rounding, detach, saturation): make it "
+        "differentiable, or search without gradients",
+    )
+
+
+def _zero_share(gradient: Float[Tensor, "*n"]) -> Float[Tensor, ""]:
+    return (gradient == 0).float().mean()
+
+
+def _check_bounds(space: SearchSpace, search: Search) -> Check:
+    group, restart = divmod(int(search.best.argmax()), search.best.shape[1])
+    shape_parameters = search.best_unit[group, restart, :, : len(space.shape_ranges)]
+    stuck = float(((shape_parameters == 0) | (shape_parameters == 1)).float().mean())
+    passed = stuck < 0.5
+    return Check(
+        "parameters inside their bounds",
+        passed,
+        f"{stuck:.0%} of the winner's shape parameters lie on a bound",
+        "" if passed else "the bounds hold the pattern back: widen them, use the free family, or add figures",
+    )
+
+
+def _check_against_random(
+    surrogate: Surrogate, space: SearchSpace, search: Search, patterns: int, seed: int
+) -> Check:
+    _, by_chance = random_search(surrogate, space, patterns=patterns, seed=seed + 1)
+    found, chance = float(search.best.max()), float(by_chance.max())
+    passed = found > chance
+    return Check(
+        "better than random search",
+        passed,
+        f"gradients found {found:.3f} steer a frame, the best of {patterns} random patterns a group {chance:.3f}",
+        "" if passed else "use more restarts or a smaller learning rate; the controller's gradients may mislead",
+    )

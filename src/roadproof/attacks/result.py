@@ -1,0 +1,116 @@
+"""What came of an attack, and its file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.attacks.checks import Check
+from roadproof.attacks.gradopt import Schedule
+from roadproof.errors import RoadproofError
+from roadproof.files import read_json, write_atomically
+from roadproof.patterns import Pattern, load_pattern, save_pattern
+from roadproof.search_space import SearchSpace
+
+FORMAT = "roadproof-attack"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Cost:
+    """What an attack took.
+
+    Args:
+        controller_frames: frames the controller was shown, forward or forward and backward.
+        seconds: wall time of the search, without loading and checks.
+    """
+
+    controller_frames: int
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class AttackResult:
+    """The pattern an attack found on recorded drives, and how it was found.
+
+    Every number in it is a *surrogate* number, from composited frames; driving says what the car does.
+
+    Args:
+        pattern: the strongest pattern.
+        group: the group it was found for, e.g. "clean+right".
+        surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
+        by_group: the best mean shift of every group.
+        history: mean shift at every iteration, (iterations, groups, restarts).
+        stopped: why the search ended.
+        cost: what it took.
+        checks: what the attack found when it distrusted itself.
+        space: where it looked.
+        schedule: its steps.
+        restarts: random starts of every group.
+        seed: of the starts.
+    """
+
+    pattern: Pattern
+    group: str
+    surrogate_shift: float
+    by_group: dict[str, float]
+    history: Float[np.ndarray, "i g r"]
+    stopped: str
+    cost: Cost
+    checks: tuple[Check, ...]
+    space: SearchSpace
+    schedule: Schedule
+    restarts: int
+    seed: int
+
+    def save(self, folder: Path) -> None:
+        """Write pattern.json, pattern.png and result.json.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        save_pattern(self.pattern, folder / "pattern.json")
+        content = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "kind": "surrogate: composited frames, not driving",
+            **{name: getattr(self, name) for name in ("group", "surrogate_shift", "by_group", "stopped")},
+            "cost": asdict(self.cost),
+            "checks": [asdict(check) for check in self.checks],
+            "space": asdict(self.space),
+            "schedule": asdict(self.schedule),
+            "restarts": self.restarts,
+            "seed": self.seed,
+            "history": np.round(self.history.astype(float), 6).tolist(),
+        }
+        write_atomically(folder / "result.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+
+    @staticmethod
+    def load(folder: Path) -> AttackResult:
+        """Read what `save` wrote.
+
+        Raises:
+            RoadproofError: a file is missing, damaged or of another format.
+        """
+        fields = read_json(folder / "result.json", FORMAT, FORMAT_VERSION, RoadproofError)
+        try:
+            return AttackResult(
+                pattern=load_pattern(folder / "pattern.json"),
+                cost=Cost(**fields["cost"]),
+                checks=tuple(Check(**check) for check in fields["checks"]),
+                space=_space(fields["space"]),
+                schedule=Schedule(**fields["schedule"] | {"drops": tuple(fields["schedule"]["drops"])}),
+                history=np.array(fields["history"], dtype=np.float64),
+                **{name: fields[name] for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed")},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None
+
+
+def _space(fields: dict[str, Any]) -> SearchSpace:
+    return SearchSpace(**fields | {"albedo": tuple(fields["albedo"])})

@@ -1,0 +1,81 @@
+"""What a pattern does to a controller on recorded drives, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from roadproof.attacks.surrogate import Surrogate
+from roadproof.compositing import composite
+from roadproof.controllers import Controller
+from roadproof.objectives import Group
+from roadproof.patterns import Pattern
+from roadproof.recordings import RecordingSet
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class ShownDrive:
+    """One recorded drive without and with a pattern composited in.
+
+    Args:
+        name: of the drive.
+        clean: its frames.
+        painted: the same with the pattern.
+        clean_steer: the controller's answers to the clean frames.
+        painted_steer: its answers to the composited ones.
+    """
+
+    name: str
+    clean: UInt8[np.ndarray, "f h w 3"]
+    painted: UInt8[np.ndarray, "f h w 3"]
+    clean_steer: Float[np.ndarray, " f"]
+    painted_steer: Float[np.ndarray, " f"]
+
+    @property
+    def mean_shift(self) -> float:
+        """How far steering moved, a frame; positive = right."""
+        return float((self.painted_steer - self.clean_steer).mean())
+
+
+def show_pattern(
+    pattern: Pattern,
+    recordings: RecordingSet,
+    controller: Controller,
+    group: Group,
+    *,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> tuple[ShownDrive, ...]:
+    """Composite a pattern into the drives of a group and ask the controller.
+
+    Args:
+        pattern: one pattern.
+        recordings: the drives.
+        controller: on `device`, in `dtype`.
+        group: which drives.
+        device: where to composite.
+        dtype: precision of the controller.
+    """
+    surrogate = Surrogate(recordings, controller, [group], device=device, dtype=dtype)
+    view = surrogate.views[0]
+    on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
+    with torch.no_grad():
+        shift = surrogate.shifts([on_device])[0][0].cpu().numpy()
+        painted = composite(on_device, view)[0].permute(0, 2, 3, 1).mul(255).round().to(torch.uint8).cpu().numpy()
+    clean_steer = surrogate.clean_steer[0].cpu().numpy()
+    drives = group.select(recordings)
+    ends = np.cumsum([len(drive.frames) for drive in drives])
+    return tuple(
+        ShownDrive(
+            name=drive.name,
+            clean=drive.frames,
+            painted=painted[end - len(drive.frames) : end],
+            clean_steer=clean_steer[end - len(drive.frames) : end],
+            painted_steer=(clean_steer + shift)[end - len(drive.frames) : end],
+        )
+        for drive, end in zip(drives, ends, strict=True)
+    )
+

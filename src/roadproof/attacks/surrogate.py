@@ -1,0 +1,173 @@
+"""The surrogate an attack searches on: recorded frames with a pattern composited in, shown to the controller.
+
+Its numbers are predictions for drives near the recorded ones; what a car really does is measured by driving.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.compositing import CanvasView, Compositor, view_canvas
+from roadproof.controllers import Controller
+from roadproof.errors import ControllerError
+from roadproof.objectives import Group, divergence
+from roadproof.patterns import Pattern
+from roadproof.photometry import PixelMaps
+from roadproof.recordings import Recording, RecordingSet
+from roadproof.search_space import SearchSpace
+
+MAX_FRAMES = 256
+"""Frames the controller sees at once: bounds memory, and more make no CPU faster."""
+
+
+class Surrogate:
+    """Divergence of patterns on a set of recordings, for every group at once, with gradients.
+
+    Args:
+        recordings: the drives.
+        controller: on `device`, in `dtype`.
+        groups: drives attacked together; each has patterns of its own.
+        device: where frames are composited.
+        dtype: precision of the frames the controller is given; compositing itself is float32.
+
+    Raises:
+        ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
+        RecordingError: a group names drives that the set lacks.
+    """
+
+    def __init__(
+        self,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        height, width = recordings.view.height_px, recordings.view.width_px
+        if controller.input_size not in (None, (height, width)):
+            wanted = controller.input_size
+            raise ControllerError(
+                f"the controller takes frames of {wanted[1]}×{wanted[0]} (width × height), "
+                f"the recordings have {width}×{height}; use a controller for this input, or record for this controller"
+            )
+        self.groups = tuple(groups)
+        self.controller = controller
+        self.dtype = dtype
+        self.frames_evaluated = 0
+        drives = [group.select(recordings) for group in groups]
+        self.lengths = [[len(drive.frames) for drive in members] for members in drives]
+        self.views = [_view(recordings, members, device) for members in drives]
+        self._speed = [_joined([drive.speed_mps for drive in members], device, dtype) for members in drives]
+        self._command = [_joined([drive.command for drive in members], device, torch.int64) for members in drives]
+        with torch.no_grad():
+            self.clean_steer = [
+                self._steer(view.clean_frames.to(dtype), speed, command)
+                for view, speed, command in zip(self.views, self._speed, self._command, strict=True)
+            ]
+        if not all(bool(steer.isfinite().all()) for steer in self.clean_steer):
+            raise ControllerError("the controller answers NaN or infinity to clean frames; check its weights and dtype")
+
+    @property
+    def device(self) -> torch.device:
+        """Where frames are composited."""
+        return self.views[0].frames.device
+
+    def divergences(self, patterns: Sequence[Pattern]) -> Float[Tensor, "g r"]:
+        """δ per frame of R patterns for each group, differentiable in the patterns.
+
+        Args:
+            patterns: one batch of R patterns a group.
+        """
+        shifts = self.shifts(patterns)
+        return torch.stack(
+            [
+                divergence(shift, lengths, group.direction)
+                for shift, lengths, group in zip(shifts, self.lengths, self.groups, strict=True)
+            ]
+        )
+
+    def shifts(self, patterns: Sequence[Pattern]) -> list[Float[Tensor, "r f"]]:
+        """Steer on composited minus steer on clean frames, for every group, pattern and frame."""
+        copies = len(patterns[0].boxes)
+        frames = self._compositor(copies)(patterns)
+        speed = torch.cat([part.repeat(copies) for part in self._speed])
+        command = torch.cat([part.repeat(copies) for part in self._command])
+        steer = self._steer(frames, speed, command)
+        parts = steer.split([copies * len(view.frames) for view in self.views])
+        return [part.view(copies, -1) - clean for part, clean in zip(parts, self.clean_steer, strict=True)]
+
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """δ per frame at points of a search space, without gradients, a bounded number of frames at a time."""
+        with torch.no_grad():
+            return torch.cat([self.divergences(_patterns(space, part)) for part in unit.split(self.batch, dim=1)], 1)
+
+    def values_and_gradients(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+        """δ per frame and its gradient at points of a search space, a bounded number of frames at a time.
+
+        Args:
+            space: the patterns.
+            unit: R points a group.
+            coarse: whether the search is still in its first stage; exact gradients do not care.
+        """
+        del coarse
+        values: list[Tensor] = []
+        gradients: list[Tensor] = []
+        for part in unit.split(self.batch, dim=1):
+            leaf = part.detach().requires_grad_()
+            value = self.divergences(_patterns(space, leaf))
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+            values.append(value.detach())
+            gradients.append(gradient)
+        return torch.cat(values, 1), torch.cat(gradients, 1)
+
+    def fingerprint(self) -> str:
+        """Tells this surrogate from another: drives, calibration, controller (by its clean answers) and precision."""
+        digest = hashlib.sha256(repr((self.groups, self.lengths, self.dtype)).encode())
+        for view, steer in zip(self.views, self.clean_steer, strict=True):
+            for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer):
+                digest.update(tensor.cpu().numpy().tobytes())
+        return digest.hexdigest()
+
+    @property
+    def batch(self) -> int:
+        """Patterns a group evaluated at once."""
+        return max(1, MAX_FRAMES // sum(len(view.frames) for view in self.views))
+
+    def _compositor(self, copies: int) -> Compositor:
+        kept = getattr(self, "_kept", None)
+        if kept is None or kept[0] != copies:
+            self._kept = (copies, Compositor(self.views, copies, dtype=self.dtype))
+        return self._kept[1]
+
+    def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
+        self.frames_evaluated += len(frames)
+        return self.controller.steer(frames, speed, command).float()
+
+
+def _patterns(space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> list[Pattern]:
+    return [space.pattern(group) for group in unit]
+
+
+def _view(recordings: RecordingSet, drives: Sequence[Recording], device: torch.device | str) -> CanvasView:
+    maps = [drive.maps for drive in drives if drive.maps is not None]
+    return view_canvas(
+        np.concatenate([drive.frames for drive in drives]),
+        np.concatenate([drive.image_from_canvas for drive in drives]),
+        recordings.view,
+        recordings.colour,
+        maps=PixelMaps.concatenate(maps) if len(maps) == len(drives) else None,
+        device=device,
+    )
+
+
+def _joined(parts: Sequence[np.ndarray], device: torch.device | str, dtype: torch.dtype) -> Tensor:
+    return torch.tensor(np.concatenate(parts), device=device, dtype=dtype)

@@ -1,0 +1,50 @@
+"""The command line: thin verbs over the public functions, one file a verb.
+
+A `RoadproofError` is one line on standard error and exit code 2, never a traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from roadproof import __version__
+from roadproof.cli.attack import attack
+from roadproof.errors import RoadproofError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
+)
+app.command()(attack)
+
+
+def _version(wanted: bool) -> None:  # noqa: FBT001
+    if wanted:
+        typer.echo(f"roadproof {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(  # pyright: ignore[reportUnusedFunction]
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,  # noqa: FBT002
+) -> None:
+    del version
+
+
+def main() -> None:
+    """Entry point of the `roadproof` command."""
+    complain = Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print
+    try:
+        app()
+    except RoadproofError as error:
+        complain(f"roadproof: {error}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        complain("roadproof: interrupted; the same command goes on from here")
+        sys.exit(130)

@@ -1,0 +1,131 @@
+"""The card of a weights file: which network it belongs to and what frames that network wants.
+
+The same JSON stands in the header of the `.safetensors` files that roadproof writes, or beside any file as
+`NAME.json`::
+
+    {
+      "format": "roadproof-controller", "version": 1,
+      "architecture": "pilotnet", "activation": "elu", "target_speed_mps": 6.0,
+      "preparation": {"frame_size": [88, 200], "rows": [15, 81], "network_size": [66, 200],
+                      "colour": "yuv", "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5, 0.5]}
+    }
+
+Only `format` and `version` must be there. An exported network (`.onnx`, `.pt2`) has no architecture.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from dataclasses import asdict, dataclass, fields
+from typing import Any, cast
+
+from roadproof.controllers.frames import FramePreparation
+from roadproof.errors import ControllerError
+
+CARD_FORMAT = "roadproof-controller"
+CARD_VERSION = 1
+
+_NUMBERS_PER_FIELD = {"frame_size": 2, "rows": 2, "network_size": 2, "mean": 3, "std": 3}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ControllerCard:
+    """What a weights file does not say by itself.
+
+    Args:
+        architecture: "cil" or "pilotnet", or None for an exported network.
+        width: CIL's factor on channels and units.
+        activation: PilotNet's, "elu" or "relu".
+        target_speed_mps: speed held when a network that only steers drives.
+        preparation: how frames become the network's input, or None for the architecture's own.
+    """
+
+    architecture: str | None = None
+    width: float = 1.0
+    activation: str = "elu"
+    target_speed_mps: float = 6.0
+    preparation: FramePreparation | None = None
+
+    def to_json(self) -> str:
+        """The card as text, with its format version."""
+        stated = {name: value for name, value in asdict(self).items() if value is not None}
+        return json.dumps({"format": CARD_FORMAT, "version": CARD_VERSION, **stated}, indent=2)
+
+
+def read_card(text: str, source: str) -> ControllerCard:
+    """The card written in `text`.
+
+    Args:
+        text: JSON.
+        source: where it stands, for messages.
+
+    Raises:
+        ControllerError: it is not a card, of another version, or holds an unknown key or a value of the wrong kind.
+    """
+    try:
+        card: object = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ControllerError(f"card {source} is not JSON: {error}") from error
+    stated = _object(card, source)
+    if stated.pop("format", None) != CARD_FORMAT:
+        raise ControllerError(f'card {source} is not a controller card, expected "format": "{CARD_FORMAT}"')
+    if (version := stated.pop("version", None)) != CARD_VERSION:
+        raise ControllerError(f"card {source} has version {version!r}, this roadproof reads version {CARD_VERSION}")
+    _known(stated, ControllerCard, source)
+    values: dict[str, Any] = {
+        name: _text(stated, name, source) for name in ("architecture", "activation") if name in stated
+    }
+    values |= {name: _number(stated[name], name, source) for name in ("width", "target_speed_mps") if name in stated}
+    if "preparation" in stated:
+        values["preparation"] = _preparation(_object(stated["preparation"], source), source)
+    return ControllerCard(**values)
+
+
+def _preparation(stated: dict[str, object], source: str) -> FramePreparation:
+    _known(stated, FramePreparation, source)
+    values: dict[str, Any] = {name: value for name, value in stated.items() if value is not None}
+    for name, count in _NUMBERS_PER_FIELD.items():
+        if name in values:
+            values[name] = _numbers(values[name], count, name, source)
+    if "colour" in values:
+        values["colour"] = _text(values, "colour", source)
+    return FramePreparation(**values)
+
+
+def _object(value: object, source: str) -> dict[str, object]:
+    if not isinstance(value, dict):
+        raise ControllerError(f"card {source} holds {value!r} where a JSON object is expected")
+    return dict(cast("dict[str, object]", value))
+
+
+def _known(stated: dict[str, object], noun: type, source: str) -> None:
+    names = [field.name for field in fields(noun)]
+    for key in stated:
+        if key not in names:
+            nearest = difflib.get_close_matches(key, names, n=1)
+            hint = f"did you mean {nearest[0]!r}?" if nearest else f"expected one of {', '.join(names)}"
+            raise ControllerError(f"card {source} has an unknown key {key!r}; {hint}")
+
+
+def _text(stated: dict[str, Any], name: str, source: str) -> str:
+    if not isinstance(stated[name], str):
+        raise ControllerError(f"card {source}: {name} is {stated[name]!r}, expected text")
+    return stated[name]
+
+
+def _number(value: object, name: str, source: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ControllerError(f"card {source}: {name} is {value!r}, expected a number")
+    return float(value)
+
+
+def _numbers(value: object, count: int, name: str, source: str) -> tuple[float | int, ...]:
+    if not isinstance(value, list) or len(cast("list[object]", value)) != count:
+        raise ControllerError(f"card {source}: {name} is {value!r}, expected a list of {count} numbers")
+    numbers = tuple(_number(item, name, source) for item in cast("list[object]", value))
+    if name in ("mean", "std"):
+        return numbers
+    if any(number != int(number) for number in numbers):
+        raise ControllerError(f"card {source}: {name} is {value!r}, expected whole numbers")
+    return tuple(int(number) for number in numbers)

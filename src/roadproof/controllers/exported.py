@@ -1,0 +1,142 @@
+"""Networks exported by others: `torch.export` (.pt2) and ONNX (.onnx).
+
+Convention:
+    An exported network takes a batch of any size. Its inputs are told apart by name: `frames` (RGB in [0, 1]) or
+    `frames_yuv` (OpenCV's YUV, x / 127.5 − 1), and `speed_mps` and `command` if it wants them; a single input may
+    have any name and is then `frames`. Its only output is the steering, (b,) or (b, 1), positive to the right.
+    A card beside the file (`cards`) says more: the size of the recorded frames, rows to keep, colour, mean and
+    deviation. Without one, frames come at the network's own size.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from roadproof.controllers.cards import ControllerCard
+from roadproof.controllers.frames import FramePreparation
+from roadproof.controllers.onnx_graph import OnnxGraph
+from roadproof.controllers.steering import CruiseControl, SteeringController
+from roadproof.errors import ControllerError, DeviceError
+
+InputShapes = dict[str, tuple[int | None, ...]]
+
+_YUV_SIGNED = FramePreparation(colour="yuv", mean=(0.5, 0.5, 0.5), std=(0.5, 0.5, 0.5))
+
+
+def exported_controller(
+    path: Path, card: ControllerCard, *, device: torch.device, dtype: torch.dtype
+) -> SteeringController:
+    """A controller around an exported network.
+
+    Args:
+        path: a `.pt2` or `.onnx` file.
+        card: how frames are prepared for it.
+        device: where it shall compute.
+        dtype: in which precision; a `.pt2` file has its own.
+
+    Raises:
+        ControllerError: the file cannot be read, its inputs cannot be told apart, or its batch is fixed.
+        DeviceError: a `.pt2` file of another precision.
+    """
+    network = TorchProgram(path, device) if path.suffix == ".pt2" else OnnxGraph(path)
+    if isinstance(network, TorchProgram):
+        own = {parameter.dtype for parameter in network.parameters() if parameter.is_floating_point()} - {dtype}
+        if own:
+            raise DeviceError(f"{path} computes in {own.pop()}, not {dtype}; ask for that dtype or export it again")
+    names, preparation = _bound(network.inputs, card, path)
+    cruise = CruiseControl(target_mps=card.target_speed_mps)
+    return SteeringController(network, preparation=preparation, inputs=names, cruise=cruise)
+
+
+class TorchProgram(nn.Module):
+    """A program saved by `torch.export.save`, with its weights frozen; it computes in the precision it was saved in.
+
+    Args:
+        path: a `.pt2` file.
+        device: where it shall compute.
+
+    Raises:
+        ControllerError: it cannot be read, or was exported for one batch size only.
+    """
+
+    def __init__(self, path: Path, device: torch.device) -> None:
+        super().__init__()
+        from torch.export.passes import move_to_device_pass
+
+        try:
+            with _pickles_refused():
+                program = torch.export.load(path)
+            program = move_to_device_pass(program, device)
+        except Exception as error:  # whatever the archive's contents make the reader raise
+            line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            raise ControllerError(f"{path} is not a torch.export file that this torch reads: {line}") from error
+        self.inputs: InputShapes = {}
+        wanted = program.graph_signature.user_inputs
+        for node in program.graph.nodes:
+            if node.op == "placeholder" and node.name in wanted:
+                shape = cast("tuple[int | torch.SymInt, ...]", node.meta["val"].shape)
+                self.inputs[node.name] = tuple(size if isinstance(size, int) else None for size in shape)
+        for name, shape in self.inputs.items():
+            if shape and shape[0] is not None:
+                raise ControllerError(
+                    f"{path}: input {name} was exported for batches of exactly {shape[0]}; export it with "
+                    'dynamic_shapes={0: torch.export.Dim("batch")} for every input'
+                )
+        self.program = program.module()
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The program's output for its inputs, in order."""
+        answer: Tensor | tuple[Tensor, ...] = self.program(*inputs)
+        return answer[0] if isinstance(answer, tuple) and len(answer) == 1 else cast("Tensor", answer)
+
+    def train(self, mode: bool = True) -> TorchProgram:  # noqa: ARG002
+        """Nothing: an exported program stays as it was exported."""
+        return self
+
+
+def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple[str, ...], FramePreparation]:
+    """What each input is, and how its frames are prepared."""
+    known = {"frames", "frames_yuv", "speed_mps", "command"}
+    names = list(shapes)
+    if len(names) == 1 and names[0] not in known:
+        names = ["frames"]
+    pictures = [name for name in names if name.startswith("frames")]
+    if not set(names) <= known or len(pictures) != 1:
+        raise ControllerError(
+            f"{path} takes inputs named {', '.join(names)}; expected frames or frames_yuv, and speed_mps and command "
+            "if it wants them: export it with these names"
+        )
+    picture = shapes[list(shapes)[names.index(pictures[0])]]
+    preparation = card.preparation or (_YUV_SIGNED if pictures[0] == "frames_yuv" else FramePreparation())
+    size = picture[2:] if len(picture) == 4 else (None, None)
+    if size[0] is not None and size[1] is not None:
+        fixed = (size[0], size[1])
+        if preparation.network_size not in (None, fixed):
+            raise ControllerError(f"the card of {path} says network_size {preparation.network_size}, the file {fixed}")
+        whole = preparation.rows is None and preparation.network_size is None
+        frame_size = preparation.frame_size or (fixed if whole else None)
+        preparation = replace(preparation, network_size=fixed, frame_size=frame_size)
+    return tuple("frames" if name in pictures else name for name in names), preparation
+
+
+@contextmanager
+def _pickles_refused() -> Generator[None, None, None]:
+    """Let torch read tensors only: its archive reader would otherwise unpickle what an archive asks it to."""
+    name = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before

@@ -1,0 +1,140 @@
+"""An ONNX graph as a torch module: evaluated node by node, so that gradients flow to the frames.
+
+Why not a converter from elsewhere: those alive need torchvision or are a single first release; a steering network
+needs some sixty operators, each a line or a few.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+
+from roadproof.controllers.onnx_operators import OPERATORS
+from roadproof.errors import ControllerError
+
+_OLDEST_OPERATOR_SET = 13
+
+
+class _Node(NamedTuple):
+    operator: str
+    attributes: dict[str, Any]
+    inputs: tuple[str, ...]
+    output: str
+    spent: tuple[str, ...]
+    """Values that no later node needs."""
+
+
+class OnnxGraph(nn.Module):
+    """The graph of an ONNX file with one output; its floating-point constants are buffers.
+
+    Args:
+        path: an `.onnx` file; external data must lie in its folder.
+
+    Raises:
+        ControllerError: the extra is not installed, the file is not ONNX, older than operator set 13, has several
+            outputs, or uses an operator that is not there; the message names it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        model = _read(path)
+        from onnx import helper, numpy_helper
+
+        graph = model.graph
+        versions = [opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")]
+        if not versions or versions[0] < _OLDEST_OPERATOR_SET:
+            raise ControllerError(
+                f"{path} uses ONNX operator set {versions}, expected {_OLDEST_OPERATOR_SET} or newer; "
+                "convert it with onnx.version_converter or export it again"
+            )
+        if len(graph.output) != 1:
+            raise ControllerError(f"{path} has {len(graph.output)} outputs, expected one: the steering")
+        self.path = path
+        self.output: str = graph.output[0].name
+        self._buffer_of: dict[str, str] = {}
+        for constant in graph.initializer:
+            self._keep(constant.name, torch.tensor(numpy_helper.to_array(constant)))
+        self.inputs = {
+            value.name: tuple(dim.dim_value or None for dim in value.type.tensor_type.shape.dim)
+            for value in graph.input
+            if value.name not in self._buffer_of
+        }
+        """Shape of each input; None where it is not fixed."""
+        nodes: list[tuple[str, dict[str, Any], tuple[str, ...], str]] = []
+        for node in graph.node:
+            attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}
+            if isinstance(attributes.get("value"), _tensor_type()):
+                attributes["value"] = torch.tensor(numpy_helper.to_array(attributes["value"]))
+            if node.op_type == "Constant":
+                self._keep(node.output[0], torch.as_tensor(next(iter(attributes.values()))))
+                continue
+            if node.op_type not in OPERATORS or node.domain not in ("", "ai.onnx") or any(node.output[1:]):
+                raise ControllerError(
+                    f"{path} uses the ONNX operator {node.domain or 'ai.onnx'}.{node.op_type} in a way roadproof does "
+                    f"not know; known with one output: {', '.join(OPERATORS)}. Export it as .pt2, or wrap the network "
+                    "yourself as module:factory"
+                )
+            nodes.append((node.op_type, attributes, tuple(node.input), node.output[0]))
+        self._nodes = _with_spent_values(nodes, keep=self.output)
+
+    def _keep(self, name: str, constant: Tensor) -> None:
+        self._buffer_of[name] = buffer = f"constant_{len(self._buffer_of)}"
+        self.register_buffer(buffer, constant)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """The output for the inputs, in the file's order.
+
+        Raises:
+            ControllerError: a node cannot be computed; the message names it and the shapes it met.
+        """
+        values: dict[str, Tensor | None] = {"": None, **dict(zip(self.inputs, inputs, strict=True))}
+        values |= {name: cast("Tensor", getattr(self, buffer)) for name, buffer in self._buffer_of.items()}
+        for node in self._nodes:
+            arguments = [values[name] for name in node.inputs]
+            try:
+                values[node.output] = OPERATORS[node.operator](node.attributes, arguments)
+            except (RuntimeError, ValueError, IndexError, KeyError, TypeError) as error:
+                shapes = ", ".join("none" if x is None else str(tuple(x.shape)) for x in arguments)
+                raise ControllerError(
+                    f"{self.path}: ONNX node {node.operator} → {node.output} cannot take shapes {shapes}: {error}"
+                ) from error
+            for name in node.spent:
+                del values[name]
+        output = values[self.output]
+        assert output is not None
+        return output
+
+
+def _with_spent_values(nodes: list[tuple[str, dict[str, Any], tuple[str, ...], str]], keep: str) -> tuple[_Node, ...]:
+    """The nodes, each with the values that it is the last to use; without this every map would stay in memory."""
+    made = {output for *_, output in nodes}
+    seen, result = {keep}, list[_Node]()
+    for operator, attributes, inputs, output in reversed(nodes):
+        spent = tuple({name for name in inputs if name in made and name not in seen})
+        seen.update(inputs)
+        result.append(_Node(operator, attributes, inputs, output, spent))
+    return tuple(reversed(result))
+
+
+def _read(path: Path) -> Any:  # noqa: ANN401
+    try:
+        onnx: Any = importlib.import_module("onnx")
+    except ImportError as error:
+        raise ControllerError(f"{path} needs the ONNX reader: pip install 'roadproof[onnx]'") from error
+    try:
+        model = onnx.load(path)
+        onnx.checker.check_model(model)
+    except Exception as error:  # the reader raises its own, protobuf's and the system's
+        line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise ControllerError(f"{path} is not a valid ONNX file: {line}") from error
+    return model
+
+
+def _tensor_type() -> type:
+    from onnx import TensorProto
+
+    return TensorProto

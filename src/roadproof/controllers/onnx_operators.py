@@ -1,0 +1,265 @@
+"""The ONNX operators that steering networks are made of, in torch: differentiable, on any device.
+
+Each entry of `OPERATORS` takes the node's attributes and its inputs (None where an optional one is left out) and
+gives its only output. Meanings are those of operator set 13 and newer (https://onnx.ai/onnx/operators/).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+Attributes = dict[str, Any]
+Inputs = Sequence[Any]
+Operator = Callable[[Attributes, Inputs], Tensor]
+
+# ONNX' codes of element types (TensorProto.DataType).
+_DTYPES = {
+    1: torch.float32, 2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32, 7: torch.int64,
+    9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16,
+}  # fmt: skip
+
+
+def _integers(x: Tensor | None) -> list[int] | None:
+    return None if x is None else [int(value) for value in x.reshape(-1)]
+
+
+def _get(x: Inputs, index: int) -> Tensor | None:
+    return x[index] if len(x) > index else None
+
+
+def _axes(a: Attributes, x: Inputs) -> list[int] | None:
+    """Axes are an attribute in older operator sets and an input in newer ones."""
+    return a.get("axes") or _integers(_get(x, 1))
+
+
+def _padded(a: Attributes, x: Tensor, value: float) -> Tensor:
+    """Pad the picture by the attributes `pads` (all begins, then all ends) or `auto_pad`."""
+    sizes, kernel = x.shape[2:], a["kernel_shape"]
+    count = len(kernel)
+    pads = a.get("pads", [0] * 2 * count)
+    mode = a.get("auto_pad", b"NOTSET")
+    if mode in (b"SAME_UPPER", b"SAME_LOWER"):
+        strides, dilations = a.get("strides", [1] * count), a.get("dilations", [1] * count)
+        total = [
+            max((math.ceil(n / s) - 1) * s + (k - 1) * d + 1 - n, 0)
+            for n, k, s, d in zip(sizes, kernel, strides, dilations, strict=True)
+        ]
+        small, large = [t // 2 for t in total], [t - t // 2 for t in total]
+        pads = small + large if mode == b"SAME_UPPER" else large + small
+    if not any(pads):
+        return x
+    last_first = [pad for axis in reversed(range(count)) for pad in (pads[axis], pads[axis + count])]
+    return functional.pad(x, last_first, value=value)
+
+
+def _conv(a: Attributes, x: Inputs) -> Tensor:
+    a = {"kernel_shape": list(x[1].shape[2:]), **a}
+    count = len(a["kernel_shape"])
+    convolve = {1: functional.conv1d, 2: functional.conv2d, 3: functional.conv3d}[count]
+    return convolve(
+        _padded(a, x[0], 0.0),
+        x[1],
+        _get(x, 2),
+        stride=a.get("strides", 1),
+        dilation=a.get("dilations", 1),
+        groups=a.get("group", 1),
+    )
+
+
+def _max_pool(a: Attributes, x: Inputs) -> Tensor:
+    padded = _padded(a, x[0], -math.inf)
+    return functional.max_pool2d(
+        padded,
+        a["kernel_shape"],
+        a.get("strides", [1, 1]),
+        dilation=a.get("dilations", 1),
+        ceil_mode=bool(a.get("ceil_mode")),
+    )
+
+
+def _average_pool(a: Attributes, x: Inputs) -> Tensor:
+    kernel, strides = a["kernel_shape"], a.get("strides", [1, 1])
+    mean = functional.avg_pool2d(_padded(a, x[0], 0.0), kernel, strides)
+    if a.get("count_include_pad"):
+        return mean
+    # Averages over real pixels only: divide by their share of the window.
+    return mean / functional.avg_pool2d(_padded(a, torch.ones_like(x[0]), 0.0), kernel, strides)
+
+
+def _gemm(a: Attributes, x: Inputs) -> Tensor:
+    left = x[0].T if a.get("transA") else x[0]
+    right = x[1].T if a.get("transB") else x[1]
+    product = a.get("alpha", 1.0) * (left @ right)
+    return product if _get(x, 2) is None else product + a.get("beta", 1.0) * x[2]
+
+
+def _batch_normalization(a: Attributes, x: Inputs) -> Tensor:
+    return functional.batch_norm(x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5))
+
+
+def _reshape(a: Attributes, x: Inputs) -> Tensor:
+    shape = _integers(x[1]) or []
+    if not a.get("allowzero"):
+        shape = [x[0].shape[axis] if size == 0 else size for axis, size in enumerate(shape)]
+    return x[0].reshape(shape)
+
+
+def _flatten(a: Attributes, x: Inputs) -> Tensor:
+    axis = a.get("axis", 1) % (x[0].ndim + 1)
+    return x[0].reshape(math.prod(x[0].shape[:axis]), -1)
+
+
+def _squeeze(a: Attributes, x: Inputs) -> Tensor:
+    axes = _axes(a, x)
+    return x[0].squeeze() if axes is None else x[0].squeeze(tuple(axes))
+
+
+def _unsqueeze(a: Attributes, x: Inputs) -> Tensor:
+    axes = _axes(a, x) or []
+    result: Tensor = x[0]
+    for axis in sorted(axis % (x[0].ndim + len(axes)) for axis in axes):
+        result = result.unsqueeze(axis)
+    return result
+
+
+def _slice(_: Attributes, x: Inputs) -> Tensor:
+    starts, ends = _integers(x[1]) or [], _integers(x[2]) or []
+    axes = _integers(_get(x, 3)) or list(range(len(starts)))
+    steps = _integers(_get(x, 4)) or [1] * len(starts)
+    result: Tensor = x[0]
+    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
+        kept = list(range(result.shape[axis]))[start : None if step < 0 and end < -result.shape[axis] else end : step]
+        result = result.index_select(axis, torch.tensor(kept, device=result.device, dtype=torch.int64))
+    return result
+
+
+def _gather(a: Attributes, x: Inputs) -> Tensor:
+    axis = a.get("axis", 0) % x[0].ndim
+    index = x[1].to(x[0].device) % x[0].shape[axis]
+    shape = (*x[0].shape[:axis], *index.shape, *x[0].shape[axis + 1 :])
+    return x[0].index_select(axis, index.reshape(-1)).reshape(shape)
+
+
+def _gather_elements(a: Attributes, x: Inputs) -> Tensor:
+    axis = a.get("axis", 0)
+    return x[0].gather(axis, x[1] % x[0].shape[axis])
+
+
+def _pad(a: Attributes, x: Inputs) -> Tensor:
+    pads, count = _integers(x[1]) or [], x[0].ndim
+    axes = [axis % count for axis in _integers(_get(x, 3)) or range(count)]
+    begin, end = dict(zip(axes, pads[: len(axes)], strict=True)), dict(zip(axes, pads[len(axes) :], strict=True))
+    last_first = [pad for axis in reversed(range(count)) for pad in (begin.get(axis, 0), end.get(axis, 0))]
+    mode = {b"constant": "constant", b"reflect": "reflect", b"edge": "replicate"}[a.get("mode", b"constant")]
+    if mode != "constant":
+        # torch reflects and repeats the last two axes of a picture only.
+        return functional.pad(x[0], last_first[: 2 * (count - 2)], mode=mode)
+    value = _get(x, 2)
+    return functional.pad(x[0], last_first, value=0.0 if value is None else float(value))
+
+
+def _clip(_: Attributes, x: Inputs) -> Tensor:
+    return torch.clamp(x[0], min=_get(x, 1), max=_get(x, 2))
+
+
+def _expand(_: Attributes, x: Inputs) -> Tensor:
+    # A size of 1 in the shape asks for the input's own: the broadcast of both.
+    like = x[0].new_empty(_integers(x[1]) or [])
+    return torch.broadcast_tensors(x[0], like)[0]  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+
+
+def _constant_of_shape(a: Attributes, x: Inputs) -> Tensor:
+    value = a.get("value", torch.zeros(1))
+    return value.to(x[0].device).expand(_integers(x[0]) or [])
+
+
+def _divide(_: Attributes, x: Inputs) -> Tensor:
+    return x[0] / x[1] if x[0].is_floating_point() else torch.div(x[0], x[1], rounding_mode="trunc")
+
+
+def _shape(a: Attributes, x: Inputs) -> Tensor:
+    return torch.tensor(x[0].shape[a.get("start", 0) : a.get("end")], dtype=torch.int64, device=x[0].device)
+
+
+def _reduced(kind: Callable[..., Tensor]) -> Operator:
+    def apply(a: Attributes, x: Inputs) -> Tensor:
+        axes = _axes(a, x)
+        if axes is None and a.get("noop_with_empty_axes"):
+            return x[0]
+        every = tuple(range(x[0].ndim)) if axes is None else tuple(axes)
+        return kind(x[0], dim=every, keepdim=bool(a.get("keepdims", 1)))
+
+    return apply
+
+
+def _elementwise(kind: Callable[..., Tensor]) -> Operator:
+    return lambda _, x: kind(*x)
+
+
+OPERATORS: dict[str, Operator] = {
+    "Abs": _elementwise(torch.abs),
+    "Add": _elementwise(torch.add),
+    "And": _elementwise(torch.logical_and),
+    "AveragePool": _average_pool,
+    "BatchNormalization": _batch_normalization,
+    "Cast": lambda a, x: x[0].to(_DTYPES[a["to"]]),
+    "Clip": _clip,
+    "Concat": lambda a, x: torch.cat(list(x), dim=a["axis"]),
+    "ConstantOfShape": _constant_of_shape,
+    "Conv": _conv,
+    "Div": _divide,
+    "Dropout": lambda _, x: x[0],
+    "Elu": lambda a, x: functional.elu(x[0], a.get("alpha", 1.0)),
+    "Equal": _elementwise(torch.eq),
+    "Erf": _elementwise(torch.erf),
+    "Exp": _elementwise(torch.exp),
+    "Expand": _expand,
+    "Flatten": _flatten,
+    "Gather": _gather,
+    "GatherElements": _gather_elements,
+    "Gelu": lambda a, x: functional.gelu(x[0], approximate=a.get("approximate", b"none").decode()),
+    "Gemm": _gemm,
+    "GlobalAveragePool": lambda _, x: x[0].mean(dim=tuple(range(2, x[0].ndim)), keepdim=True),
+    "Greater": _elementwise(torch.gt),
+    "HardSigmoid": lambda a, x: (x[0] * a.get("alpha", 0.2) + a.get("beta", 0.5)).clamp(0.0, 1.0),
+    "HardSwish": lambda _, x: functional.hardswish(x[0]),
+    "Identity": lambda _, x: x[0],
+    "LeakyRelu": lambda a, x: functional.leaky_relu(x[0], a.get("alpha", 0.01)),
+    "Less": _elementwise(torch.lt),
+    "MatMul": _elementwise(torch.matmul),
+    "Max": lambda _, x: reduce(torch.maximum, x),
+    "MaxPool": _max_pool,
+    "Min": lambda _, x: reduce(torch.minimum, x),
+    "Mul": _elementwise(torch.mul),
+    "Neg": _elementwise(torch.neg),
+    "Not": _elementwise(torch.logical_not),
+    "Or": _elementwise(torch.logical_or),
+    "PRelu": lambda _, x: torch.where(x[0] < 0, x[0] * x[1], x[0]),
+    "Pad": _pad,
+    "Pow": _elementwise(torch.pow),
+    "ReduceMax": _reduced(torch.amax),
+    "ReduceMean": _reduced(torch.mean),
+    "ReduceSum": _reduced(torch.sum),
+    "Relu": _elementwise(torch.relu),
+    "Reshape": _reshape,
+    "Selu": lambda _, x: functional.selu(x[0]),
+    "Shape": _shape,
+    "Sigmoid": _elementwise(torch.sigmoid),
+    "Slice": _slice,
+    "Softmax": lambda a, x: x[0].softmax(dim=a.get("axis", -1)),
+    "Softplus": lambda _, x: functional.softplus(x[0]),
+    "Sqrt": _elementwise(torch.sqrt),
+    "Squeeze": _squeeze,
+    "Sub": _elementwise(torch.sub),
+    "Tanh": _elementwise(torch.tanh),
+    "Transpose": lambda a, x: x[0].permute(a.get("perm", list(reversed(range(x[0].ndim))))),
+    "Unsqueeze": _unsqueeze,
+    "Where": _elementwise(torch.where),
+}

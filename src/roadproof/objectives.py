@@ -1,0 +1,112 @@
+"""What an attack drives up: how far a painted pattern shifts a controller's steering on recorded drives.
+
+The divergence δ of the paper compares the controller's answers to composited frames with its answers to the clean
+ones. Signed for a group of drives (clean and pushed right: to the right is positive; clean and pushed left: to the
+left), or the absolute value of each drive's sum where all drives are pooled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.errors import RecordingError
+from roadproof.recordings import Push, Recording, RecordingSet
+
+
+class Direction(StrEnum):
+    """Where an attack pushes: to one side, or to whichever side each drive gives way."""
+
+    RIGHT = "right"
+    LEFT = "left"
+    EITHER = "either"
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Drives attacked together, and where to.
+
+    Args:
+        pushes: which drives belong to it.
+        direction: "right" or "left" for the paper's Group, "either" for Group-All, Random and a single drive.
+    """
+
+    pushes: tuple[Push, ...]
+    direction: Direction
+
+    def __str__(self) -> str:
+        return "+".join(self.pushes) if self.direction is not Direction.EITHER else "all"
+
+    def select(self, recordings: RecordingSet) -> tuple[Recording, ...]:
+        """The drives of a set that belong to this group.
+
+        Raises:
+            RecordingError: the set lacks a kind of drive that the group names.
+        """
+        have = {recording.push for recording in recordings.recordings}
+        missing = [push for push in self.pushes if push not in have]
+        if missing:
+            raise RecordingError(
+                f"group {self} needs a {missing[0]} drive, the set has {', '.join(sorted(have))}; "
+                "record one, or choose other groups"
+            )
+        return tuple(recording for recording in recordings.recordings if recording.push in self.pushes)
+
+
+RIGHT_GROUP = Group((Push.CLEAN, Push.RIGHT), Direction.RIGHT)
+LEFT_GROUP = Group((Push.CLEAN, Push.LEFT), Direction.LEFT)
+
+
+def parse_groups(text: str, recordings: RecordingSet) -> tuple[Group, ...]:
+    """Groups from words: "clean+right,clean+left" (the paper's Group), or "all" (Group-All, Random, T = 1).
+
+    Raises:
+        RecordingError: a word is unknown, or a group mixes or lacks sides.
+    """
+    if text == "all":
+        pushes = tuple(dict.fromkeys(recording.push for recording in recordings.recordings))
+        return (Group(pushes, Direction.EITHER),)
+    return tuple(_parse_group(part) for part in text.split(","))
+
+
+def _parse_group(text: str) -> Group:
+    try:
+        pushes = tuple(Push(word.strip()) for word in text.split("+"))
+    except ValueError:
+        raise RecordingError(f"group {text!r} is unknown; write e.g. clean+right,clean+left or all") from None
+    sides = [push for push in pushes if push in (Push.LEFT, Push.RIGHT)]
+    if len(sides) != 1 or Push.RANDOM in pushes:
+        raise RecordingError(f"group {text!r} needs exactly one of left and right, e.g. clean+right; or write all")
+    return Group(pushes, Direction(sides[0]))
+
+
+def divergence(
+    shift: Float[Tensor, "*b f"], lengths: Sequence[int], direction: Direction
+) -> Float[Tensor, "*b"]:
+    """δ, per frame: how far steering moved where the attack wants it.
+
+    Args:
+        shift: steer on composited minus steer on clean frames, the group's drives one after another.
+        lengths: frames of each drive.
+        direction: "right" counts right as positive, "left" left; "either" takes each drive's absolute sum.
+
+    Returns:
+        The sum over frames divided by their number, so that groups of different length compare; the paper's loss is
+        its negative times the number of frames (and 180/π in the released code).
+
+    References:
+        Eq. tloss and the paragraph below it.
+    """
+    match direction:
+        case Direction.RIGHT:
+            total = shift.sum(-1)
+        case Direction.LEFT:
+            total = -shift.sum(-1)
+        case Direction.EITHER:
+            total = torch.stack([drive.sum(-1).abs() for drive in shift.split(list(lengths), -1)]).sum(0)
+    return total / shift.shape[-1]

@@ -1,0 +1,289 @@
+"""Recorded drives on disk: folders that explain themselves, checked when they are read.
+
+    SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, drives
+    SET/DRIVE/drive.npz        per frame: frame number, homography, speed, command, steer
+    SET/DRIVE/frames/N.png     the controller's input, unpainted; or all of them in SET/DRIVE/frames.npy
+    SET/DRIVE/shading.npz      optional: gain and offset of every pixel (see `photometry.PixelMaps`)
+
+Nothing is pickled, and no path in a file leaves the folder.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import zipfile
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
+
+from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
+from roadproof.files import read_json
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, check_image_from_canvas
+from roadproof.photometry import ColourTransform, PixelMaps
+
+FORMAT = "roadproof-recordings"
+FORMAT_VERSION = 1
+_UNITS = {
+    "frames": "RGB uint8, the controller's input, unpainted",
+    "image_from_canvas": "homography, canvas px (x, y, 1) to camera px, pixel centres at integers, third coordinate > 0",
+    "speed_mps": "m/s",
+    "command": "2 follow, 3 left, 4 right, 5 straight",
+    "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
+}
+_PER_FRAME = ("frame_number", "image_from_canvas", "speed_mps", "command", "steer")
+
+
+class Push(StrEnum):
+    """How a drive was perturbed: not at all, to one side only, or at random."""
+
+    CLEAN = "clean"
+    LEFT = "left"
+    RIGHT = "right"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Recording:
+    """One drive, as far as the canvas is in view.
+
+    Args:
+        name: names its folder.
+        push: how it was perturbed.
+        frames: the controller's input without any paint, (F, H, W, 3).
+        frame_number: of each frame in the drive, rising.
+        image_from_canvas: one homography a frame, canvas px to camera px.
+        speed_mps: m/s.
+        command: CARLA's codes (`datatypes.Command`).
+        steer: what the recorded controller answered to each frame; for information.
+        maps: per-pixel gain and offset of the paint, where they were calibrated.
+
+    Raises:
+        RecordingError: lengths differ, a value is not finite, or a homography is not a view of the canvas.
+    """
+
+    name: str
+    push: Push
+    frames: UInt8[np.ndarray, "f h w 3"]
+    frame_number: Int[np.ndarray, "..."]
+    image_from_canvas: Float[np.ndarray, "..."]
+    speed_mps: Float[np.ndarray, "..."]
+    command: Int[np.ndarray, "..."]
+    steer: Float[np.ndarray, "..."]
+    maps: PixelMaps | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.frames)
+        if count == 0:
+            raise RecordingError(f"drive {self.name} has no frames, expected at least one that shows the canvas")
+        for field in _PER_FRAME:
+            values: np.ndarray = getattr(self, field)
+            tail = (3, 3) if field == "image_from_canvas" else ()
+            if values.shape != (count, *tail):
+                raise RecordingError(
+                    f"drive {self.name}: {field} has shape {values.shape}, expected {(count, *tail)} for {count} frames"
+                )
+            bad = np.flatnonzero(~np.isfinite(values.reshape(count, -1)).all(1))
+            if bad.size:
+                number = self.frame_number[bad[0]]
+                raise RecordingError(f"drive {self.name}: {field} of frame {number} is NaN or infinite; drop the frame")
+        for number, homography in zip(self.frame_number, self.image_from_canvas, strict=True):
+            try:
+                check_image_from_canvas(homography)
+            except GeometryError as error:
+                raise RecordingError(f"drive {self.name}, frame {number}: {error}") from None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class RecordingSet:
+    """Drives of one scenario with one camera, one controller input and one colour transform.
+
+    Args:
+        camera: the camera on the car.
+        view: how the controller's input is made from its picture.
+        colour: painted → seen, common to all drives.
+        recordings: the drives.
+        origin: where they come from, in words.
+
+    Raises:
+        RecordingError: no drive, two of one name, or frames of another size than the controller's input.
+    """
+
+    camera: CameraModel
+    view: CropResize
+    colour: ColourTransform
+    recordings: tuple[Recording, ...]
+    origin: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.recordings:
+            raise RecordingError("the set has no drives, expected at least a clean one")
+        names = [recording.name for recording in self.recordings]
+        if len(set(names)) != len(names):
+            raise RecordingError(f"two drives have the same name among {', '.join(names)}")
+        for recording in self.recordings:
+            height, width = recording.frames.shape[1:3]
+            if (height, width) != (self.view.height_px, self.view.width_px):
+                raise RecordingError(
+                    f"drive {recording.name} has frames of {width}×{height}, "
+                    f"expected {self.view.width_px}×{self.view.height_px} as the set's crop and resize make them"
+                )
+
+
+def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = False) -> None:
+    """Write a set to a new folder, all or nothing.
+
+    Args:
+        recordings: the set.
+        folder: must not exist yet, or be empty.
+        compact: one frames.npy a drive instead of a PNG a frame.
+
+    Raises:
+        OutputError: the folder is there already, or cannot be written.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder} exists already; choose a new folder for the recordings")
+    part: Path | None = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+        for recording in recordings.recordings:
+            _write_drive(recording, part / recording.name, compact=compact)
+        (part / "recordings.json").write_text(json.dumps(_manifest(recordings), indent=1, ensure_ascii=False) + "\n")
+        part.chmod(0o755)
+        part.replace(folder)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}; choose a folder that can be written") from None
+    finally:
+        if part is not None:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def _manifest(recordings: RecordingSet) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "origin": recordings.origin,
+        "units": _UNITS,
+        "canvas_px": CANVAS_SIZE_PX,
+        "camera": asdict(recordings.camera),
+        "crop_resize": asdict(recordings.view),
+        "colour": recordings.colour.to_dict(),
+        "drives": [
+            {"name": recording.name, "push": str(recording.push), "frames": len(recording.frames)}
+            for recording in recordings.recordings
+        ],
+    }
+
+
+def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
+    folder.mkdir()
+    np.savez_compressed(folder / "drive.npz", **{field: getattr(recording, field) for field in _PER_FRAME})
+    if recording.maps is not None:
+        maps = {"gain": recording.maps.gain.numpy(), "offset": recording.maps.offset.numpy()}
+        np.savez_compressed(folder / "shading.npz", **maps)
+    if compact:
+        np.save(folder / "frames.npy", recording.frames, allow_pickle=False)
+        return
+    (folder / "frames").mkdir()
+    for number, frame in zip(recording.frame_number, recording.frames, strict=True):
+        Image.fromarray(frame).save(folder / "frames" / f"{number}.png")
+
+
+def load_recordings(folder: Path) -> RecordingSet:
+    """Read and check a set of recorded drives.
+
+    Raises:
+        RecordingError: the folder or a part of it is missing, damaged or inconsistent; the message names it.
+    """
+    if not folder.is_dir():
+        raise RecordingError(f"no folder {folder}; expected a set of recordings with a recordings.json")
+    if not (folder / "recordings.json").is_file():
+        raise RecordingError(f"{folder} has no recordings.json; expected a set of recordings made by roadproof")
+    manifest = read_json(folder / "recordings.json", FORMAT, FORMAT_VERSION, RecordingError)
+    try:
+        return RecordingSet(
+            camera=CameraModel(**manifest["camera"]),
+            view=CropResize(**manifest["crop_resize"]),
+            colour=ColourTransform.from_dict(manifest["colour"]),
+            recordings=tuple(_read_drive(folder, drive) for drive in manifest["drives"]),
+            origin=str(manifest.get("origin", "")),
+        )
+    except (KeyError, TypeError) as error:
+        raise RecordingError(f"{folder / 'recordings.json'} is incomplete or has an unknown field: {error}") from None
+    except (ColourError, GeometryError) as error:
+        raise RecordingError(f"{folder / 'recordings.json'}: {error}") from None
+
+
+def _read_drive(root: Path, drive: dict[str, Any]) -> Recording:
+    name = str(drive["name"])
+    folder = root / name
+    if Path(name).name != name or name in {"", ".", ".."}:
+        raise RecordingError(f"{root / 'recordings.json'}: drive name {name!r} is not a plain folder name")
+    if not folder.is_dir():
+        raise RecordingError(f"drive {name} is listed in recordings.json but {folder} is missing")
+    try:
+        push = Push(drive["push"])
+    except ValueError:
+        raise RecordingError(f"drive {name} has push {drive['push']!r}, expected one of {', '.join(Push)}") from None
+    fields = _read_arrays(folder / "drive.npz", _PER_FRAME)
+    shading = folder / "shading.npz"
+    maps = _read_arrays(shading, ("gain", "offset")) if shading.exists() else None
+    return Recording(
+        name=name,
+        push=push,
+        frames=_read_frames(folder, fields["frame_number"]),
+        frame_number=fields["frame_number"],
+        image_from_canvas=fields["image_from_canvas"].astype(np.float64),
+        speed_mps=fields["speed_mps"].astype(np.float64),
+        command=fields["command"],
+        steer=fields["steer"].astype(np.float64),
+        maps=None if maps is None else PixelMaps(torch.tensor(maps["gain"]), torch.tensor(maps["offset"])),
+    )
+
+
+def _read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in names}
+    except FileNotFoundError:
+        raise RecordingError(f"{path} is missing") from None
+    except KeyError as error:
+        raise RecordingError(f"{path}: {error.args[0]}") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise RecordingError(f"{path} is damaged ({error}); record or copy it again") from None
+
+
+def _read_frames(folder: Path, numbers: np.ndarray) -> UInt8[np.ndarray, "f h w 3"]:
+    if (folder / "frames.npy").exists():
+        try:
+            frames = cast("np.ndarray", np.load(folder / "frames.npy", allow_pickle=False))
+        except (OSError, ValueError, EOFError) as error:
+            raise RecordingError(f"{folder / 'frames.npy'} is damaged ({error}); record or copy it again") from None
+        if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[-1] != 3:
+            raise RecordingError(
+                f"{folder / 'frames.npy'} is {frames.dtype} of shape {frames.shape}, expected uint8 (frames, h, w, 3)"
+            )
+        return frames
+    frames = [_read_frame(folder / "frames" / f"{number}.png") for number in numbers]
+    sizes = {frame.shape[1::-1] for frame in frames}
+    if len(sizes) > 1:
+        raise RecordingError(f"{folder / 'frames'} has pictures of different sizes: {sorted(sizes)}")
+    return np.stack(frames)
+
+
+def _read_frame(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    try:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except FileNotFoundError:
+        raise RecordingError(f"frame {path} is missing; every frame number of drive.npz needs its PNG") from None
+    except (OSError, SyntaxError, ValueError) as error:
+        raise RecordingError(f"frame {path} cannot be read ({error}); record or copy it again") from None

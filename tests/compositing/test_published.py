@@ -1,0 +1,70 @@
+"""The published way: bit for bit the authors' masks, their local linearisation, and its kinship with ours."""
+
+import numpy as np
+import torch
+from references import approach
+from scenes import PLAIN, road_frames
+
+from roadproof.compositing import composite, view_canvas
+from roadproof.compositing.published import (
+    canvas_mask,
+    composite_published,
+    local_gradients,
+    nearest_canvas_pixels,
+    view_canvas_published,
+)
+from roadproof.geometry import CANVAS_SIZE_PX, CIL_INPUT
+from roadproof.patterns import rectangles_from_published
+
+ROWS = [[70.5, 191.5, 56.7, 37.7, 143.2, 196.7, 112.2], [154.4, 176.0, 44.0, 0.8, 8.4, 150.4, 193.1]]
+
+
+def test_masks_of_the_whole_canvas_are_the_authors_bit_for_bit(carla_data):
+    for trajectory in ("t1", "t2", "t3"):
+        stored = np.load(carla_data / trajectory / "homographies.npz", allow_pickle=False)
+        masks = np.unpackbits(stored["mask_nearest"], axis=1).reshape(-1, 88, 200).astype(bool)
+        ours = nearest_canvas_pixels(stored["H"], CIL_INPUT) < CANVAS_SIZE_PX**2
+        np.testing.assert_array_equal(ours, masks)
+
+
+def test_a_mask_covers_the_rectangles_area():
+    box = rectangles_from_published(ROWS).boxes[1]
+    assert abs(float(canvas_mask(box).sum()) / float(box[2] * box[3]) - 1) < 0.05
+
+
+def test_published_frames_are_ours_without_antialiasing():
+    frames, homographies = road_frames(3, 0), approach(3)
+    pattern = rectangles_from_published(ROWS)
+    published = composite_published(pattern, view_canvas_published(frames, homographies, CIL_INPUT, PLAIN))
+    ours = composite(pattern, view_canvas(frames, homographies, CIL_INPUT, PLAIN)).permute(0, 2, 3, 1)
+    clean = torch.as_tensor(frames) / 255
+    painted = (published != clean).any(-1)
+    assert float((published - ours).abs()[painted].median()) < 0.01
+    assert float((published - ours).abs().mean()) < 0.01
+
+
+def test_local_linearisation_points_where_the_exact_gradient_does():
+    frames, homographies = road_frames(3, 0), approach(3)
+    colours = torch.tensor(ROWS)[:, 4:] / 255
+    values = torch.tensor(ROWS)[:, :4]
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 88), torch.linspace(-1, 1, 200), indexing="ij")
+    weight = (columns + rows)[None, :, :, None].expand(3, -1, -1, 3)
+    shape, colour = local_gradients(
+        values, colours, view_canvas_published(frames, homographies, CIL_INPUT, PLAIN), weight, step=10.0
+    )
+    leaf = torch.tensor(ROWS).requires_grad_()
+    boxes_pattern = _pattern(leaf)
+    exact_frames = composite(boxes_pattern, view_canvas(frames, homographies, CIL_INPUT, PLAIN)).permute(0, 2, 3, 1)
+    (exact,) = torch.autograd.grad((exact_frames * weight).sum(), leaf)
+    cosine = torch.nn.functional.cosine_similarity
+    for parameter in range(4):
+        assert torch.sign(shape[:, parameter]).tolist() == torch.sign(exact[:, parameter]).tolist()
+    assert float(cosine(shape.flatten(), exact[:, :4].flatten(), dim=0)) > 0.9
+    assert float(cosine(colour.flatten(), exact[:, 4:].flatten(), dim=0)) > 0.98
+
+
+def _pattern(rows):
+    from roadproof.coverage import Shape
+    from roadproof.patterns import Pattern, boxes_from_published
+
+    return Pattern((Shape.RECTANGLE,) * len(rows), boxes_from_published(rows[:, :4]), rows[:, 4:] / 255)

@@ -1,0 +1,49 @@
+"""Cards: what is written is read back; what is wrong is said in one line."""
+
+import json
+
+import pytest
+
+from roadproof.controllers import PILOTNET_ON_CARLA, ControllerCard
+from roadproof.controllers.cards import read_card
+from roadproof.errors import ControllerError
+
+
+def card(**stated):
+    return json.dumps({"format": "roadproof-controller", "version": 1} | stated)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        ControllerCard(),
+        ControllerCard(architecture="cil", width=0.5),
+        ControllerCard(architecture="pilotnet", activation="relu", target_speed_mps=8.0, preparation=PILOTNET_ON_CARLA),
+    ],
+)
+def test_a_card_is_read_as_it_was_written(written):
+    assert read_card(written.to_json(), "x") == written
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "card net.json is not JSON"),
+        ("[1]", r"holds \[1\] where a JSON object is expected"),
+        ("{}", "not a controller card"),
+        (card(version=2), "has version 2, this roadproof reads version 1"),
+        (card(architectur="cil"), "unknown key 'architectur'; did you mean 'architecture'"),
+        (card(preparation={"color": "yuv"}), "unknown key 'color'; did you mean 'colour'"),
+        (card(width="half"), "width is 'half', expected a number"),
+        (card(width=True), "width is True, expected a number"),
+        (card(activation=3), "activation is 3, expected text"),
+        (card(preparation={"rows": [1, 2, 3]}), "rows is .* expected a list of 2 numbers"),
+        (card(preparation={"rows": [1.5, 2]}), "expected whole numbers"),
+        (card(preparation={"colour": "hsv"}), "colour is 'hsv'"),
+        (card(preparation=4), "where a JSON object is expected"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(text, message):
+    with pytest.raises(ControllerError, match=message) as refusal:
+        read_card(text, "net.json")
+    assert "\n" not in str(refusal.value)

@@ -1,0 +1,187 @@
+"""Exported networks load as controllers that answer and differentiate as what they were exported from."""
+
+import os
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from roadproof.controllers import (
+    CIL,
+    ControllerCard,
+    FramePreparation,
+    SteeringController,
+    check_controller,
+    load_controller,
+)
+from roadproof.controllers.exported import _pickles_refused
+from roadproof.errors import ControllerError, DeviceError
+
+CARD = ControllerCard(
+    target_speed_mps=7.0, preparation=FramePreparation(frame_size=(24, 32), rows=(8, 24), network_size=(16, 16))
+)
+
+
+class Net(nn.Module):
+    """A small network with the inputs of a commanded controller."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            self.conv = nn.Conv2d(3, 4, 3, stride=2)
+            self.dense = nn.Linear(4 * 7 * 7 + 1, 2)
+
+    def forward(self, frames, speed_mps, command):
+        maps = torch.tanh(self.conv(frames)).flatten(1)
+        answers = self.dense(torch.cat([maps, speed_mps[:, None] / 25], dim=1))
+        return torch.where(command == 3, answers[:, 0], answers[:, 1])
+
+
+class FramesAlone(nn.Module):
+    def forward(self, picture):
+        return picture.mean(dim=(1, 2, 3))
+
+
+def inputs(size: int = 3, height: int = 16, width: int = 16) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    frames = torch.rand(size, 3, height, width, generator=torch.Generator().manual_seed(0))
+    return frames, torch.linspace(0, 9, size), torch.tensor([2, 3, 4] * size)[:size]
+
+
+def export(network: nn.Module, arguments, path, *, fixed: bool = False) -> None:
+    batch = torch.export.Dim("batch")
+    shapes = None if fixed else tuple({0: batch} for _ in arguments)
+    torch.export.save(torch.export.export(network, arguments, dynamic_shapes=shapes), path)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    path = tmp_path_factory.mktemp("program") / "net.pt2"
+    export(Net().eval(), inputs(), path)
+    return path
+
+
+def agree(controller, network, frames, prepare=lambda frames: frames) -> None:
+    answers, gradients = [], []
+    for call in (controller.steer, lambda leaf, *rest: network(prepare(leaf), *rest)):
+        leaf = frames.clone().requires_grad_()
+        steer = call(leaf, *inputs(len(leaf))[1:])
+        answers.append(steer.detach())
+        gradients.append(torch.autograd.grad(steer.sum(), leaf)[0])
+    torch.testing.assert_close(answers[0], answers[1], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-3, atol=1e-5 * float(gradients[1].abs().max()))
+    assert gradients[1].abs().max() > 0
+
+
+def test_a_program_answers_and_differentiates_as_its_network(program):
+    controller = load_controller(program)
+    assert controller.input_size == (16, 16)
+    agree(controller, Net().eval(), inputs(5)[0])
+    report = check_controller(controller)
+    assert report.passed, report.failures
+
+
+def test_a_card_beside_it_says_how_frames_are_prepared(program):
+    card = program.with_suffix(".json")
+    card.write_text(CARD.to_json())
+    try:
+        controller = load_controller(program)
+    finally:
+        card.unlink()
+    assert isinstance(controller, SteeringController)
+    assert (controller.input_size, controller.cruise.target_mps) == ((24, 32), 7.0)
+    halved = lambda frames: frames[:, :, 8:].reshape(-1, 3, 16, 16, 2).mean(dim=-1)  # noqa: E731
+    agree(controller, Net().eval(), inputs(4, 24, 32)[0], halved)
+
+
+def test_a_single_input_may_have_any_name(tmp_path):
+    export(FramesAlone(), inputs()[:1], tmp_path / "mean.pt2")
+    controller = load_controller(tmp_path / "mean.pt2")
+    frames, speed, command = inputs()
+    torch.testing.assert_close(controller.steer(frames, speed, command), frames.mean(dim=(1, 2, 3)))
+
+
+def test_programs_that_cannot_serve_are_refused(program, tmp_path):
+    export(Net().eval(), inputs(), tmp_path / "fixed.pt2", fixed=True)
+    with pytest.raises(ControllerError, match="frames was exported for batches of exactly 3"):
+        load_controller(tmp_path / "fixed.pt2")
+
+    class Odd(Net):
+        def forward(self, frames, velocity, command):
+            return super().forward(frames, velocity, command)
+
+    export(Odd().eval(), inputs(), tmp_path / "odd.pt2")
+    with pytest.raises(ControllerError, match="inputs named frames, velocity, command; expected"):
+        load_controller(tmp_path / "odd.pt2")
+    (tmp_path / "bad.pt2").write_bytes(b"no program")
+    with pytest.raises(ControllerError, match=r"bad\.pt2 is not a torch\.export file"):
+        load_controller(tmp_path / "bad.pt2")
+    with pytest.raises(DeviceError, match=r"computes in torch\.float32, not torch\.float64"):
+        load_controller(program, dtype="float64")
+    wrong = ControllerCard(preparation=FramePreparation(network_size=(66, 200)))
+    (tmp_path / "net.pt2").write_bytes(program.read_bytes())
+    (tmp_path / "net.json").write_text(wrong.to_json())
+    with pytest.raises(ControllerError, match=r"says network_size \(66, 200\), the file \(16, 16\)"):
+        load_controller(tmp_path / "net.pt2")
+
+
+def test_the_environment_is_as_before_after_loading(program, monkeypatch):
+    monkeypatch.delenv("TORCH_FORCE_WEIGHTS_ONLY_LOAD", raising=False)
+    load_controller(program)
+    assert "TORCH_FORCE_WEIGHTS_ONLY_LOAD" not in os.environ
+    monkeypatch.setenv("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "0")
+    load_controller(program)
+    assert os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] == "0"
+
+
+def test_pickles_in_an_archive_are_not_run(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "ran"),))
+
+    torch.save(Payload(), tmp_path / "payload")
+    with _pickles_refused(), pytest.raises(pickle.UnpicklingError):
+        torch.load(tmp_path / "payload", weights_only=False)
+    assert not (tmp_path / "ran").exists()
+
+
+class Steering(nn.Module):
+    """CIL's steering alone, as its users would export it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cil = CIL(width=0.05, seed=1)
+
+    def forward(self, frames, speed_mps, command):
+        return self.cil.steer(frames, speed_mps, command)
+
+
+@pytest.mark.parametrize(("network", "size"), [(Net(), (16, 16)), (Steering(), (88, 200))], ids=["small", "cil"])
+def test_a_network_exported_to_onnx_answers_and_differentiates_as_it(network, size, tmp_path):
+    pytest.importorskip("onnxscript", reason="exporting to ONNX needs onnxscript")
+    network.eval().requires_grad_(False)
+    path, shapes = tmp_path / "net.onnx", ({0: torch.export.Dim("batch")},) * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter's own
+        torch.onnx.export(
+            network, inputs(3, *size), path, dynamo=True, dynamic_shapes=shapes, external_data=False, verbose=False
+        )
+    controller = load_controller(path)
+    assert controller.input_size == size
+    agree(controller, network, inputs(5, *size)[0])
+    report = check_controller(controller)
+    assert report.passed, report.failures
+
+
+def test_the_foreign_onnx_file_gets_yuv_by_its_input_name(pilotnet_data):
+    controller = load_controller(pilotnet_data / "pilotnet.onnx")
+    assert isinstance(controller, SteeringController)
+    assert (controller.input_size, controller.preparation.colour) == ((66, 200), "yuv")
+    frames = torch.rand(3, 3, 88, 200, generator=torch.Generator().manual_seed(0))
+    same = load_controller(f"pilotnet:{pilotnet_data / 'pilotnet.safetensors'}")
+    speed, command = torch.zeros(3), torch.full((3,), 2)
+    ours = controller.steer(frames[:, :, 15:81], speed, command)
+    np.testing.assert_allclose(ours.numpy(), same.steer(frames, speed, command).numpy(), atol=1e-5)

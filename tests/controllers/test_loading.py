@@ -1,0 +1,195 @@
+"""Specs: every kind loads and answers as the network it was made from; every mistake gets one clear line."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from roadproof.controllers import (
+    CIL,
+    ControllerCard,
+    CruiseControl,
+    FramePreparation,
+    SteeringController,
+    check_controller,
+    load_controller,
+    pilotnet_controller,
+    save_controller,
+)
+from roadproof.errors import ControllerError, DeviceError, OutputError
+
+
+def drive(height: int = 88, width: int = 200) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    frames = torch.rand(4, 3, height, width, generator=torch.Generator().manual_seed(0))
+    return frames, torch.tensor([0.0, 3.0, 6.0, 9.0]), torch.tensor([2, 3, 4, 5])
+
+
+@pytest.fixture
+def cil() -> CIL:
+    return CIL(width=0.1, seed=5).eval()
+
+
+def test_cil_is_saved_and_loaded_folded_and_frozen(cil, tmp_path):
+    save_controller(cil, tmp_path / "new" / "cil.safetensors")
+    loaded = load_controller(tmp_path / "new" / "cil.safetensors")
+    assert isinstance(loaded, CIL)
+    assert (loaded.width, loaded.is_folded, loaded.training) == (0.1, True, False)
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
+    torch.testing.assert_close(loaded.steer(*drive()), cil.steer(*drive()).detach(), rtol=1e-4, atol=1e-6)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["cil.safetensors"]
+
+
+def test_pilotnet_keeps_its_activation_preparation_and_speed(tmp_path):
+    preparation = FramePreparation(frame_size=(160, 320), rows=(60, 135), network_size=(66, 200), colour="rgb")
+    saved = pilotnet_controller(
+        activation="relu", preparation=preparation, cruise=CruiseControl(target_mps=9.0), seed=2
+    )
+    save_controller(saved, tmp_path / "p.safetensors")
+    loaded = load_controller(tmp_path / "p.safetensors")
+    assert isinstance(loaded, SteeringController)
+    assert (loaded.preparation, loaded.cruise) == (preparation, CruiseControl(target_mps=9.0))
+    torch.testing.assert_close(loaded.steer(*drive(160, 320)), saved.steer(*drive(160, 320)).detach())
+
+
+def test_a_spec_may_name_the_architecture_of_bare_weights(pilotnet_data):
+    controller = load_controller(f"pilotnet:{pilotnet_data / 'pilotnet.safetensors'}")
+    assert controller.input_size == (88, 200)
+    report = check_controller(controller)
+    assert report.passed, report.failures
+
+
+def test_a_card_beside_bare_weights_says_the_rest(pilotnet_data, tmp_path):
+    weights = tmp_path / "net.safetensors"
+    shutil.copy(pilotnet_data / "pilotnet.safetensors", weights)
+    with pytest.raises(ControllerError, match=r"says nothing about its architecture.*pilotnet:.*net\.json"):
+        load_controller(weights)
+    rows = FramePreparation(frame_size=(88, 200), rows=(10, 76), network_size=(66, 200))
+    card = ControllerCard(architecture="pilotnet", activation="relu", preparation=rows)
+    weights.with_suffix(".json").write_text(card.to_json())
+    controller = load_controller(weights)
+    assert isinstance(controller, SteeringController)
+    assert controller.preparation == rows
+    assert controller.network.activation == "relu"
+
+
+def test_bare_cil_weights_are_the_published_size(tmp_path):
+    save_file(CIL(seed=1).state_dict(), tmp_path / "cil.safetensors")
+    assert load_controller(f"cil:{tmp_path / 'cil.safetensors'}").input_size == (88, 200)
+    save_file(CIL(width=0.1).state_dict(), tmp_path / "small.safetensors")
+    with pytest.raises(ControllerError, match=r"tensor .* has shape .*, expected .* for this CIL"):
+        load_controller(f"cil:{tmp_path / 'small.safetensors'}")
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-5), ("bfloat16", 0.03)])
+def test_other_precisions_answer_alike_in_the_dtype_of_the_frames(cil, tmp_path, dtype, tolerance):
+    save_controller(cil, tmp_path / "cil.safetensors")
+    loaded = load_controller(tmp_path / "cil.safetensors", dtype=dtype)
+    steer = loaded.steer(*drive())
+    assert steer.dtype == torch.float32
+    torch.testing.assert_close(steer, cil.steer(*drive()).detach(), rtol=0.0, atol=tolerance)
+    assert check_controller(loaded, tolerance=tolerance).passed
+
+
+def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
+    (tmp_path / "my_driver.py").write_text(
+        "from roadproof.controllers import CIL\n"
+        "def make():\n    return CIL(width=0.1, seed=9)\n"
+        "class Nested:\n    make = staticmethod(make)\n"
+        "def wrong():\n    return 3\n"
+        "value = 4\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    for spec in ("my_driver:make", "my_driver:Nested.make"):
+        controller = load_controller(spec)
+        assert isinstance(controller, CIL)
+        assert not controller.training
+        torch.testing.assert_close(controller.steer(*drive()), CIL(width=0.1, seed=9).eval().steer(*drive()).detach())
+    for spec, message in (
+        ("my_driver:wrong", "returned a int without input_size, steer, act"),
+        ("my_driver:value", "is 4, expected a function"),
+        ("my_driver:other", "cannot import my_driver:other"),
+        ("no_such_module:make", "No module named 'no_such_module'"),
+    ):
+        with pytest.raises(ControllerError, match=message):
+            load_controller(spec)
+
+
+def test_an_error_inside_a_factory_is_not_hidden(tmp_path, monkeypatch):
+    (tmp_path / "my_broken_driver.py").write_text("def make():\n    return 1 / 0\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        load_controller("my_broken_driver:make")
+
+
+@pytest.mark.parametrize("spec", ["", "nonsense", "net.h5", "pilotnet:", "a b:c", "https://x.org/net"])
+def test_an_unknown_spec_lists_what_exists(spec):
+    with pytest.raises(ControllerError, match=r"expected FILE\.safetensors, cil:FILE.*module:factory") as refusal:
+        load_controller(spec)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["net.safetensors", "cil:net.safetensors", "net.onnx", "net.pt2"])
+def test_a_missing_file_is_named(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ControllerError, match=r"controller file net\.\w+ does not exist"):
+        load_controller(name)
+
+
+def test_damaged_and_unfitting_weights_are_refused(cil, tmp_path):
+    path = tmp_path / "net.safetensors"
+    path.write_bytes(b"not tensors")
+    with pytest.raises(ControllerError, match="not a safetensors file or is damaged"):
+        load_controller(path)
+    save_controller(cil, path)
+    state = load_file(path)
+    spec = f"cil:{path}"
+
+    def refused(changed, message):
+        save_file(changed, path)
+        with pytest.raises(ControllerError, match=message):
+            load_controller(spec)
+
+    refused({name: value for name, value in state.items() if name != "join.0.bias"}, r"lacks tensor join\.0\.bias")
+    refused(state | {"extra": torch.zeros(1)}, "has an unexpected tensor extra")
+    full = CIL().state_dict()
+    refused(full | {"join.0.bias": torch.full((512,), np.nan)}, r"join\.0\.bias has NaN")
+
+
+def test_devices_and_precisions_that_are_not_there_are_refused(cil, tmp_path):
+    save_controller(cil, tmp_path / "cil.safetensors")
+    for device, message in (
+        (f"cuda:{torch.cuda.device_count()}", "is not there: this torch sees"),
+        ("gpu", "'gpu' is unknown"),
+        ("meta", "'meta' is not supported"),
+    ):
+        with pytest.raises(DeviceError, match=message):
+            load_controller(tmp_path / "cil.safetensors", device=device)
+    with pytest.raises(DeviceError, match="dtype 'int8' is unknown, expected one of float32"):
+        load_controller(tmp_path / "cil.safetensors", dtype="int8")
+
+
+def test_what_cannot_be_saved_is_said(cil, tmp_path):
+    with pytest.raises(ControllerError, match="folded CIL"):
+        save_controller(cil.folded(), tmp_path / "x.safetensors")
+    with pytest.raises(ControllerError, match="cannot save a Identity"):
+        controller = SteeringController(torch.nn.Identity(), preparation=FramePreparation())
+        save_controller(controller, tmp_path / "x.safetensors")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        save_controller(cil, tmp_path / "file" / "x.safetensors")
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="this torch sees no CUDA device")
+def test_on_the_gpu_it_answers_as_on_the_cpu(cil, pilotnet_data, tmp_path):
+    save_controller(cil, tmp_path / "cil.safetensors")
+    specs = (tmp_path / "cil.safetensors", f"pilotnet:{pilotnet_data / 'pilotnet.safetensors'}")
+    for spec in (*specs, pilotnet_data / "pilotnet.onnx"):
+        there, here = load_controller(spec, device="cuda"), load_controller(spec)
+        batch = drive(*(here.input_size or (88, 200)))
+        steer = there.steer(*(value.to("cuda") for value in batch))
+        torch.testing.assert_close(steer.cpu(), here.steer(*batch), rtol=0.0, atol=5e-3)
+        assert check_controller(there, device="cuda", tolerance=5e-3).passed
