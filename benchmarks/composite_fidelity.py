@@ -7,7 +7,7 @@ painted (`colours.csv`: index, r, g, b), the painted pixels (`painted_mask.png`)
 Colours come in pairs of one hue: indices 2h−1 and 2h. The colour models see the renders named by --fit alone, and the
 one reported as chosen is chosen by leaving hues out of those.
 
-Errors are mean absolute ones over the paint and the three channels, in 8-bit levels, of composites rounded to 8 bits. At
+Errors are mean absolute ones over paint and channels, in 8-bit levels, of composites rounded to 8 bits. At
 the controller's input the paint is every pixel at least half of whose footprint is painted. The bare road beside the
 paint comes from the fit renders; beneath the paint it is not known, and taken to be as beside it.
 """
