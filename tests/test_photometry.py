@@ -24,6 +24,7 @@ from roadproof.photometry import (
     pixel_maps_from_two_paints,
     samples_from_pictures,
 )
+from roadproof.photometry.fitting import _ColourProblem
 from roadproof.photometry.responses import decode_srgb, encode_srgb
 
 F64 = torch.float64
@@ -142,6 +143,15 @@ def test_cross_validation_chooses_the_model_that_made_the_colours(response, name
     elsewhere = torch.tensor([[75.0, 5.0]], dtype=F64).expand(27, 2)
     truth = ColourTransform(response, SHADING)(COLOURS, elsewhere)
     assert (fit.transform(COLOURS, elsewhere) - truth).abs().mean() < 1.5 / 255
+
+
+@pytest.mark.parametrize("kind", [FilmResponse, AffineResponse])
+def test_the_slopes_of_the_fit_are_those_of_central_differences(kind):
+    problem = _ColourProblem(looks(AFFINE, SHADING, noise=4 / 255), kind, shade=True)
+    at = torch.linspace(-0.4, 0.6, 7 if kind is FilmResponse else 14, dtype=F64)
+    steps = 1e-6 * torch.eye(len(at), dtype=F64)
+    slopes = torch.stack([(problem.residuals(at + step) - problem.residuals(at - step)) / 2e-6 for step in steps], 1)
+    torch.testing.assert_close(problem.jacobian(at), slopes, atol=1e-6, rtol=1e-5)
 
 
 def test_a_fit_without_pixels_is_flat_and_repeats_exactly():
