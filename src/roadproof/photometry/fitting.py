@@ -7,7 +7,6 @@ linear for large ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.errors import ColourError
+from roadproof.photometry.least_squares import least_squares
 from roadproof.photometry.responses import (
     SATURATED,
     AffineResponse,
@@ -27,8 +27,7 @@ from roadproof.photometry.samples import ColourSamples, distinct
 from roadproof.photometry.transform import ColourTransform, RadialShading, squared_radius
 
 _LARGE = 8 / 255
-_ITERATIONS = 100
-_STEP = 1e-6
+_FOLDS = 12
 # Logarithms of exposure, contrast and encoding, for pictures encoded twice and once.
 _FILM_STARTS = ((-1.5, -1.5, -1.5, 0.4, 0.0), (0.0, 0.0, 0.0, 0.3, 0.9))
 
@@ -44,8 +43,8 @@ class FitReport:
         samples: how many samples it was fitted to.
         saturated: share of their values that lay at the end of the scale.
         residual: mean absolute error on those samples.
-        left_out: mean absolute error on groups left out of the fit in turn; none where the rest of the groups does not
-            determine the model.
+        left_out: mean absolute error on groups left out of the fit in turn, in at most twelve folds; none where the
+            rest of the groups does not determine the model.
         left_out_channel: the same per channel.
         worst: the painted colour with the largest mean error, in [0, 1]; left out where possible.
         worst_error: its error.
@@ -116,19 +115,12 @@ def _best(fits: list[ColourFit | ColourError]) -> ColourFit:
 
 def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | ColourError:
     try:
-        transform = _solve(samples, kind, shade)
+        parameters = _solve(samples, kind, shade)
     except ColourError as error:
         return error
+    transform = _transform(parameters, samples, kind, shade)
     residual = _errors(transform, samples)
-    left_out: Tensor | None = torch.full_like(residual, torch.nan)
-    groups = samples.groups
-    for group in range(int(groups.max()) + 1):
-        out = groups == group
-        try:
-            left_out[out] = _errors(_solve(samples.at(~out), kind, shade), samples.at(out))
-        except ColourError:
-            left_out = None
-            break
+    left_out = _left_out_errors(samples, kind, shade, start=parameters)
     shown = residual if left_out is None else left_out
     colours, which = distinct(samples.painted)
     by_colour = torch.zeros(len(colours), dtype=torch.float64).index_add(0, which, shown.mean(1)) / which.bincount()
@@ -146,6 +138,21 @@ def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | C
     return ColourFit(transform, report)
 
 
+def _left_out_errors(samples: ColourSamples, kind: FittedKind, shade: bool, start: Tensor) -> Tensor | None:
+    """Errors of each sample under a fit to the other groups, (N, 3); none where those do not determine it."""
+    errors = torch.zeros_like(samples.seen, dtype=torch.float64)
+    fold = samples.groups % _FOLDS
+    for left_out in range(min(_FOLDS, int(fold.max()) + 1)):
+        out = fold == left_out
+        try:
+            # From the fit to all samples, a fold needs a few steps only.
+            parameters = _solve(samples.at(~out), kind, shade, start)
+        except ColourError:
+            return None
+        errors[out] = _errors(_transform(parameters, samples, kind, shade), samples.at(out))
+    return errors
+
+
 def _errors(transform: ColourTransform, samples: ColourSamples) -> Float[Tensor, "n 3"]:
     """Absolute errors in 8-bit levels."""
     pixel = torch.zeros(len(samples), 2, dtype=torch.float64) if samples.pixel is None else samples.pixel
@@ -157,34 +164,71 @@ def _triple(values: Tensor) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _solve(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourTransform:
+def _solve(samples: ColourSamples, kind: FittedKind, shade: bool, start: Tensor | None = None) -> Tensor:
+    """Parameters of the response, then gain and offset of the shading if there is any."""
     painted, seen = samples.painted.double(), samples.seen.double()
     if kind is AffineResponse:
         affine = fit_affine(painted, seen)
-        if not shade:
-            return ColourTransform(affine)
         starts = [torch.cat([affine.matrix.reshape(-1), affine.offset])]
+        if not shade:
+            return starts[0]
     else:
         _check_film(painted, seen)
-        starts = [torch.tensor(start, dtype=torch.float64) for start in _FILM_STARTS]
-    at = _shading_feature(samples) if shade else None
-    colours, which = distinct(painted)
-    dark, bright = seen <= SATURATED, seen >= 1 - SATURATED
+        starts = [torch.tensor(values, dtype=torch.float64) for values in _FILM_STARTS]
+    problem = _ColourProblem(samples, kind, shade)
+    if start is not None:
+        return least_squares(problem, [start])
+    padding = torch.zeros(2 if shade else 0, dtype=torch.float64)
+    return least_squares(problem, [torch.cat([values, padding]) for values in starts])
 
-    def residuals(parameters: Tensor) -> Tensor:
-        flat = parameters if at is None else parameters[:-2]
-        predicted = kind.from_parameters(flat)(colours)[which]
-        if at is not None:
-            predicted = predicted * (1 + parameters[-2] * at) + parameters[-1] * at
-        error = predicted - seen
-        error = torch.where(dark, error.clamp_min(0.0), torch.where(bright, error.clamp_max(0.0), error)).reshape(-1)
-        # r ↦ sign(r) √ρ(r) with ρ the pseudo-Huber loss, written so that it is smooth at 0.
+
+class _ColourProblem:
+    """Differences of predicted and seen colours, made robust and one-sided where the seen value is saturated."""
+
+    def __init__(self, samples: ColourSamples, kind: FittedKind, shade: bool) -> None:
+        self._response = kind.from_parameters
+        self._colours, self._which = distinct(samples.painted.double())
+        self._seen = samples.seen.double()
+        self._dark, self._bright = self._seen <= SATURATED, self._seen >= 1 - SATURATED
+        self._shade = shade
+        self._at = _shading_feature(samples) if shade else torch.zeros(len(samples), 1, dtype=torch.float64)
+
+    def residuals(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, " n"]:
+        gain, offset = self._gain_and_offset(parameters)
+        return self._robust(gain * self._flat(parameters)[self._which] + offset - self._seen).reshape(-1)
+
+    def jacobian(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "n p"]:
+        leaf = parameters.clone().requires_grad_()
+        flat = self._flat(leaf)
+        each = torch.eye(flat.numel(), dtype=flat.dtype).reshape(-1, *flat.shape)
+        (slope,) = torch.autograd.grad(flat, leaf, each, is_grads_batched=True)
+        gain, offset = self._gain_and_offset(parameters)
+        seen = flat.detach()[self._which]
+        columns = gain[..., None] * slope.reshape(*flat.shape, -1)[self._which]
+        if self._shade:
+            columns[..., -2], columns[..., -1] = self._at * seen, self._at
+        error = (gain * seen + offset - self._seen).requires_grad_()
+        (weight,) = torch.autograd.grad(self._robust(error).sum(), error)
+        return (weight[..., None] * columns).reshape(-1, len(parameters))
+
+    def _flat(self, parameters: Tensor) -> Tensor:
+        return self._response(parameters[:-2] if self._shade else parameters)(self._colours)
+
+    def _gain_and_offset(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        gain, offset = parameters[-2:] if self._shade else (0.0, 0.0)
+        return 1 + gain * self._at, offset * self._at
+
+    def _robust(self, error: Tensor) -> Tensor:
+        over, under = error.clamp_min(0.0), error.clamp_max(0.0)
+        error = torch.where(self._dark, over, torch.where(self._bright, under, error))
+        # e ↦ sign(e) √ρ(e) with ρ the pseudo-Huber loss, written so that it is smooth at 0.
         return error * (2 / (1 + (1 + (error / _LARGE).square()).sqrt())).sqrt()
 
-    padding = torch.zeros(0 if at is None else 2, dtype=torch.float64)
-    parameters = _least_squares(residuals, [torch.cat([start, padding]) for start in starts])
-    if at is None or samples.size_px is None:
+
+def _transform(parameters: Tensor, samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourTransform:
+    if not shade:
         return ColourTransform(kind.from_parameters(parameters))
+    assert samples.size_px is not None
     width, height = samples.size_px
     shading = RadialShading(width_px=width, height_px=height, gain=float(parameters[-2]), offset=float(parameters[-1]))
     return ColourTransform(kind.from_parameters(parameters[:-2]), shading)
@@ -203,51 +247,3 @@ def _shading_feature(samples: ColourSamples) -> Float[Tensor, "n 1"]:
     assert samples.pixel is not None
     assert samples.size_px is not None
     return squared_radius(samples.pixel.double(), *samples.size_px)[:, None]
-
-
-def _least_squares(residuals: Callable[[Tensor], Tensor], starts: list[Tensor]) -> Tensor:
-    """The best end of Levenberg and Marquardt's method from several starts.
-
-    Raises:
-        ColourError: no start leads to finite residuals.
-    """
-    ends = [_descend(residuals, start) for start in starts]
-    best, loss = min(ends, key=lambda end: end[1])
-    if not loss < float("inf"):
-        raise ColourError("the colour fit does not converge; check that painted and seen colours belong together")
-    return best
-
-
-def _jacobian(residuals: Callable[[Tensor], Tensor], at: Tensor) -> Float[Tensor, "n p"]:
-    """By central differences: with a dozen parameters in double precision nothing is lost by it."""
-    steps = _STEP * torch.eye(len(at), dtype=at.dtype)
-    return torch.stack([(residuals(at + step) - residuals(at - step)) / (2 * _STEP) for step in steps], 1)
-
-
-def _descend(residuals: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, float]:
-    def loss_of(value: Tensor) -> float:
-        total = float(value @ value)
-        return total if total == total else float("inf")
-
-    value = residuals(at)
-    loss, damping = loss_of(value), 1e-2
-    for _ in range(_ITERATIONS):
-        jacobian = _jacobian(residuals, at)
-        normal, slope = jacobian.T @ jacobian, jacobian.T @ value
-        scale = torch.diag(normal.diagonal() + 1e-9)
-        better: Tensor | None = None
-        while better is None and damping < 1e9:
-            moved = at - cast("Tensor", torch.linalg.solve(normal + damping * scale, slope))
-            moved_value = residuals(moved)
-            if loss_of(moved_value) < loss:
-                better = moved
-            else:
-                damping *= 4
-        if better is None:
-            break
-        value = residuals(better)
-        gained, at, loss = loss - loss_of(value), better, loss_of(value)
-        damping /= 8
-        if gained < 1e-10 * loss:
-            break
-    return at, loss

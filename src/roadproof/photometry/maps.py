@@ -58,7 +58,8 @@ def pixel_maps_from_two_paints(
 ) -> PixelMaps:
     """Gain, offset and visibility of every pixel from two replays of one drive.
 
-    Pixels that the canvas fills only in part take gain and offset from their neighbours inside it.
+    Pixels that the canvas fills only in part take gain and offset from their neighbours inside it. Where the edge of
+    a shadow meets the edge of the canvas, the two cannot be told apart, and a few pixels are off.
 
     Args:
         light_frames: the drive with the whole canvas painted `light`.
@@ -95,11 +96,14 @@ def pixel_maps_from_two_paints(
     near = _dilate(inside, _BORDER_PX)
     known = torch.where(inside[..., None], torch.cat([slope, level], -1), 0.0)
     filled = _filled(known, inside)
-    own = (inside | (seen & ~near))[..., None]
-    gain = torch.where(own, slope, torch.where(near[..., None], filled[..., :3], 1.0))
-    offset = torch.where(own, level, torch.where(near[..., None], filled[..., 3:], 0.0))
-    expected = (gain * (light_colour - dark_colour)).mean(-1).clamp_min(_SEEN)
-    visible = torch.where(own[..., 0], 1.0, torch.where(near, (apart / expected).clamp(0.0, 1.0), 0.0))
+    expected = (filled[..., :3] * (light_colour - dark_colour)).mean(-1)
+    # More contrast than the neighbours have cannot come from a part of the pixel: it is lit better, and seen whole.
+    own = inside | (seen & (~near | (apart >= expected)))
+    border = (near & ~own)[..., None]
+    gain = torch.where(own[..., None], slope, torch.where(border, filled[..., :3], 1.0))
+    offset = torch.where(own[..., None], level, torch.where(border, filled[..., 3:], 0.0))
+    share = (apart / expected.clamp_min(_SEEN)).clamp(0.0, 1.0)
+    visible = torch.where(own, 1.0, torch.where(border[..., 0], share, 0.0))
     return PixelMaps(gain, offset, visible, response)
 
 
