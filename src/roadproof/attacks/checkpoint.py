@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save_file  # pyright: ignore[reportUnknownVariableType]
 from torch import Tensor
 
 from roadproof.files import write_atomically
@@ -28,10 +29,12 @@ def load_checkpoint(path: Path, identity: str, device: torch.device) -> dict[str
     if not path.exists():
         return None
     try:
-        with safe_open(path, framework="pt") as stored:
-            if (stored.metadata() or {}).get("identity") != _digest(identity):
+        with cast("Any", safe_open)(path, framework="pt") as stored:
+            metadata: dict[str, str] = stored.metadata() or {}
+            if metadata.get("identity") != _digest(identity):
                 return None
-            return {name: stored.get_tensor(name).to(device) for name in stored.keys()}  # noqa: SIM118
+            names: list[str] = stored.keys()
+            return {name: stored.get_tensor(name).to(device) for name in names}
     except (SafetensorError, OSError):
         return None
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from roadproof.attacks.checks import Check
 from roadproof.attacks.gradopt import Schedule
+from roadproof.coverage import Shape
 from roadproof.errors import RoadproofError
 from roadproof.files import read_json, write_atomically
 from roadproof.patterns import Pattern, load_pattern, save_pattern
@@ -115,5 +116,7 @@ class AttackResult:
             raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None
 
 
-def _space(fields: dict[str, Any]) -> SearchSpace:
-    return SearchSpace(**fields | {"albedo": tuple(fields["albedo"])})
+def _space(stored: dict[str, Any]) -> SearchSpace:
+    darkest, brightest = stored["albedo"]
+    fields: dict[str, Any] = {**stored, "albedo": (darkest, brightest), "shape": Shape(stored["shape"])}
+    return SearchSpace(**fields)

@@ -98,7 +98,7 @@ class Surrogate:
         speed = torch.cat([part.repeat(copies) for part in self._speed])
         command = torch.cat([part.repeat(copies) for part in self._command])
         steer = self._steer(frames, speed, command)
-        parts = steer.split([copies * len(view.frames) for view in self.views])
+        parts = cast("tuple[Tensor, ...]", steer.split([copies * len(view.frames) for view in self.views]))
         return [part.view(copies, -1) - clean for part, clean in zip(parts, self.clean_steer, strict=True)]
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
@@ -138,7 +138,7 @@ class Surrogate:
     def _batches(self, unit: Float[Tensor, "g r k n"]) -> tuple[Tensor, ...]:
         """Parts of at most MAX_FRAMES frames, as even as can be; at least one pattern a group each."""
         at_once = max(1, MAX_FRAMES // sum(len(view.frames) for view in self.views))
-        return cast("tuple[Tensor, ...]", unit.chunk(-(-unit.shape[1] // at_once), dim=1))
+        return unit.chunk(-(-unit.shape[1] // at_once), dim=1)
 
     def _compositor(self, copies: int) -> Compositor:
         kept = getattr(self, "_kept", None)

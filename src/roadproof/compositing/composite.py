@@ -36,9 +36,9 @@ def composite(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b f 3 h w"]
     Returns:
         Frames in [0, 1]; the bare road is copied bit for bit.
     """
-    batch = pattern.boxes.shape[:-2]
-    flat = Pattern(pattern.shapes, pattern.boxes.flatten(0, -3), pattern.colours.flatten(0, -3))
-    frames = Compositor([view], len(flat.boxes) if batch else 1)([flat])
+    batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
+    flat = Pattern(pattern.shapes, pattern.boxes.reshape(-1, figures, 5), pattern.colours.reshape(-1, figures, 3))
+    frames = Compositor([view], len(flat.boxes))([flat])
     return frames.view(*batch, *view.clean_frames.shape)
 
 

@@ -53,7 +53,7 @@ def view_canvas_published(
 ) -> PublishedView:
     """Prepare frames for compositing as published."""
     lookup = torch.as_tensor(nearest_canvas_pixels(image_from_canvas, view), device=device)
-    return PublishedView(torch.as_tensor(frames, device=device).float() / 255, lookup, colour)
+    return PublishedView(torch.tensor(frames, device=device).float() / 255, lookup, colour)
 
 
 def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize) -> Int[np.ndarray, "f h w"]:

@@ -70,7 +70,7 @@ def view_canvas(
     """
     index, centre, jacobian = canvas_pixels(image_from_canvas, view)
     footprints = Footprints.of(centre, jacobian, view.resampling, device=device, dtype=dtype)
-    levels = torch.as_tensor(frames, device=device).to(dtype) / 255
+    levels = torch.tensor(frames, device=device).to(dtype) / 255
     place = torch.as_tensor(index, device=device)
     clean = levels.reshape(-1, 3)[place]
     if maps is None:
