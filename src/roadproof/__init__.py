@@ -1,3 +1,68 @@
-"""roadproof: finds the paint on a road that makes a camera-driven controller leave its lane, in simulation."""
+"""roadproof: finds the paint on a road that makes a camera-driven controller leave its lane, in simulation.
+
+Every public name is here and loaded on first use, so that importing roadproof costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from roadproof.attacks import AttackResult as AttackResult
+    from roadproof.attacks import Schedule as Schedule
+    from roadproof.attacks import attack as attack
+    from roadproof.attacks import show_pattern as show_pattern
+    from roadproof.compositing import CanvasView as CanvasView
+    from roadproof.compositing import composite as composite
+    from roadproof.compositing import view_canvas as view_canvas
+    from roadproof.controllers import Controller as Controller
+    from roadproof.controllers import check_controller as check_controller
+    from roadproof.controllers import load_controller as load_controller
+    from roadproof.coverage import Shape as Shape
+    from roadproof.errors import RoadproofError as RoadproofError
+    from roadproof.geometry import CameraModel as CameraModel
+    from roadproof.geometry import CanvasPlacement as CanvasPlacement
+    from roadproof.geometry import CropResize as CropResize
+    from roadproof.geometry import homography_from_points as homography_from_points
+    from roadproof.geometry import homography_from_pose as homography_from_pose
+    from roadproof.objectives import Group as Group
+    from roadproof.patterns import Pattern as Pattern
+    from roadproof.patterns import load_pattern as load_pattern
+    from roadproof.patterns import raster as raster
+    from roadproof.patterns import save_pattern as save_pattern
+    from roadproof.photometry import ColourTransform as ColourTransform
+    from roadproof.photometry import fit_colour as fit_colour
+    from roadproof.recordings import Push as Push
+    from roadproof.recordings import Recording as Recording
+    from roadproof.recordings import RecordingSet as RecordingSet
+    from roadproof.recordings import load_recordings as load_recordings
+    from roadproof.recordings import save_recordings as save_recordings
+    from roadproof.search_space import SearchSpace as SearchSpace
 
 __version__ = "0.1.0"
+
+_ROOMS = {
+    "attacks": ("AttackResult", "Schedule", "attack", "show_pattern"),
+    "compositing": ("CanvasView", "composite", "view_canvas"),
+    "controllers": ("Controller", "check_controller", "load_controller"),
+    "coverage": ("Shape",),
+    "errors": ("RoadproofError",),
+    "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
+    "objectives": ("Group",),
+    "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
+    "photometry": ("ColourTransform", "fit_colour"),
+    "recordings": ("Push", "Recording", "RecordingSet", "load_recordings", "save_recordings"),
+    "search_space": ("SearchSpace",),
+}
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module 'roadproof' has no attribute {name!r}")
+    return getattr(import_module(f"roadproof.{_ROOM_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_ROOM_OF])

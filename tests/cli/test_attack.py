@@ -1,0 +1,204 @@
+"""`roadproof attack` as its users call it: results, pictures, and one clear line for every mistake."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from roadproof.attacks import AttackResult
+from roadproof.cli import app, main
+from roadproof.patterns import load_pattern
+from roadproof.recordings import save_recordings
+from scenes import recording_set
+
+CONTROLLER = textwrap.dedent(
+    """
+    import torch
+
+    class Linear(torch.nn.Module):
+        input_size = (88, 200)
+
+        def __init__(self):
+            super().__init__()
+            weight = torch.zeros(3, 88, 200)
+            weight[:, :, 100:], weight[:, :, :100] = 1e-3, -1e-3
+            self.register_buffer("weight", weight)
+
+        def steer(self, frames, speed_mps, command):
+            return (frames * self.weight).sum((1, 2, 3))
+
+        def act(self, frame, speed_mps, command):
+            raise NotImplementedError
+
+    def small():
+        controller = Linear()
+        controller.input_size = (66, 200)
+        return controller
+    """
+)
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("workplace")
+    save_recordings(recording_set(frames=3), folder / "set")
+    (folder / "own_controller.py").write_text(CONTROLLER)
+    return folder
+
+
+@pytest.fixture
+def here(workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    return workplace
+
+
+def command(*options, recordings="set", controller="own_controller:Linear"):
+    quick = ["--figures", "2", "--iterations", "4", "--restarts", "2", "--random-patterns", "3"]
+    return ["attack", str(recordings), "--controller", controller, *quick, *options]
+
+
+def run(monkeypatch, capsys, arguments):
+    """The installed command's exit code and what it printed."""
+    monkeypatch.setattr(sys, "argv", ["roadproof", *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    return stopped.value.code or 0, capsys.readouterr()
+
+
+def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, monkeypatch, capsys):
+    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "out")))
+    assert code == 0, printed.err
+    assert "Strongest for clean+" in printed.out
+    assert "predicted" in printed.out
+    assert printed.err == ""
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"pattern.json", "pattern.png", "result.json", "search.png", "film-clean.png"} <= names
+    assert "search.safetensors" not in names
+    result = AttackResult.load(tmp_path / "out")
+    assert result.history.shape == (4, 2, 2)
+    assert len(load_pattern(tmp_path / "out" / "pattern.json").shapes) == 2
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["kind"].startswith("surrogate")
+    for picture in (tmp_path / "out").glob("*.png"):
+        pixels = np.asarray(Image.open(picture).convert("RGB"))
+        assert pixels.std() > 5, picture
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--black"],
+        ["--family", "free", "--shape", "ellipse"],
+        ["--groups", "all"],
+        ["--albedo", "0.1", "0.7", "--max-painted-share", "0.2"],
+        ["--gradient", "published"],
+    ],
+    ids=" ".join,
+)
+def test_every_kind_of_search_runs(here, tmp_path, options):
+    outcome = CliRunner().invoke(app, command("--out", str(tmp_path), "--iterations", "2", *options))
+    assert outcome.exit_code == 0, outcome.output
+
+
+def damaged(here, tmp_path, change):
+    import shutil
+
+    shutil.copytree(here / "set", tmp_path / "set")
+    change(tmp_path / "set")
+    return str(tmp_path / "set")
+
+
+def nan_homography(folder):
+    stored = dict(np.load(folder / "clean" / "drive.npz"))
+    stored["image_from_canvas"] = np.full_like(stored["image_from_canvas"], np.nan)
+    np.savez(folder / "clean" / "drive.npz", **stored)
+
+
+def truncated_png(folder):
+    picture = next((folder / "clean" / "frames").iterdir())
+    picture.write_bytes(picture.read_bytes()[:80])
+
+
+MISTAKES = {
+    "missing folder": (["--figures", "2"], {"recordings": "nowhere"}, "no folder nowhere"),
+    "empty folder": ([], {"recordings": lambda tmp: _empty(tmp)}, "has no recordings.json"),
+    "truncated PNG": ([], {"damage": truncated_png}, "cannot be read"),
+    "NaN homography": ([], {"damage": nan_homography}, "is NaN or infinite"),
+    "no figure": (["--figures", "0"], {}, "figures is 0, expected 1 or more"),
+    "no iterations": (["--iterations", "0"], {}, "iterations is 0"),
+    "no restarts": (["--restarts", "0"], {}, "restarts is 0"),
+    "wrong frame size": ([], {"controller": "own_controller:small"}, "takes frames of 200×66"),
+    "unknown controller": ([], {"controller": "resnet"}, "unknown controller 'resnet'"),
+    "missing weights": ([], {"controller": "none.safetensors"}, "none.safetensors"),
+    "missing factory": ([], {"controller": "own_controller:nothing"}, "nothing"),
+    "unknown device": (["--device", "tpu"], {}, "tpu"),
+    "unknown dtype": (["--dtype", "int4"], {}, "int4"),
+    "unknown family": (["--family", "publised"], {}, "did you mean published?"),
+    "unknown shape": (["--shape", "star"], {}, "expected one of rectangle, ellipse"),
+    "unknown group": (["--groups", "clean+up"], {}, "group 'clean+up' is unknown"),
+    "published with ellipses": (["--gradient", "published", "--family", "free"], {}, "published gradient needs"),
+}
+
+
+def _empty(tmp_path):
+    (tmp_path / "empty").mkdir()
+    return tmp_path / "empty"
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_clear_line_and_exit_code_2(here, tmp_path, monkeypatch, capsys, name):
+    options, kwargs, message = MISTAKES[name]
+    kwargs = dict(kwargs)
+    if "damage" in kwargs:
+        kwargs["recordings"] = damaged(here, tmp_path, kwargs.pop("damage"))
+    if callable(kwargs.get("recordings")):
+        kwargs["recordings"] = kwargs["recordings"](tmp_path)
+    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "out"), *options, **kwargs))
+    assert code == 2
+    assert message in printed.err
+    assert printed.err.startswith("roadproof: ")
+    assert printed.err.count("\n") == 1, "one line"
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+def test_cuda_that_is_absent_is_named(here, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path), "--device", "cuda"))
+    assert code == 2
+    assert "cuda" in printed.err
+
+
+def test_an_output_folder_that_cannot_be_made_is_named_before_the_search(here, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("")
+    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "file" / "out")))
+    assert code == 2
+    assert "cannot write" in printed.err
+
+
+def test_a_full_disk_is_named_and_leaves_nothing_half_written(here, tmp_path, monkeypatch, capsys):
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("roadproof.attacks.result.json.dumps", full)
+    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "out")))
+    assert code == 2
+    assert "No space left" in printed.err
+    assert not list((tmp_path / "out").glob(".result*"))
+
+
+def test_importing_roadproof_is_quick_and_free_of_heavy_libraries():
+    code = "import sys, roadproof; sys.exit(str({'torch', 'numpy', 'matplotlib'} & set(sys.modules) or '') or 0)"
+    source = os.pathsep.join(sys.path)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": source},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
