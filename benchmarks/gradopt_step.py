@@ -1,0 +1,165 @@
+"""What one step of GradOpt costs, against the bare controller and against the published way.
+
+    python benchmarks/gradopt_step.py --json OUT [--frames 88] [--recordings SET] [--quick]
+
+A step composites the frames, shows them to the controller and goes back to the pattern's parameters. The bare
+controller's forward and backward pass to the same frames is the physical limit: ratio 1. The published way renders
+1 + 8 K whole sets of frames for one gradient. All three are measured in turn, in one run, on the same frames.
+"""
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import roadproof
+from roadproof.attacks import Surrogate
+from roadproof.attacks.published import PublishedSurrogate
+from roadproof.controllers import CIL, pilotnet_controller
+from roadproof.datatypes import VehicleState
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.objectives import parse_groups
+from roadproof.photometry import AffineResponse, ColourTransform
+from roadproof.recordings import Push, Recording, RecordingSet, load_recordings
+from roadproof.search_space import SearchSpace
+
+
+def synthetic_drive(frames: int) -> RecordingSet:
+    """A drive of the geometry of CARLA's recordings: the canvas comes from 16 m ahead to under the car."""
+    rng = np.random.default_rng(0)
+    canvas = CanvasPlacement(x_m=0.0, y_m=0.0, width_m=7.56, length_m=9.53)
+    distance_m = np.linspace(16.0, 5.0, frames)
+    states = [
+        VehicleState(x_m=-d, y_m=0.3 * np.sin(d), z_m=0.0, yaw_rad=0.03 * np.cos(d), speed_mps=6.0) for d in distance_m
+    ]
+    drive = Recording(
+        name="clean",
+        push=Push.CLEAN,
+        frames=rng.integers(60, 160, (frames, 88, 200, 3), dtype=np.uint8),
+        frame_number=np.arange(frames),
+        image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, state, canvas) for state in states]),
+        speed_mps=np.full(frames, 6.0),
+        command=np.full(frames, 2),
+        steer=np.zeros(frames),
+    )
+    colour = ColourTransform(AffineResponse(torch.eye(3) * 0.7, torch.full((3,), 0.02)))
+    return RecordingSet(camera=CIL_CAMERA, view=CIL_INPUT, colour=colour, recordings=(drive,))
+
+
+def placed(controller: torch.nn.Module, device: str, dtype: torch.dtype) -> torch.nn.Module:
+    """As `load_controller` leaves a network: evaluation mode, frozen, channels last."""
+    controller.eval().requires_grad_(False)
+    return controller.to(device=device, dtype=dtype, memory_format=torch.channels_last)
+
+
+def milliseconds(function: Callable[[], object], device: str) -> float:
+    """One call, the device's own queue included."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+    start = time.perf_counter()
+    function()
+    if device != "cpu":
+        torch.cuda.synchronize()
+    return (time.perf_counter() - start) * 1e3
+
+
+def measure(
+    recordings: RecordingSet, name: str, figures: int, dtype: torch.dtype, device: str, repeats: int, published: bool
+) -> dict[str, object]:
+    """One case: medians of alternating repeats after a warm-up."""
+    controller = CIL(seed=0).folded() if name == "cil" else pilotnet_controller(seed=0)
+    controller = placed(controller, device, dtype)
+    groups = parse_groups("all", recordings)
+    surrogate = Surrogate(recordings, controller, groups, device=device)
+    space = SearchSpace(figures=figures)
+    unit = space.random((1, 1), torch.Generator().manual_seed(0)).to(device)
+    frames = surrogate.views[0].clean_frames.detach().clone(memory_format=torch.channels_last)
+    speed = torch.cat([torch.tensor(r.speed_mps, device=device).float() for r in recordings.recordings])
+    command = torch.cat([torch.tensor(r.command, device=device) for r in recordings.recordings])
+
+    def step() -> None:
+        surrogate.values_and_gradients(space, unit)
+
+    def bare() -> None:
+        leaf = frames.requires_grad_()
+        torch.autograd.grad(controller.steer(leaf, speed, command).float().sum(), leaf)
+
+    runs = {"step": step, "bare": bare}
+    if published:
+        authors = PublishedSurrogate(recordings, controller, groups, device=device)
+        runs["published"] = lambda: authors.values_and_gradients(space, unit, coarse=True)
+    if device != "cpu":
+        torch.cuda.reset_peak_memory_stats()
+    times: dict[str, list[float]] = {key: [] for key in runs}
+    for repeat in range(repeats + 2):
+        for key, function in runs.items():
+            if key == "published" and repeat >= 4:
+                continue
+            elapsed = milliseconds(function, device)
+            if repeat >= (1 if key == "published" else 2):
+                times[key].append(elapsed)
+    median = {key: statistics.median(values) for key, values in times.items()}
+    peak = torch.cuda.max_memory_allocated() / 2**20 if device != "cpu" else _peak_mb()
+    return {
+        "controller": name,
+        "figures": figures,
+        "dtype": str(dtype).removeprefix("torch."),
+        "device": device,
+        "frames": len(frames),
+        "canvas_pixels": len(surrogate.views[0].clean),
+        "step_ms": round(median["step"], 2),
+        "step_ms_range": [round(min(times["step"]), 2), round(max(times["step"]), 2)],
+        "bare_ms": round(median["bare"], 2),
+        "bare_ms_range": [round(min(times["bare"]), 2), round(max(times["bare"]), 2)],
+        "ratio": round(statistics.median(s / b for s, b in zip(times["step"], times["bare"], strict=True)), 3),
+        "published_step_ms": round(median["published"], 1) if published else None,
+        "published_over_ours": round(median["published"] / median["step"], 2) if published else None,
+        "peak_mb": round(peak),
+    }
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def main() -> None:
+    """Measure every case and write them with versions and device."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--frames", type=int, default=88)
+    parser.add_argument("--recordings", type=Path, help="a set of real recordings instead of the synthetic drive")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--quick", action="store_true", help="K = 5 in float32 on the CPU only")
+    args = parser.parse_args()
+    recordings = load_recordings(args.recordings) if args.recordings else synthetic_drive(args.frames)
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() and not args.quick else ["cpu"]
+    dtypes = [torch.float32] if args.quick else [torch.float32, torch.bfloat16]
+    cases = []
+    for device in devices:
+        for name in ("cil", "pilotnet"):
+            for figures in (5,) if args.quick else (1, 5):
+                for dtype in dtypes:
+                    case = measure(recordings, name, figures, dtype, device, args.repeats, dtype == torch.float32)
+                    cases.append(case)
+                    print(json.dumps(case), flush=True)
+    result = {
+        "benchmark": "gradopt_step",
+        "roadproof": roadproof.__version__,
+        "torch": torch.__version__,
+        "threads": torch.get_num_threads(),
+        "processor": platform.processor() or platform.machine(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "cases": cases,
+    }
+    args.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
