@@ -142,7 +142,7 @@ class RoadMap:
             ScenarioError: start or goal is off the road, or no way leads to the goal.
         """
         begin = self.nearest_lane(start.x_m, start.y_m, start.yaw_rad)
-        if abs(begin.lateral_m) > ON_ROUTE_M or abs(begin.heading_error_rad) > math.pi / 2:
+        if abs(begin.lateral_m) > ON_ROUTE_M or abs(begin.heading_error_rad) > math.pi / 3:
             raise ScenarioError(
                 f"start ({start.x_m:.1f}, {start.y_m:.1f}) with yaw {start.yaw_rad:.2f} rad is not along a driving "
                 f"lane (the nearest is {abs(begin.lateral_m):.1f} m away and {abs(begin.heading_error_rad):.2f} rad "
