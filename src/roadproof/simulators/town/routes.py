@@ -29,6 +29,19 @@ class RoutePosition:
     command: Command
 
 
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A junction on a route: where along it the route enters and leaves, and a circle round all of its lanes."""
+
+    junction: str
+    enters_m: float
+    leaves_m: float
+    command: Command
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Route:
     """A way along lane centres.
@@ -39,6 +52,7 @@ class Route:
         arclengths_m: distance driven up to each point.
         commands: codes of `Command`: a turn or straight on from 20 m before a junction to its end, else follow.
         lanes: indices of the lanes it takes, in order.
+        crossings: the junctions it crosses, in order.
     """
 
     points: Line
@@ -46,6 +60,7 @@ class Route:
     arclengths_m: Float[np.ndarray, " n"]
     commands: Int[np.ndarray, " n"]
     lanes: tuple[int, ...]
+    crossings: tuple[Crossing, ...]
 
     @property
     def length_m(self) -> float:
@@ -135,30 +150,43 @@ def route_along(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, to_m
     at = np.linspace(from_m, end_m, count)
     points = np.column_stack([np.interp(at, stations, centre[:, axis]) for axis in range(3)])
     along = np.gradient(points[:, :2], axis=0)
+    crossings = _crossings(lanes, way, from_m, end_m)
     return Route(
         points=points,
         headings_rad=np.unwrap(np.arctan2(along[:, 1], along[:, 0])),
         arclengths_m=polyline_stations(points),
-        commands=_commands(lanes, way, at),
+        commands=_commands(crossings, at - from_m),
         lanes=way,
+        crossings=crossings,
     )
 
 
-def _commands(lanes: Sequence[Lane], way: tuple[int, ...], at_m: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def _crossings(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, end_m: float) -> tuple[Crossing, ...]:
     ends = np.cumsum([lanes[index].length_m for index in way])
-    commands = np.full(len(at_m), int(Command.FOLLOW))
+    crossings: list[Crossing] = []
     k = 0
     while k < len(way):
         junction, first = lanes[way[k]].junction, k
         while k + 1 < len(way) and lanes[way[k + 1]].junction == junction:
             k += 1
-        if junction is not None:
-            crossing = [lanes[index] for index in way[first : k + 1]]
-            enters = float(ends[first] - crossing[0].length_m)
-            turn = sum(float(lane.headings_rad[-1] - lane.headings_rad[0]) for lane in crossing)
+        passed = [lanes[index] for index in way[first : k + 1]]
+        enters = float(ends[first] - passed[0].length_m)
+        if junction is not None and enters < end_m:
+            turn = sum(float(lane.headings_rad[-1] - lane.headings_rad[0]) for lane in passed)
             command = Command.LEFT if turn > TURN_RAD else Command.RIGHT if turn < -TURN_RAD else Command.STRAIGHT
-            ahead = (at_m >= enters - COMMAND_LEAD_M) & (at_m <= ends[k])
-            # A junction close behind another one does not change what is asked at the first.
-            commands[ahead & ((at_m >= enters) | (commands == int(Command.FOLLOW)))] = int(command)
+            inside = [lane.centre[:, :2] for lane in lanes if lane.junction == junction and lane.kind == "driving"]
+            low, high = np.concatenate(inside).min(axis=0), np.concatenate(inside).max(axis=0)
+            x, y = (float(value) for value in 0.5 * (low + high))
+            radius = 0.5 * float((high - low).max())
+            crossings.append(Crossing(junction, enters - from_m, float(ends[k]) - from_m, command, x, y, radius))
         k += 1
+    return tuple(crossings)
+
+
+def _commands(crossings: tuple[Crossing, ...], at_m: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    commands = np.full(len(at_m), int(Command.FOLLOW))
+    # Backwards, so that a junction close behind another one does not change what is asked at the first.
+    for crossing in reversed(crossings):
+        ahead = (at_m >= crossing.enters_m - COMMAND_LEAD_M) & (at_m <= crossing.leaves_m)
+        commands[ahead] = int(crossing.command)
     return commands
