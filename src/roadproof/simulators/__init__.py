@@ -1,1 +1,1 @@
-"""Simulators behind one protocol: the embedded town here, others beside it. Nothing heavy is imported until it is opened."""
+"""Simulators behind one protocol. Nothing heavy is imported until one is asked for."""

@@ -1,1 +1,1 @@
-"""The embedded town: roads from OpenDRIVE, Panda3D's software renderer and Bullet's vehicle physics, on one CPU core."""
+"""The embedded town: roads from OpenDRIVE, a software renderer and vehicle physics on one CPU core."""
