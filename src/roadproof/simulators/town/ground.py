@@ -43,7 +43,7 @@ class Ground:
         size_m: their extent in x and y.
         albedo: colour in display levels, RGB, `FINE_M` a pixel.
         hard: 255 where it is paved, 0 on lawn, `FINE_M` a pixel.
-        puddles: where water collects, 0 to 255, `COARSE_M` a pixel.
+        hollows: how low the ground lies, 0 to 255: where water collects first, `COARSE_M` a pixel.
         open_sky: share of the sky that is seen, 0 to 255, `COARSE_M` a pixel.
     """
 
@@ -51,7 +51,7 @@ class Ground:
     size_m: tuple[float, float]
     albedo: Image.Image
     hard: Image.Image
-    puddles: UInt8[np.ndarray, "h w"]
+    hollows: UInt8[np.ndarray, "h w"]
     open_sky: UInt8[np.ndarray, "h w"]
 
 
@@ -67,10 +67,10 @@ def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50
     surface = _surfaces(fine, roads, scenery)
     tracks = _tyre_tracks(coarse, roads)
     edges = coarse.outlines([lane for lane in roads.lanes if lane.kind == "sidewalk"], 1.0)
-    puddles = _puddles(coarse, tracks, edges, seed)
+    hollows = _hollows(coarse, tracks, edges, seed)
     albedo = _albedo(coarse, surface, tracks, edges, seed)
     hard = surface.point([0] + [255] * 255)
-    return Ground(low, size, albedo, hard, puddles, _open_sky(coarse, scenery))
+    return Ground(low, size, albedo, hard, hollows, _open_sky(coarse, scenery))
 
 
 class _Canvas:
@@ -128,9 +128,9 @@ def _tyre_tracks(canvas: _Canvas, roads: RoadMap) -> Plane:
     return np.asarray(image.filter(ImageFilter.GaussianBlur(0.22 / canvas.pixel_m)), np.float32) / 255
 
 
-def _puddles(canvas: _Canvas, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
-    lie = canvas.noise(seed, 10, 5) + 0.05 * tracks + 0.10 * edges
-    return (np.clip((lie - 0.525) / 0.07, 0, 1) * 255).astype(np.uint8)
+def _hollows(canvas: _Canvas, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
+    low = 0.7 * canvas.noise(seed, 14, 5) + 0.3 * canvas.noise(seed + 4, 48, 3) + 0.05 * tracks + 0.08 * edges
+    return (np.clip((low - 0.35) / 0.40, 0, 1) * 255).astype(np.uint8)
 
 
 def _albedo(canvas: _Canvas, surface: Image.Image, tracks: Plane, edges: Plane, seed: int) -> Image.Image:
@@ -297,7 +297,9 @@ def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> 
     sunlit = 255 - np.asarray(soft)
     facing = np.full(sunlit.shape, sun[2], np.float32)
     light = sky.light(facing, sunlit.astype(np.float32) / 255, ground.open_sky.astype(np.float32) / 255)
-    shine = 0.62 * min(1.0, 1.5 * sky.wetness) if sky.wetness > WET_FROM else 0.0
+    # The wetter, the further up the hollows are full; what is merely wet mirrors a little as well.
+    full = np.clip((ground.hollows.astype(np.float32) / 255 - 0.80 + 0.34 * sky.wetness) / 0.10, 0, 1)
+    share = (0.50 * full + 0.07) * sky.wetness**0.5 if sky.wetness > WET_FROM else 0 * full
     zenith, horizon = np.array(sky.zenith), np.array(sky.horizon)
     red, green, blue = (round(v) for v in 255 * 0.78 * (0.6 * horizon + 0.4 * zenith))
     return LitGround(
@@ -306,7 +308,7 @@ def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> 
         sunlit=sunlit,
         colour=_damp(ground, sky.wetness),
         light=Image.fromarray((light * 255 + 0.5).astype(np.uint8)),
-        water=Image.fromarray((ground.puddles * shine).astype(np.uint8)),
+        water=Image.fromarray((share * 255).astype(np.uint8)),
         mirrored=(red, green, blue),
     )
 

@@ -162,19 +162,21 @@ class _Edge:
 def _rails(site: _Site, edge: _Edge) -> None:
     """Guard rails outside bends, in pieces of two metres."""
     rail, post = site.builder("rail"), site.builder("concrete")
+    reserved: list[Float[np.ndarray, "4 2"]] = []
     for station in np.arange(1.0, edge.length_m - 1.0, 2.0):
         if edge.turn_per_m(float(station)) < 1 / 60:
             continue
-        a, b = edge.pose(station - 1.0, 0.35), edge.pose(station + 1.0, 0.35)
+        a, b = edge.pose(float(station) - 1.0, 0.4), edge.pose(float(station) + 1.0, 0.4)
         pose = Pose((a.x_m + b.x_m) / 2, (a.y_m + b.y_m) / 2, math.atan2(b.y_m - a.y_m, b.x_m - a.x_m))
-        half = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m) / 2
-        solid = Solid("guard rail", pose, (half + 0.02, 0.08), 0.80)
-        if not site.free(solid.corners + 0.0) and not site.free(edge_corners(pose.ahead(0.0, -0.3), half, 0.1)):
+        half = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m) / 2 + 0.02
+        if not site.free(edge_corners(pose.ahead(0.0, -0.7), half, 0.2)):
             continue
-        rail.box((-half - 0.02, -0.05, 0.45), (half + 0.02, 0.05, 0.80), pose, tile_m=(2.0, 0.35), faces="yYZ")
-        post.box((-0.06, -0.12, 0.0), (0.06, -0.02, 0.74), pose, (0.55, 0.55, 0.54))
-        site.solids.append(solid)
-        site.take(edge_corners(pose.ahead(0.0, -3.0), half + 0.5, 3.4))
+        rail.box((-half, -0.05, 0.45), (half, 0.05, 0.80), pose, tile_m=(2.0, 0.35), faces="yYZ")
+        post.box((-0.07, -0.14, 0.0), (0.07, -0.04, 0.76), pose, (0.42, 0.42, 0.41))
+        site.solids.append(Solid("guard rail", pose, (half, 0.08), 0.80))
+        reserved.append(edge_corners(pose.ahead(0.0, -3.0), half + 0.5, 3.4))
+    for corners in reserved:
+        site.take(corners)
 
 
 def edge_corners(pose: Pose, half_along_m: float, half_across_m: float) -> Float[np.ndarray, "4 2"]:

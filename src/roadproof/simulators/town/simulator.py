@@ -86,7 +86,7 @@ class TownSimulator:
         self,
         *,
         camera: CameraModel = CIL_CAMERA,
-        input: CropResize = CIL_INPUT,
+        input: CropResize = CIL_INPUT,  # noqa: A002
         dt_s: float = 0.05,
     ) -> None:
         substeps = dt_s / SUBSTEP_S

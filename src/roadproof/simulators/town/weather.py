@@ -123,7 +123,8 @@ SKIES: dict[Weather, Sky] = {
     ),
     Weather.FOGGY_MORNING: Sky(
         sun=(0.70, -0.55, 0.40), sunlight=(0.14, 0.13, 0.10), skylight=(0.46, 0.48, 0.51), shadow=0.5,
-        shadow_blur_m=1.5, haze=(0.76, 0.77, 0.78), density_per_m=0.0300, zenith=(0.72, 0.74, 0.77), horizon=(0.77, 0.78, 0.79),
+        shadow_blur_m=1.5, haze=(0.76, 0.77, 0.78), density_per_m=0.0300,
+        zenith=(0.72, 0.74, 0.77), horizon=(0.77, 0.78, 0.79),
         clouds=0.8,
         cloud_light=(0.78, 0.79, 0.80), wetness=0.15,
     ),
