@@ -89,6 +89,10 @@ def test_a_road_is_placed_by_its_start_pose(tmp_path: Path) -> None:
     [
         ({"geometry": piece("<poly3 a='0' b='0' c='0' d='0'/>")}, "road 7: <geometry> holds <poly3>"),
         ({"geometry": piece("<arc/>")}, "road 7: <arc> has no curvature"),
+        ({"geometry": piece('<arc curvature="90"/>')}, "road 7: <geometry> has a curvature of 90 1/m"),
+        ({"geometry": piece("<line/>", length="40")}, "road 7: <geometry> goes from 0.000 to 40.000 m"),
+        ({"geometry": piece("<line/>", length="-3")}, "road 7: <geometry> has length -3.0 m"),
+        ({"lanes": LANES.replace('s="0"', 's="60"')}, "road 7: <laneSection> starts outside"),
         ({"geometry": piece('<arc curvature="nan"/>')}, "road 7: <arc> has curvature='nan'"),
         ({"geometry": piece("<line/>", length="long")}, "road 7: <geometry> has length='long'"),
         ({"geometry": ""}, "road 7: <planView>"),

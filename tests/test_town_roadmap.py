@@ -1,7 +1,9 @@
 """Lanes, surfaces and routes: against CARLA's own reading of its towns, and against plain geometry."""
 
 import math
+import random
 import time
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,29 @@ from roadproof.datatypes import Command, VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.simulators.town.junctions import triangulated
 from roadproof.simulators.town.roadmap import RoadMap, Surface, lane_triangles
+
+SECOND = Path(__file__).parents[1] / "src" / "roadproof" / "simulators" / "town" / "assets" / "second.xodr"
+
+
+def street(number: int, x: float, *, link: str = "", junction: str = "-1", width: float = 3.5) -> str:
+    """A straight two-way road of 40 m along x."""
+    lanes = {
+        side: f'<{side}><lane id="{k}" type="driving"><link><predecessor id="{k}"/><successor id="{k}"/></link>'
+        f'<width sOffset="0" a="{width}" b="0" c="0" d="0"/></lane></{side}>'
+        for side, k in (("left", 1), ("right", -1))
+    }
+    return (
+        f'<road id="{number}" length="40" junction="{junction}"><link>{link}</link><planView>'
+        f'<geometry s="0" x="{x}" y="0" hdg="0" length="40"><line/></geometry></planView>'
+        f'<lanes><laneSection s="0">{lanes["left"]}<center><lane id="0"/></center>{lanes["right"]}'
+        "</laneSection></lanes></road>"
+    )
+
+
+def loaded(folder: Path, *parts: str) -> RoadMap:
+    path = folder / "map.xodr"
+    path.write_text(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>")
+    return RoadMap.from_opendrive(path)
 
 
 @pytest.fixture(scope="module", params=["Town01", "Town02"])
@@ -222,3 +247,69 @@ def test_ears_cover_a_polygon_with_a_notch() -> None:
     triangles = triangulated(np.column_stack([outline, np.zeros(5)]))
     assert len(triangles) == 3
     assert triangle_area(triangles) == pytest.approx(polygon_area(outline))
+
+
+def test_a_road_goes_on_into_the_next(tmp_path: Path) -> None:
+    onward = '<successor elementType="road" elementId="2" contactPoint="start"/>'
+    back = '<predecessor elementType="road" elementId="1" contactPoint="end"/>'
+    road_map = loaded(tmp_path, street(1, 0.0, link=onward), street(2, 40.0, link=back))
+    route = road_map.route(VehicleState(5.0, -1.75, 0.0, 0.0, 0.0), (70.0, -1.75))
+    assert route.length_m == pytest.approx(65.0)
+    np.testing.assert_allclose(route.points[:, 1], -1.75)
+    assert route.crossings == ()
+    back_home = road_map.route(VehicleState(75.0, 1.75, 0.0, math.pi, 0.0), (5.0, 1.75))
+    assert back_home.length_m == pytest.approx(70.0)
+
+
+def test_a_goal_no_way_leads_to_is_refused(tmp_path: Path) -> None:
+    road_map = loaded(tmp_path, street(1, 0.0), street(2, 60.0))
+    with pytest.raises(ScenarioError, match=r"no way leads from lane -1 of road 1 .* to lane -1 of road 2"):
+        road_map.route(VehicleState(5.0, -1.75, 0.0, 0.0, 0.0), (80.0, -1.75))
+
+
+@pytest.mark.parametrize(
+    ("first", "said"),
+    [
+        (
+            street(1, 0.0, link='<successor elementType="road" elementId="9" contactPoint="start"/>'),
+            "links to road 9, which is not in the file",
+        ),
+        (
+            street(1, 0.0, link='<successor elementType="junction" elementId="9"/>'),
+            "names junction 9, which is not in the file",
+        ),
+        (
+            street(1, 0.0, link='<successor elementType="road" elementId="2" contactPoint="start"/>'),
+            "road 1: lane -1 ends 20.00 m from lane -1 of road 2",
+        ),
+        (
+            street(1, 0.0, link='<successor elementType="road" elementId="2"/>'),
+            "has contactPoint None, expected 'start' or 'end'",
+        ),
+        (street(1, 0.0, width=400.0), "road 1: lane 1 is 400 m wide"),
+        (street(1, -9000.0), "expected at most 5000 m each way"),
+    ],
+)
+def test_links_and_sizes_that_cannot_be_are_named(tmp_path: Path, first: str, said: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        loaded(tmp_path, first, street(2, 60.0))
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_damaged_map_loads_or_is_refused_in_one_line(tmp_path: Path, seed: int) -> None:
+    dice = random.Random(seed)
+    root = ET.fromstring(SECOND.read_text())
+    for _ in range(dice.choice([1, 1, 2, 4])):
+        parents = {child: parent for parent in root.iter() for child in parent}
+        element = dice.choice(list(parents))
+        if dice.random() < 0.3:
+            parents[element].remove(element)
+        elif element.attrib:
+            name = dice.choice(list(element.attrib))
+            element.set(name, dice.choice(["", "nan", "-1", "0", "1e9", "x", "3", "-7.5", "1e-12", "99"]))
+    (tmp_path / "map.xodr").write_text(ET.tostring(root, encoding="unicode"))
+    try:
+        RoadMap.from_opendrive(tmp_path / "map.xodr")
+    except ScenarioError as error:
+        assert "\n" not in str(error)

@@ -1,6 +1,9 @@
 """Traffic keeps its lanes, its distance and its promises: the same seed, the same day."""
 
 import math
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -106,6 +109,29 @@ def test_the_same_seed_gives_the_same_traffic_and_another_seed_another() -> None
         runs.append(np.concatenate([np.stack([a.x_m, a.y_m, a.yaw_rad, a.speed_mps]) for a in both]))
     np.testing.assert_array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
+
+
+def test_another_process_gives_the_same_traffic() -> None:
+    script = (
+        "from roadproof.datatypes import VehicleState\n"
+        "from roadproof.simulators.town.maps import load_map\n"
+        "from roadproof.simulators.town.traffic import Traffic\n"
+        "ego = VehicleState(150.0, -1.75, 0.0, 0.0, 0.0)\n"
+        "traffic = Traffic(load_map('town'), cars=20, pedestrians=20, seed=5, ego=ego)\n"
+        "for _ in range(200): traffic.step(0.05, ego)\n"
+        "print([a.tobytes().hex() for who in (traffic.cars, traffic.pedestrians) for a in (who.x_m, who.y_m)])\n"
+    )
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2")
+    ]
+    assert outputs[0] == outputs[1]
+    assert len(outputs[0]) > 1000
 
 
 def test_cars_stop_behind_the_driven_car() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.opendrive import LaneRecord, OpenDrive, Road, Section
+from roadproof.simulators.town.opendrive import MAX_WIDTH_M, LaneRecord, OpenDrive, Road, Section
 
 Line = Float[np.ndarray, "n 3"]
 
@@ -182,6 +182,10 @@ def _borders(road: Road, section: Section) -> _Borders:
         while (record := section.lanes.get(number)) is not None:
             assert record.width is not None
             width = np.maximum(record.width(inside - section.start_m), 0.0)
+            if width.max() > MAX_WIDTH_M:
+                raise ScenarioError(
+                    f"road {road.name}: lane {number} is {width.max():.0f} m wide, expected at most {MAX_WIDTH_M:.0f}"
+                )
             inner[number], edge = edge, edge + side * width
             outer[number] = edge
             number += side

@@ -26,6 +26,10 @@ from jaxtyping import Float
 from roadproof.errors import ScenarioError
 
 Stations = Float[np.ndarray, " n"]
+MAX_LENGTH_M = 50_000.0
+MAX_CURVATURE = 5.0
+MAX_WIDTH_M = 100.0
+GAP_M = 0.05
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -229,7 +233,7 @@ def _road(element: ET.Element) -> Road:
         )
     for lateral in ("superelevation", "shape"):
         for record in element.iterfind(f"lateralProfile/{lateral}"):
-            if any(float(record.get(key, 0)) != 0.0 for key in "abcd"):
+            if any(_number(record, key, where) != 0.0 for key in "abcd"):
                 raise ScenarioError(f"{where}: <{lateral}> that is not zero is not supported")
     length = _number(element, "length", where)
     plan = tuple(_geometry(piece, where) for piece in element.iterfind("planView/geometry"))
@@ -239,6 +243,11 @@ def _road(element: ET.Element) -> Road:
     starts = [piece.s_m for piece in plan]
     if starts != sorted(starts):
         raise ScenarioError(f"{where}: <geometry> elements are not ordered by s")
+    reach = plan[-1].s_m + plan[-1].length_m
+    if abs(reach - length) > GAP_M or starts[0] > GAP_M:
+        raise ScenarioError(
+            f"{where}: <geometry> goes from {starts[0]:.3f} to {reach:.3f} m, expected 0 to {length:.3f}"
+        )
     junction = element.get("junction", "-1")
     return Road(
         name=name,
@@ -273,6 +282,12 @@ def _geometry(element: ET.Element, where: str) -> Geometry:
         raise ScenarioError(
             f"{where}: <geometry> holds {found}, which is not supported; expected line, arc, spiral or paramPoly3"
         )
+    if not 0.0 <= length <= MAX_LENGTH_M:
+        raise ScenarioError(f"{where}: <geometry> has length {length} m, expected 0 to {MAX_LENGTH_M:.0f}")
+    if length > 1e-9 and shape.max_curvature() > MAX_CURVATURE:
+        raise ScenarioError(
+            f"{where}: <geometry> has a curvature of {shape.max_curvature():.3g} 1/m, expected at most {MAX_CURVATURE}"
+        )
     heading = _number(element, "hdg", where)
     return Geometry(
         _number(element, "s", where), _number(element, "x", where), _number(element, "y", where), heading, length, shape
@@ -286,6 +301,8 @@ def _sections(road: ET.Element, length_m: float, where: str) -> tuple[Section, .
     starts = [_number(element, "s", where) for element in elements]
     if starts != sorted(starts):
         raise ScenarioError(f"{where}: <laneSection> elements are not ordered by s")
+    if starts[0] < 0.0 or starts[-1] > length_m:
+        raise ScenarioError(f"{where}: <laneSection> starts outside the road's 0 to {length_m:.3f} m")
     sections: list[Section] = []
     for element, start, end in zip(elements, starts, [*starts[1:], length_m], strict=True):
         lanes = [

@@ -24,6 +24,7 @@ from roadproof.simulators.town.routes import Route, route_along, shortest_way
 from roadproof.simulators.town.spatial import SegmentIndex, TriangleIndex
 
 REACH_M = 6.0
+MAX_EXTENT_M = 5000.0
 HEADING_WEIGHT_M = 2.0
 ON_ROUTE_M = 5.0
 
@@ -73,7 +74,7 @@ class RoadMap:
         """Index lanes and areas for queries.
 
         Raises:
-            ScenarioError: there is no driving lane.
+            ScenarioError: there is no driving lane, or the map is larger than 5 km.
         """
         self.lanes = lanes
         self.mark_lines = mark_lines
@@ -83,6 +84,11 @@ class RoadMap:
             raise ScenarioError("the map has no lane of type driving, expected at least one")
         everything = np.concatenate([line[:, :2] for lane in lanes for line in (lane.left, lane.right)])
         low, high = everything.min(axis=0), everything.max(axis=0)
+        if (high - low).max() > MAX_EXTENT_M:
+            raise ScenarioError(
+                f"the map spans {high[0] - low[0]:.0f} × {high[1] - low[1]:.0f} m, expected at most "
+                f"{MAX_EXTENT_M:.0f} m each way; cut out the part to be driven"
+            )
         self.bounds_m: tuple[float, float, float, float] = (
             float(low[0]),
             float(low[1]),
@@ -132,7 +138,7 @@ class RoadMap:
         )
 
     def route(self, start: VehicleState, goal_m: tuple[float, float]) -> Route:
-        """The shortest route from a pose to the place on a driving lane nearest to the goal.
+        """The shortest route from a pose to the place on a driving lane nearest to the goal, without lane changes.
 
         Args:
             start: on a driving lane and turned along it.
