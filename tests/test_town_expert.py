@@ -8,7 +8,9 @@ from roadproof.datatypes import Event
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+from roadproof.simulators.town import physics
 from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.training import expert as driver
 from roadproof.training.expert import Expert
 
 SCENARIOS = builtin_scenarios()
@@ -53,3 +55,8 @@ def test_the_expert_completes_all_scenarios(town: TownSimulator) -> None:
     for agents, least in ((0, 40), (20, 38)):
         drives = [driven(town, scenario, agents, 1) for scenario in SCENARIOS]
         assert sum(arrived and not events for arrived, events, _ in drives) >= least
+
+
+def test_the_expert_knows_the_car_it_drives() -> None:
+    assert driver.WHEELBASE_M == physics.WHEELBASE_M
+    assert driver.MAX_STEER_RAD == physics.MAX_STEER_RAD

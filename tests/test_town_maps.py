@@ -11,7 +11,7 @@ import pytest
 
 from roadproof.datatypes import Command
 from roadproof.errors import ScenarioError
-from roadproof.scenarios import BUILTIN_FILE, Scenario, builtin_scenarios, find_scenario, save_scenarios
+from roadproof.scenarios import BUILTIN_FILE, Scenario, builtin_scenarios, find_scenario, load_scenarios, save_scenarios
 from roadproof.simulators.town.maps import canvas_points, load_map, scenario_route
 
 SCENARIOS = builtin_scenarios()
@@ -94,3 +94,11 @@ def test_unknown_maps_are_refused() -> None:
         load_map("Town01")
     with pytest.raises(ScenarioError, match="cannot be read"):
         load_map("/missing/map.xodr")
+
+
+def test_the_example_of_the_docs_is_valid(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    path = tmp_path / "list.toml"
+    path.write_text(text.split("```toml\n")[1].split("```")[0], encoding="utf-8")
+    (scenario,) = load_scenarios(path)
+    assert 70.0 < scenario_route(scenario, load_map(scenario.map_name)).length_m < 80.0

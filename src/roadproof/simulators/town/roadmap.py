@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.simulators.town.junctions import Corner, JunctionArea, junction_areas, triangulated
-from roadproof.simulators.town.lanes import Lane, Line, MarkLine, build_lanes
+from roadproof.simulators.town.lanes import Lane, MarkLine, build_lanes
 from roadproof.simulators.town.opendrive import read_opendrive
 from roadproof.simulators.town.routes import Route, route_along, shortest_way
 from roadproof.simulators.town.spatial import SegmentIndex, TriangleIndex
@@ -205,11 +205,6 @@ def lane_triangles(lane: Lane) -> Float[np.ndarray, "t 3 3"]:
     """The lane's surface as triangles, two for each step along it."""
     a, b, c, d = lane.right[:-1], lane.right[1:], lane.left[1:], lane.left[:-1]
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-
-
-def area_triangles(outline: Line) -> Float[np.ndarray, "t 3 3"]:
-    """A junction's area as triangles."""
-    return triangulated(outline)
 
 
 def _surface_index(lanes: tuple[Lane, ...], junctions: tuple[JunctionArea, ...]) -> TriangleIndex:
