@@ -28,7 +28,7 @@ from roadproof.simulators.town.meshes import Mesh
 from roadproof.simulators.town.textures import GRAIN_MEAN
 
 PATCH_PX = 512
-GRAIN_TILE_M = 4.0
+GRAIN_TILE_M = 3.0
 COARSEST = 7
 NEAREST_M = 0.5
 
@@ -108,7 +108,7 @@ def _turned_grain(
     rows: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "p p 1"]:
     """The asphalt's grain, 1 on average, over a turned square of pixels."""
-    fine = np.asarray(Image.fromarray(grain[::-1, :, 0]).reduce(2))
+    fine = np.ascontiguousarray(grain[::-1, :, 0])
     pixel_m = GRAIN_TILE_M / len(fine)
     outline = corner + np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) @ np.stack([columns, rows]) * PATCH_PX
     first = np.floor(outline.min(axis=0) / GRAIN_TILE_M) * GRAIN_TILE_M

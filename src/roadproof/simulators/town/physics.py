@@ -27,6 +27,8 @@ BRAKING_MPS2 = 8.0
 SUBSTEP_S = 0.01
 SETTLE_STEPS = 60
 CAR_HALF_M = (2.25, 0.93)
+TOUCH_M = 0.02
+BLOCK_M = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +57,13 @@ class Physics:
         ground.add_shape(bullet.BulletPlaneShape(core.Vec3(0, 0, 1), 0))
         ground.set_friction(1.0)
         self._place(ground)
+        self._blocks: dict[tuple[int, int], list[int]] = {}
         for i, solid in enumerate(solids):
-            node = self._box(f"solid-{i}", solid.half_m, solid.height_m)
-            self._kinds[node.get_name()] = Contact("static", f"{solid.name} {i}")
-            self._stand(self._place(node), solid.pose, solid.height_m)
+            self._blocks.setdefault(_block(solid.pose.x_m, solid.pose.y_m), []).append(i)
+        self._solids = tuple(solids)
+        self._near: dict[tuple[int, int], Path] = {}
+        self._parts: dict[str, list[Contact]] = {}
+        self._surround(start.x_m, start.y_m)
         self._cars: list[Path] = []
         for i, pose in enumerate(cars):
             node = self._box(f"car-{i}", CAR_HALF_M, HEIGHT_M)
@@ -72,12 +77,13 @@ class Physics:
 
     def step(self, control: Control, dt_s: float) -> None:
         """Drive on by a whole number of substeps."""
-        wanted = -control.steer * MAX_STEER_RAD
-        for _ in range(max(1, round(dt_s / SUBSTEP_S))):
-            reach = STEER_RATE_RAD_S * SUBSTEP_S
-            self._steer_rad += min(max(wanted - self._steer_rad, -reach), reach)
-            self._drive(control)
-            self._world.do_physics(SUBSTEP_S, 0)
+        count = max(1, round(dt_s / SUBSTEP_S))
+        wanted, reach = -control.steer * MAX_STEER_RAD, STEER_RATE_RAD_S * count * SUBSTEP_S
+        self._steer_rad += min(max(wanted - self._steer_rad, -reach), reach)
+        position = self._path.get_pos()
+        self._surround(position.x, position.y)
+        self._drive(control)
+        self._advance(count)
 
     def move_cars(self, poses: Sequence[Pose]) -> None:
         """Put the other cars where they are now."""
@@ -94,11 +100,19 @@ class Physics:
 
     def contacts(self) -> list[Contact]:
         """What the car touches now, the ground aside, in order of name."""
-        found: set[str] = set()
+        found: set[Contact] = set()
         for contact in self._world.contact_test(self._chassis).get_contacts():
-            if contact.get_manifold_point().get_distance() <= 0.02:
-                found |= {contact.get_node0().get_name(), contact.get_node1().get_name()}
-        return [self._kinds[name] for name in sorted(found) if name in self._kinds]
+            if contact.get_manifold_point().get_distance() > TOUCH_M:
+                continue
+            for node, part in (
+                (contact.get_node0(), contact.get_idx0()),
+                (contact.get_node1(), contact.get_idx1()),
+            ):
+                if node.get_name() in self._parts:
+                    found.add(self._parts[node.get_name()][part])
+                elif node.get_name() in self._kinds:
+                    found.add(self._kinds[node.get_name()])
+        return sorted(found, key=lambda contact: contact.name)
 
     def close(self) -> None:
         """Take everything out of the world."""
@@ -106,6 +120,27 @@ class Physics:
         for body in self._world.get_rigid_bodies():
             self._world.remove(body)
         self._root.remove_node()
+
+    def _surround(self, x_m: float, y_m: float) -> None:
+        """Keep the solids of the blocks around the car in the world: Bullet's time grows with all there is."""
+        column, row = _block(x_m, y_m)
+        wanted = {(column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)} & self._blocks.keys()
+        if wanted == self._near.keys():
+            return
+        for key in sorted(self._near.keys() - wanted):
+            path = self._near.pop(key)
+            self._world.remove(path.node())
+            path.remove_node()
+        for key in sorted(wanted - self._near.keys()):
+            name = f"block {key[0]} {key[1]}"
+            block = bullet.BulletRigidBodyNode(name)
+            for solid in (self._solids[i] for i in self._blocks[key]):
+                middle = core.Vec3(solid.pose.x_m, solid.pose.y_m, solid.pose.z_m + solid.height_m / 2)
+                turn = core.Vec3(math.degrees(solid.pose.yaw_rad), 0.0, 0.0)
+                half = core.Vec3(solid.half_m[0], solid.half_m[1], solid.height_m / 2)
+                block.add_shape(bullet.BulletBoxShape(half), core.TransformState.make_pos_hpr(middle, turn))
+            self._parts[name] = [Contact("static", f"{self._solids[i].name} {i}") for i in self._blocks[key]]
+            self._near[key] = self._place(block)
 
     def _place(self, node: Node) -> Path:
         self._world.attach(node)
@@ -150,7 +185,7 @@ class Physics:
         """Let the springs come to rest, then start exactly where and as fast as asked."""
         for _ in range(SETTLE_STEPS):
             self._drive(Control(0.0, brake=1.0))
-            self._world.do_physics(SUBSTEP_S, 0)
+            self._advance(1)
         height = self._path.get_z()
         yaw = start.yaw_rad
         self._path.set_pos_hpr(start.x_m, start.y_m, height, math.degrees(yaw) - 90.0, 0.0, 0.0)
@@ -158,8 +193,12 @@ class Physics:
         along = core.Vec3(math.cos(yaw) * start.speed_mps, math.sin(yaw) * start.speed_mps, 0.0)
         self._chassis.set_linear_velocity(along)
 
+    def _advance(self, substeps: int) -> None:
+        # A little more than the whole, so that rounding never leaves a substep for the next call.
+        self._world.do_physics(substeps * SUBSTEP_S * (1 + 1e-6), substeps, SUBSTEP_S)
+
     def _drive(self, control: Control) -> None:
-        """Set the wheels for one substep: rear drive with a power limit, all brakes, rolling and air drag."""
+        """Set the wheels: rear drive with a power limit, all brakes, rolling and air drag."""
         velocity = self._chassis.get_linear_velocity()
         speed = math.hypot(velocity.x, velocity.y)
         force = control.throttle * min(TRACTION_N, POWER_W / max(speed, 1.0))
@@ -175,3 +214,7 @@ class Physics:
         if speed > 0.1:
             drag = (ROLLING_N + DRAG_N_S2_PER_M2 * speed * speed) / speed
             self._chassis.apply_central_force(core.Vec3(-velocity.x * drag, -velocity.y * drag, 0.0))
+
+
+def _block(x_m: float, y_m: float) -> tuple[int, int]:
+    return math.floor(x_m / BLOCK_M), math.floor(y_m / BLOCK_M)

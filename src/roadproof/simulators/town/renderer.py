@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -27,6 +27,7 @@ from roadproof.geometry import (
 from roadproof.simulators.town import textures
 from roadproof.simulators.town.canvas import (
     COARSEST,
+    GRAIN_TILE_M,
     PATCH_PX,
     Raster,
     RoadPatch,
@@ -58,10 +59,11 @@ from roadproof.simulators.town.weather import SKIES, Sky, sky_picture
 
 CELL_M, CELL_MARGIN_M = 30.0, 1.0
 CULL_M = 60.0
-FLAT_SEEN_M = 80.0
+NEAR_SEEN_M = 80.0
+HIDDEN_DEPTH = 4.0
 SKY_M = 640.0
 FAR_LAND_M = 520.0
-HAZE_TOP_M = 26.0
+HAZE_TOP_M = 19.0
 HEADINGS = 8
 PERSON_LOOKS = 12
 STRIDES = (-1.0, -0.4, 0.4, 1.0)
@@ -82,6 +84,7 @@ SOLID_TEXTURES: dict[str, Callable[[], UInt8[np.ndarray, "h w c"]]] = {
     "rail": textures.guard_rail,
     "plain": textures.plain,
 }
+FURNITURE = ("plain", "hedge", "rail")
 
 
 class Layer(IntEnum):
@@ -94,6 +97,7 @@ class Layer(IntEnum):
     PAVEMENT = 5
     PAVEMENT_SHADE = 6
     SOLID = 10
+    SMALL = 11
     CUT_OUT = 20
     FAR_LAND = 21
     HAZE = 22
@@ -101,7 +105,7 @@ class Layer(IntEnum):
     RAIN = 30
 
 
-FLAT_LAYERS = (Layer.PAINT, Layer.PAVEMENT)
+NEAR_LAYERS = (Layer.PAINT, Layer.PAVEMENT, Layer.SMALL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +143,10 @@ class Renderer:
         self._ground = build_ground(roads, scenery, CELL_M)
         self._grain = textures.asphalt_grain()
         self._textures = _static_textures(self._grain)
-        self._solids = _with_atlas(scenery, list(SOLID_TEXTURES))
-        self._trees = _with_atlas(scenery, [f"tree{kind}" for kind in range(TREES)])
+        walls = {name: mesh for name, mesh in scenery.meshes.items() if name not in FURNITURE}
+        furniture = {name: mesh for name, mesh in scenery.meshes.items() if name in FURNITURE}
+        self._walls, self._furniture = (_with_atlas(meshes, list(SOLID_TEXTURES)) for meshes in (walls, furniture))
+        self._trees = _with_atlas(scenery.meshes, [f"tree{kind}" for kind in range(TREES)])
         self._stage = ground_stage()
         self._screens: dict[int, Screen] = {}
         self._weather: Weather | None = None
@@ -269,7 +275,7 @@ class Renderer:
                 x, y = low[0] + column * CELL_M, low[1] + row * CELL_M
                 corners = np.array([(x, y, 0), (x + CELL_M, y, 0), (x + CELL_M, y + CELL_M, 0), (x, y + CELL_M, 0)])
                 builder = MeshBuilder()
-                builder.quad(corners, corners[:, :2] / 4.0)
+                builder.quad(corners, corners[:, :2] / GRAIN_TILE_M)
                 mesh = builder.build()
                 node = _node(mesh, np.full((4, 4), 255, np.uint8), self._land.uv(mesh.points, (column, row), low))
                 self._attach(node, Layer.GROUND, self._textures["asphalt"], self._land.textures[column, row])
@@ -314,7 +320,11 @@ class Renderer:
         return _rgba(mesh.albedo * light * damp * (1 - share) + share * mirrored / 255)
 
     def _build_scenery(self, sky: Sky) -> None:
-        for layer, name, mesh in ((Layer.SOLID, "solids", self._solids), (Layer.CUT_OUT, "trees", self._trees)):
+        for layer, name, mesh in (
+            (Layer.SOLID, "solids", self._walls),
+            (Layer.SMALL, "solids", self._furniture),
+            (Layer.CUT_OUT, "trees", self._trees),
+        ):
             for node in _lit_nodes(mesh, sky):
                 self._attach(node, layer, self._textures[name])
 
@@ -326,22 +336,24 @@ class Renderer:
         dress(path, layer)
 
     def _district(self, node: Node, layer: Layer) -> Path:
-        """The parent of the nodes of a part of town, of which the flat things are seen from near only."""
+        """The parent of the nodes of a part of town, of which small things are seen from near only."""
         middle = node.get_bounds().get_approx_center()
-        key = (math.floor(middle.x / CULL_M), math.floor(middle.y / CULL_M), layer in FLAT_LAYERS)
+        key = (math.floor(middle.x / CULL_M), math.floor(middle.y / CULL_M), layer in NEAR_LAYERS)
         if key not in self._districts:
             self._districts[key] = self._lit_nodes.attach_new_node("district")
         return self._districts[key]
 
     def _show_near(self, x_m: float, y_m: float) -> None:
-        for (column, row, flat), district in self._districts.items():
-            if flat:
-                dx = max(abs(x_m - (column + 0.5) * CULL_M) - CULL_M / 2, 0)
-                dy = max(abs(y_m - (row + 0.5) * CULL_M) - CULL_M / 2, 0)
-                if dx * dx + dy * dy < FLAT_SEEN_M**2:
-                    district.show()
-                else:
-                    district.hide()
+        """Leave out what is too small or too deep in the haze to be seen."""
+        farthest = HIDDEN_DEPTH / self._lit.sky.density_per_m
+        for (column, row, small), district in self._districts.items():
+            dx = max(abs(x_m - (column + 0.5) * CULL_M) - CULL_M / 2, 0)
+            dy = max(abs(y_m - (row + 0.5) * CULL_M) - CULL_M / 2, 0)
+            reach = min(farthest, NEAR_SEEN_M) if small else farthest
+            if dx * dx + dy * dy < reach * reach:
+                district.show()
+            else:
+                district.hide()
 
     def _build_air(self, sky: Sky) -> None:
         for old in (*self._follow.get_children(), *self._haze.get_children()):
@@ -535,12 +547,12 @@ def _static_textures(grain: UInt8[np.ndarray, "g g 3"]) -> dict[str, Texture]:
     return made
 
 
-def _with_atlas(scenery: Scenery, names: Sequence[str]) -> Mesh:
+def _with_atlas(meshes: Mapping[str, Mesh], names: Sequence[str]) -> Mesh:
     """The meshes of some textures as one, with the coordinates of the atlas they share."""
     parts = [
         dataclasses.replace(mesh, uv=textures.atlas_uv(mesh.uv, i, ATLAS_COLUMNS, len(names)))
         for i, name in enumerate(names)
-        if (mesh := scenery.meshes.get(name)) is not None
+        if (mesh := meshes.get(name)) is not None
     ]
     return joined(parts)
 
@@ -598,10 +610,10 @@ def _haze_cards(sky: Sky, tangent: float, eye_m: float) -> list[tuple[Mesh, UInt
 
     Each card's foot fades out, so that on the ground the haze grows steadily from one card to the next.
     """
-    nearest = min(13.0, max(4.0, 0.16 / sky.density_per_m))
+    nearest = min(40.0, max(4.0, 0.11 / sky.density_per_m))
     distances = [nearest]
     while distances[-1] < 260.0:
-        distances.append(max(1.42 * distances[-1], distances[-1] + 0.045 / sky.density_per_m))
+        distances.append(max(1.6 * distances[-1], distances[-1] + 0.045 / sky.density_per_m))
     cards: list[tuple[Mesh, UInt8[np.ndarray, "n 4"]]] = []
     for d, beyond in reversed(list(zip(distances, [*distances[1:], 1.5 * distances[-1]], strict=True))):
         strength = 1 - math.exp(-sky.density_per_m * (beyond - d if d > nearest else beyond))

@@ -69,14 +69,14 @@ def _grain(deviation: Plane) -> Picture:
 
 
 def asphalt_grain(seed: int = 1) -> Picture:
-    """Four metres of asphalt: stones, some light, some dark, in a fine binder."""
-    n = 512
+    """Three metres of asphalt: stones, some light, some dark, in a fine binder."""
+    n = 256
     rng = np.random.default_rng(seed)
     stones = np.asarray(
         Image.fromarray((rng.random((n, n)) * 255).astype(np.uint8)).filter(ImageFilter.GaussianBlur(0.8)), np.float32
     )
     stones = (stones - stones.mean()) / stones.std()
-    rough = fractal_noise(n, n, seed=seed + 1, cells=16, octaves=4) - 0.5
+    rough = fractal_noise(n, n, seed=seed + 1, cells=8, octaves=4) - 0.5
     light = (stones > 2.2) * 0.10 - (stones < -2.3) * 0.08
     return _grain(0.040 * stones + 0.16 * rough + light)
 
