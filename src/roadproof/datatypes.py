@@ -26,6 +26,23 @@ class Command(IntEnum):
     STRAIGHT = 5
 
 
+class Weather(StrEnum):
+    """Sky, light and road of a drive. The first four are the paper's; the others are for robustness."""
+
+    CLEAR_NOON = "clear-noon"
+    CLOUDY_NOON = "cloudy-noon"
+    RAINY_NOON = "rainy-noon"
+    CLEAR_SUNSET = "clear-sunset"
+    CLOUDY_SUNSET = "cloudy-sunset"
+    WET_NOON = "wet-noon"
+    HARD_RAIN_NOON = "hard-rain-noon"
+    FOGGY_MORNING = "foggy-morning"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Weather:
+        raise SimulatorError(f"weather {value!r} is unknown, expected one of {', '.join(cls)}")
+
+
 @dataclass(frozen=True, slots=True)
 class Control:
     """What a driver does to the car for one step.

@@ -1,0 +1,220 @@
+"""Scenarios: where a drive starts, where it leads, where the canvas lies. 40 are built in.
+
+A list of scenarios is a TOML file; the built-in one is read the same way. Whether start, goal and canvas lie on the
+road is for the simulator that knows the map to say.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import json
+import math
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+from roadproof.datatypes import VehicleState
+from roadproof.errors import GeometryError, OutputError, ScenarioError
+from roadproof.geometry import CanvasPlacement
+
+Kind = Literal["straight", "left", "right"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+BUILTIN_FILE = Path(__file__).with_name("scenarios.toml")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scenario:
+    """One stretch of road to be driven.
+
+    Args:
+        name: for people and files, for instance "left-03".
+        kind: whether the route keeps straight or veers to a side, in a bend or at a junction.
+        map_name: a map the simulator knows by name ("town"), or the path of an OpenDRIVE file.
+        start: where the car stands, and how fast it goes when the drive begins.
+        goal_m: (x, y) the route leads to.
+        canvas: the stretch of road that can be painted.
+        time_limit_s: after this many seconds the drive ends.
+
+    Raises:
+        ScenarioError: a value is missing, not finite or out of range.
+    """
+
+    name: str
+    kind: Kind
+    map_name: str
+    start: VehicleState
+    goal_m: tuple[float, float]
+    canvas: CanvasPlacement
+    time_limit_s: float
+
+    def __post_init__(self) -> None:
+        numbers = {**asdict(self.start), **asdict(self.canvas), "goal x": self.goal_m[0], "goal y": self.goal_m[1]}
+        for what, value in {**numbers, "time_limit_s": self.time_limit_s}.items():
+            if not math.isfinite(value):
+                raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number")
+        if self.time_limit_s <= 0:
+            raise ScenarioError(f"scenario {self.name}: time_limit_s is {self.time_limit_s}, expected more than 0")
+        if self.start.speed_mps < 0:
+            raise ScenarioError(f"scenario {self.name}: start speed_mps is {self.start.speed_mps}, expected 0 or more")
+        if math.dist(self.goal_m, (self.start.x_m, self.start.y_m)) < 1.0:
+            raise ScenarioError(f"scenario {self.name}: the goal is less than 1 m from the start; move it")
+
+
+def builtin_scenarios() -> tuple[Scenario, ...]:
+    """The 40 built-in scenarios: 16 straight, 12 left, 12 right."""
+    return load_scenarios(BUILTIN_FILE)
+
+
+def find_scenario(name: str, scenarios: Sequence[Scenario]) -> Scenario:
+    """The scenario of this name.
+
+    Raises:
+        ScenarioError: there is none; the message names the nearest.
+    """
+    for scenario in scenarios:
+        if scenario.name == name:
+            return scenario
+    names = [scenario.name for scenario in scenarios]
+    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
+    hint = f"did you mean {nearest[0]!r}?" if nearest else "the list is empty"
+    raise ScenarioError(f"no scenario is called {name!r}; {hint}")
+
+
+def load_scenarios(path: Path) -> tuple[Scenario, ...]:
+    """Read scenarios from a TOML file.
+
+    A `map_name` that ends in ".xodr" is the name of an OpenDRIVE file in the folder of the TOML file.
+
+    Raises:
+        ScenarioError: the file cannot be read, or an entry is not a valid scenario; the message names it.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ScenarioError(f"scenarios {path} cannot be read ({error.strerror}); check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"scenarios {path} is not valid TOML ({error})") from error
+    entries = content.get("scenario")
+    if not isinstance(entries, list) or not entries:
+        raise ScenarioError(f"scenarios {path} has no [[scenario]], expected at least one")
+    scenarios: list[Scenario] = []
+    for k, entry in enumerate(cast("list[object]", entries)):
+        try:
+            scenarios.append(_scenario(entry, path.parent))
+        except (ScenarioError, GeometryError) as error:
+            raise ScenarioError(f"scenarios {path}, entry {k + 1}: {error}") from error
+    names = [scenario.name for scenario in scenarios]
+    for name in names:
+        if names.count(name) > 1:
+            raise ScenarioError(f"scenarios {path}: the name {name!r} is used twice; names must differ")
+    return tuple(scenarios)
+
+
+def save_scenarios(scenarios: Sequence[Scenario], path: Path) -> None:
+    """Write scenarios as TOML, under a temporary name first.
+
+    Raises:
+        OutputError: the file cannot be written.
+        ScenarioError: a scenario's map is an OpenDRIVE file in another folder.
+    """
+    blocks = [_block(scenario, path.parent) for scenario in scenarios]
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text("\n".join(blocks), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise OutputError(f"scenarios cannot be written to {path} ({error.strerror}); choose another place") from error
+
+
+def _block(scenario: Scenario, folder: Path) -> str:
+    map_name = scenario.map_name
+    if map_name.endswith(".xodr"):
+        if Path(map_name).resolve().parent != folder.resolve():
+            raise ScenarioError(f"scenario {scenario.name}: its map {map_name} is not in {folder}; copy it there first")
+        map_name = Path(map_name).name
+    lines = ["[[scenario]]"]
+    # JSON's strings, escaped to ASCII, are TOML's.
+    lines += [f"{key} = {json.dumps(value)}" for key, value in (("name", scenario.name), ("kind", scenario.kind))]
+    lines += [f"map_name = {json.dumps(map_name)}", f"start = {_table(asdict(scenario.start))}"]
+    lines += [f"goal_m = [{float(scenario.goal_m[0])!r}, {float(scenario.goal_m[1])!r}]"]
+    lines += [f"canvas = {_table(asdict(scenario.canvas))}", f"time_limit_s = {float(scenario.time_limit_s)!r}"]
+    return "\n".join(lines) + "\n"
+
+
+def _table(values: Mapping[str, float]) -> str:
+    return "{ " + ", ".join(f"{key} = {float(value)!r}" for key, value in values.items()) + " }"
+
+
+def _scenario(entry: object, folder: Path) -> Scenario:
+    values = _known(entry, {field.name for field in fields(Scenario)}, "the scenario")
+    missing = [field.name for field in fields(Scenario) if field.name not in values]
+    if missing:
+        raise ScenarioError(f"{missing[0]} is missing")
+    goal = cast("list[object]", values["goal_m"])
+    if not isinstance(values["goal_m"], list) or len(goal) != 2:
+        raise ScenarioError(f"goal_m is {goal!r}, expected [x, y]")
+    start = _numbers(values["start"], {field.name for field in fields(VehicleState)}, "start")
+    canvas = _numbers(values["canvas"], {field.name for field in fields(CanvasPlacement)}, "canvas")
+    for key in ("x_m", "y_m"):
+        for what, table in (("start", start), ("canvas", canvas)):
+            if key not in table:
+                raise ScenarioError(f"{what} has no {key}")
+    return Scenario(
+        name=_string(values, "name"),
+        kind=_kind(_string(values, "kind")),
+        map_name=_map_name(_string(values, "map_name"), folder),
+        start=VehicleState(**{"z_m": 0.0, "yaw_rad": 0.0, "speed_mps": 0.0, **start}),
+        goal_m=(_float(goal[0], "goal_m"), _float(goal[1], "goal_m")),
+        canvas=CanvasPlacement(**canvas),
+        time_limit_s=_float(values["time_limit_s"], "time_limit_s"),
+    )
+
+
+def _kind(text: str) -> Kind:
+    for kind in KINDS:
+        if text == kind:
+            return kind
+    raise ScenarioError(f"kind is {text!r}, expected straight, left or right")
+
+
+def _map_name(name: str, folder: Path) -> str:
+    if not name.endswith(".xodr"):
+        return name
+    if Path(name).name != name:
+        raise ScenarioError(f"map_name is {name!r}, expected a file name without folders; put the map beside the list")
+    return str(folder / name)
+
+
+def _known(entry: object, keys: set[str], what: str) -> dict[str, Any]:
+    if not isinstance(entry, dict):
+        raise ScenarioError(f"{what} is {entry!r}, expected a table")
+    table = cast("dict[str, Any]", entry)  # TOML's keys are strings
+    for key in table:
+        if key not in keys:
+            nearest = difflib.get_close_matches(key, sorted(keys), n=1, cutoff=0.0)
+            raise ScenarioError(f"{what} has an unknown key {key!r}; did you mean {nearest[0]!r}?")
+    return table
+
+
+def _numbers(entry: object, keys: set[str], what: str) -> dict[str, float]:
+    return {key: _float(value, f"{what} {key}") for key, value in _known(entry, keys, what).items()}
+
+
+def _float(value: object, what: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ScenarioError(f"{what} is {value!r}, expected a number")
+    return float(value)
+
+
+def _string(values: Mapping[str, Any], key: str) -> str:
+    if not isinstance(values[key], str) or not values[key]:
+        raise ScenarioError(f"{key} is {values[key]!r}, expected a text")
+    return values[key]

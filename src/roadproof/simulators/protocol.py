@@ -1,0 +1,85 @@
+"""What every simulator offers to rollouts, calibration and training, whatever runs behind it."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from roadproof.datatypes import Control, Observation, Weather
+from roadproof.geometry import CameraModel, CropResize, Homography
+from roadproof.scenarios import Scenario
+
+PatternImage = UInt8[np.ndarray, "400 400 4"]
+"""What is painted on the canvas: RGBA with straight (not premultiplied) alpha; y = 0 is the far edge."""
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """A world with one car that is driven step by step.
+
+    A simulator is a context manager: entering starts it, leaving frees everything it holds. Several may live at once,
+    each in its own process. The same calls with the same seed give the same pixels and states.
+    """
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera on the car; full pictures have its size."""
+        ...
+
+    @property
+    def input(self) -> CropResize:
+        """How the controller's frame is cut from the camera picture."""
+        ...
+
+    @property
+    def dt_s(self) -> float:
+        """Simulated seconds per step."""
+        ...
+
+    def __enter__(self) -> Simulator: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def reset(
+        self,
+        scenario: Scenario,
+        *,
+        weather: Weather = Weather.CLEAR_NOON,
+        pattern: PatternImage | None = None,
+        cars: int = 0,
+        pedestrians: int = 0,
+        seed: int = 0,
+        full_pictures: bool = False,
+    ) -> Observation:
+        """Begin a drive: nothing of the one before is left.
+
+        Args:
+            scenario: start, goal, canvas, time limit and map.
+            weather: one of the eight.
+            pattern: painted on the canvas; None leaves the road bare.
+            cars: other cars on the road.
+            pedestrians: people about.
+            seed: of the other cars and the people.
+            full_pictures: also give the full camera picture with every observation.
+
+        Raises:
+            SimulatorError: it is not open, or an argument does not fit.
+        """
+        ...
+
+    def step(self, control: Control) -> Observation:
+        """Drive on for `dt_s`.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        ...
+
+    def image_from_canvas(self) -> Homography:
+        """The exact homography of the current state: canvas px to camera px."""
+        ...

@@ -1,0 +1,347 @@
+"""The ground seen from above: what it is made of, which shadows fall on it, where water stands.
+
+Convention:
+    Planes are north-up pictures turned round: row 0 is the *lowest* y, column 0 the lowest x, and a sample lies in the
+    middle of its square. `Ground` is the same in all weathers; `LitGround` is one weather.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageChops, ImageDraw, ImageFilter
+
+from roadproof.simulators.town.lanes import Lane
+from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.simulators.town.scenery import Scenery
+from roadproof.simulators.town.textures import fractal_noise
+from roadproof.simulators.town.weather import Sky
+
+FINE_M = 0.125
+COARSE_M = 0.25
+BORDER_M = 30.0
+NOISE_M = 64.0
+UNIT = 190
+WET_FROM = 0.3
+
+ASPHALT, SHOULDER, PAVEMENT, LAWN = (96, 96, 98), (104, 103, 102), (172, 168, 160), (88, 106, 58)
+KINDS = (LAWN, PAVEMENT, SHOULDER, ASPHALT)
+
+Plane = Float[np.ndarray, "_ _"]
+Vector = Float[np.ndarray, "2"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What the ground is made of.
+
+    Args:
+        low_m: world x, y of the planes' lower corner.
+        size_m: their extent in x and y.
+        albedo: colour in display levels, RGB, `FINE_M` a pixel.
+        hard: 255 where it is paved, 0 on lawn, `FINE_M` a pixel.
+        hollows: how low the ground lies, 0 to 255: where water collects first, `COARSE_M` a pixel.
+        open_sky: share of the sky that is seen, 0 to 255, `COARSE_M` a pixel.
+    """
+
+    low_m: tuple[float, float]
+    size_m: tuple[float, float]
+    albedo: Image.Image
+    hard: Image.Image
+    hollows: UInt8[np.ndarray, "h w"]
+    open_sky: UInt8[np.ndarray, "h w"]
+
+
+def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50) -> Ground:
+    """Draw the ground of a map; its extent is a whole number of cells."""
+    x0, y0, x1, y1 = roads.bounds_m
+    low = (math.floor((x0 - BORDER_M) / cell_m) * cell_m, math.floor((y0 - BORDER_M) / cell_m) * cell_m)
+    size = (
+        math.ceil((x1 + BORDER_M - low[0]) / cell_m) * cell_m,
+        math.ceil((y1 + BORDER_M - low[1]) / cell_m) * cell_m,
+    )
+    fine, coarse = _Canvas(low, size, FINE_M), _Canvas(low, size, COARSE_M)
+    surface = _surfaces(fine, roads, scenery)
+    tracks = _tyre_tracks(coarse, roads)
+    edges = coarse.outlines([lane for lane in roads.lanes if lane.kind == "sidewalk"], 1.0)
+    hollows = _hollows(coarse, tracks, edges, seed)
+    albedo = _albedo(coarse, surface, tracks, edges, seed)
+    hard = surface.point([0] + [255] * 255)
+    return Ground(low, size, albedo, hard, hollows, _open_sky(coarse, scenery))
+
+
+class _Canvas:
+    """Draws world shapes into a plane of one byte a pixel."""
+
+    def __init__(self, low: tuple[float, float], size: tuple[float, float], pixel_m: float) -> None:
+        self.low, self.pixel_m = np.array(low), pixel_m
+        self.shape = (round(size[1] / pixel_m), round(size[0] / pixel_m))
+
+    def blank(self) -> Image.Image:
+        return Image.new("L", (self.shape[1], self.shape[0]), 0)
+
+    def points(self, world: np.ndarray) -> list[tuple[float, float]]:
+        return [(float(x), float(y)) for x, y in (world[:, :2] - self.low) / self.pixel_m - 0.5]
+
+    def outlines(self, lanes: list[Lane], width_m: float) -> Plane:
+        """The inner borders of lanes as soft lines, in [0, 1]."""
+        image = self.blank()
+        pen = ImageDraw.Draw(image)
+        for lane in lanes:
+            pen.line(self.points(lane.left), fill=255, width=max(1, round(width_m / self.pixel_m)))
+        return np.asarray(image.filter(ImageFilter.GaussianBlur(0.3 / self.pixel_m)), np.float32) / 255
+
+    def noise(self, seed: int, cells: int, octaves: int) -> Plane:
+        """Noise that repeats every `NOISE_M`."""
+        n = round(NOISE_M / self.pixel_m)
+        patch = fractal_noise(n, n, seed=seed, cells=cells, octaves=octaves)
+        rows, columns = np.arange(self.shape[0]) % n, np.arange(self.shape[1]) % n
+        return patch[rows][:, columns]
+
+
+def _surfaces(canvas: _Canvas, roads: RoadMap, scenery: Scenery) -> Image.Image:
+    """0 lawn, 1 pavement, 2 shoulder, 3 road."""
+    image = canvas.blank()
+    pen = ImageDraw.Draw(image)
+    for outline in scenery.paved:
+        pen.polygon(canvas.points(outline), fill=1)
+    layers = {"sidewalk": 1, "shoulder": 2, "border": 2, "parking": 2, "driving": 3}
+    for lane in sorted(roads.lanes, key=lambda lane: layers.get(lane.kind, 0)):
+        if lane.kind in layers:
+            pen.polygon(canvas.points(np.concatenate([lane.left, lane.right[::-1]])), fill=layers[lane.kind])
+    for area in roads.junctions:
+        pen.polygon(canvas.points(area.outline), fill=3)
+    return image
+
+
+def _tyre_tracks(canvas: _Canvas, roads: RoadMap) -> Plane:
+    """Where wheels run, in [0, 1]."""
+    image = canvas.blank()
+    pen = ImageDraw.Draw(image)
+    for lane in roads.lanes:
+        if lane.kind == "driving":
+            for share in (0.27, 0.73):
+                pen.line(canvas.points(lane.left * (1 - share) + lane.right * share), fill=255, width=2)
+    return np.asarray(image.filter(ImageFilter.GaussianBlur(0.22 / canvas.pixel_m)), np.float32) / 255
+
+
+def _hollows(canvas: _Canvas, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
+    low = 0.7 * canvas.noise(seed, 14, 5) + 0.3 * canvas.noise(seed + 4, 48, 3) + 0.05 * tracks + 0.08 * edges
+    return (np.clip((low - 0.35) / 0.40, 0, 1) * 255).astype(np.uint8)
+
+
+def _albedo(canvas: _Canvas, surface: Image.Image, tracks: Plane, edges: Plane, seed: int) -> Image.Image:
+    """Colours: asphalt with tracks, dirt at the kerb and mended patches; slabs; lawn."""
+    broad, lumps = canvas.noise(seed + 1, 8, 4), canvas.noise(seed + 2, 64, 4)
+    road = 1 + 0.22 * (broad - 0.5) + 0.05 * (lumps - 0.5) - 0.11 * tracks - 0.16 * edges
+    road *= 1 - 0.09 * _mended(canvas, seed)
+    lawn = 0.72 + 0.36 * broad + 0.40 * (lumps - 0.3)
+    # Factors up to 1.34 as bytes; the tables make up for it.
+    factors = [
+        Image.fromarray(np.clip(plane * UNIT + 0.5, 0, 255).astype(np.uint8)).resize(
+            surface.size, Image.Resampling.BILINEAR
+        )
+        for plane in (lawn, 0.94 + 0.12 * broad, road)
+    ]
+    paved = Image.composite(factors[2], factors[1], surface.point([0, 0] + [255] * 254))
+    factor = Image.composite(paved, factors[0], surface.point([0] + [255] * 255))
+    channels = [
+        ImageChops.multiply(surface.point([round(kind[k] * 255 / UNIT) for kind in KINDS] + [0] * 252), factor)
+        for k in range(3)
+    ]
+    return Image.merge("RGB", channels).filter(ImageFilter.BoxBlur(0.6))
+
+
+def _mended(canvas: _Canvas, seed: int) -> Plane:
+    """Rectangles of newer asphalt and sealed cracks, 0 or 1."""
+    rng = np.random.default_rng(seed + 3)
+    image = canvas.blank()
+    pen = ImageDraw.Draw(image)
+    height, width = canvas.shape
+    for _ in range(round(height * width * canvas.pixel_m**2 / 90)):
+        x, y = rng.uniform(0, width), rng.uniform(0, height)
+        w, h = rng.uniform(0.7, 3.0, 2) / canvas.pixel_m
+        pen.rectangle((x, y, x + w, y + h), fill=255)
+    return np.asarray(image, np.float32) / 255
+
+
+def _open_sky(canvas: _Canvas, scenery: Scenery) -> UInt8[np.ndarray, "h w"]:
+    """How open the sky is: less beside walls, below trees and under parked cars."""
+    walls, low = canvas.blank(), canvas.blank()
+    tall, flat = ImageDraw.Draw(walls), ImageDraw.Draw(low)
+    for solid in scenery.solids:
+        if solid.name == "building":
+            tall.polygon(canvas.points(solid.corners), fill=255)
+        elif solid.casts_shadow and solid.half_m[1] > 0.3:
+            flat.polygon(canvas.points(solid.corners), fill=255)
+    for tree in scenery.trees:
+        (x, y), r = canvas.points(np.array([[tree.x_m, tree.y_m]]))[0], 0.34 * tree.height_m / canvas.pixel_m
+        flat.ellipse((x - r, y - r, x + r, y + r), fill=90)
+    near = np.asarray(walls.filter(ImageFilter.GaussianBlur(1.5 / canvas.pixel_m)), np.float32) / 255
+    broad = (
+        np.asarray(
+            walls.reduce(4).filter(ImageFilter.GaussianBlur(1.5 / canvas.pixel_m)).resize(walls.size), np.float32
+        )
+        / 255
+    )
+    under = np.asarray(low.filter(ImageFilter.GaussianBlur(0.4 / canvas.pixel_m)), np.float32) / 255
+    share = 1 - np.clip(0.36 * near + 0.40 * broad + 0.5 * under, 0, 0.7)
+    return (share * 255).astype(np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LitGround:
+    """The ground in one weather.
+
+    Args:
+        ground: what it is made of.
+        sky: the weather.
+        sunlit: 255 in the sun, 0 in full shadow, `COARSE_M` a pixel.
+        colour: dry or damp, before light, RGB, `FINE_M` a pixel.
+        light: what colours are multiplied with, 255 for 1, RGB, `COARSE_M` a pixel.
+        water: share of mirrored sky in what is seen, 255 for 1, `COARSE_M` a pixel; on paved ground only.
+        mirrored: the sky that is mirrored, RGB levels.
+    """
+
+    ground: Ground
+    sky: Sky
+    sunlit: UInt8[np.ndarray, "h w"]
+    colour: Image.Image
+    light: Image.Image
+    water: Image.Image
+    mirrored: tuple[int, int, int]
+
+    def sunlit_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """1 in the sun, 0 in full shadow."""
+        return self._at(self.sunlit, points_m)
+
+    def open_sky_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """Share of the sky that is seen."""
+        return self._at(self.ground.open_sky, points_m)
+
+    def water_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """Share of mirrored sky."""
+        return self._at(np.asarray(self.water), points_m)
+
+    def _at(self, plane: UInt8[np.ndarray, "h w"], points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        at = np.floor((np.asarray(points_m) - self.ground.low_m) / COARSE_M).astype(int)
+        x, y = np.clip(at[:, 0], 0, plane.shape[1] - 1), np.clip(at[:, 1], 0, plane.shape[0] - 1)
+        return plane[y, x] / 255
+
+    def cell(self, column: int, row: int, cell_m: float, margin_m: float) -> Image.Image:
+        """The lit colour of a square cell and a margin round it, `FINE_M` a pixel, row 0 the *highest* y."""
+        n = round((cell_m + 2 * margin_m) / FINE_M)
+        low = np.array([column, row]) * cell_m - margin_m
+        box = self._box(low, n, FINE_M)
+        # The light's pixels are twice as large: half a pixel of a cell is a quarter of theirs.
+        coarse = self._box(low, n // 2, COARSE_M)
+        light = self.light.crop(coarse).resize((n, n), Image.Resampling.BILINEAR)
+        seen = ImageChops.multiply(self.colour.crop(box), light)
+        if self.sky.wetness > WET_FROM:
+            water = self.water.crop(coarse).resize((n, n), Image.Resampling.BILINEAR)
+            share = ImageChops.multiply(water, self.ground.hard.crop(box))
+            seen = Image.composite(Image.new("RGB", (n, n), self.mirrored), seen, share)
+        return seen.transpose(Image.Transpose.FLIP_TOP_BOTTOM)
+
+    def _box(self, low: np.ndarray, n: int, pixel_m: float) -> tuple[int, int, int, int]:
+        x, y = (round(float(v) / pixel_m) for v in low)
+        return (x, y, x + n, y + n)
+
+    def patch(
+        self, plane: Image.Image, pixel_m: float, corner: Vector, per_column: Vector, per_row: Vector, pixels: int
+    ) -> Float[np.ndarray, "p p c"]:
+        """A plane seen in a turned square of pixels.
+
+        Args:
+            plane: one of this ground's.
+            pixel_m: its resolution.
+            corner: world x, y of the square's upper left corner.
+            per_column: world step from a column to the next.
+            per_row: world step from a row to the next.
+            pixels: rows and columns of the square.
+        """
+        x0, y0 = (corner - np.array(self.ground.low_m)) / pixel_m
+        (ax, ay), (bx, by) = per_column / pixel_m, per_row / pixel_m
+        turned = plane.transform(
+            (pixels, pixels), Image.Transform.AFFINE, (ax, bx, x0, ay, by, y0), Image.Resampling.BILINEAR
+        )
+        array = np.asarray(turned, np.float32)
+        return array if array.ndim == 3 else array[..., None]
+
+
+def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> LitGround:
+    """Cast the shadows of one weather."""
+    canvas = _Canvas(ground.low_m, ground.size_m, COARSE_M)
+    image = canvas.blank()
+    pen = ImageDraw.Draw(image)
+    sun = sky.to_sun
+    run = -sun[:2] / sun[2]
+    for solid in scenery.solids:
+        if solid.casts_shadow:
+            base = solid.corners
+            pen.polygon(canvas.points(_hull(np.concatenate([base, base + run * solid.height_m]))), fill=255)
+    rng = np.random.default_rng(seed)
+    for tree in scenery.trees:
+        foot = np.array([tree.x_m, tree.y_m])
+        pen.line(canvas.points(np.stack([foot, foot + run * 0.45 * tree.height_m])), fill=255, width=1)
+        for _ in range(22):
+            height = tree.height_m * rng.uniform(0.42, 0.92)
+            angle, spread = rng.uniform(0, 2 * math.pi), 0.34 * tree.height_m * math.sqrt(rng.random())
+            centre = foot + run * height + spread * np.array([math.cos(angle), math.sin(angle)])
+            (x, y), r = canvas.points(centre[None])[0], tree.height_m * rng.uniform(0.04, 0.10) / COARSE_M
+            pen.ellipse((x - r, y - r, x + r, y + r), fill=225)
+    soft = image.filter(ImageFilter.GaussianBlur(sky.shadow_blur_m / COARSE_M))
+    sunlit = 255 - np.asarray(soft)
+    facing = np.full(sunlit.shape, sun[2], np.float32)
+    light = sky.light(facing, sunlit.astype(np.float32) / 255, ground.open_sky.astype(np.float32) / 255)
+    # The wetter, the further up the hollows are full; what is merely wet mirrors a little as well.
+    full = np.clip((ground.hollows.astype(np.float32) / 255 - 0.80 + 0.34 * sky.wetness) / 0.10, 0, 1)
+    share = (0.50 * full + 0.07) * sky.wetness**0.5 if sky.wetness > WET_FROM else 0 * full
+    zenith, horizon = np.array(sky.zenith), np.array(sky.horizon)
+    red, green, blue = (round(v) for v in 255 * 0.78 * (0.6 * horizon + 0.4 * zenith))
+    return LitGround(
+        ground=ground,
+        sky=sky,
+        sunlit=sunlit,
+        colour=_damp(ground, sky.wetness),
+        light=Image.fromarray((light * 255 + 0.5).astype(np.uint8)),
+        water=Image.fromarray((share * 255).astype(np.uint8)),
+        mirrored=(red, green, blue),
+    )
+
+
+def paved_damp(wetness: float) -> float:
+    """What wetness multiplies the colour of paved ground with."""
+    return 1 - 0.34 * wetness
+
+
+def _damp(ground: Ground, wetness: float) -> Image.Image:
+    if wetness == 0.0:
+        return ground.albedo
+    soft, hard = (
+        ground.albedo.point([round(v * factor) for v in range(256)] * 3)
+        for factor in (1 - 0.10 * wetness, paved_damp(wetness))
+    )
+    return Image.composite(hard, soft, ground.hard)
+
+
+def _hull(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """Convex hull, by Andrew's monotone chain."""
+    ordered = sorted((float(x), float(y)) for x, y in points)
+
+    def half(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        kept: list[tuple[float, float]] = []
+        for p in sequence:
+            while len(kept) > 1 and _turn(kept[-2], kept[-1], p) <= 0:
+                kept.pop()
+            kept.append(p)
+        return kept[:-1]
+
+    return np.array(half(ordered) + half(ordered[::-1]))
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

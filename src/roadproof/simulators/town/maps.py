@@ -1,0 +1,80 @@
+"""Maps by name, and what a scenario means on its map."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.errors import ScenarioError
+from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.scenarios import Scenario
+from roadproof.simulators.town.roadmap import RoadMap, Surface
+from roadproof.simulators.town.routes import Route
+
+BUILTIN_MAPS = ("town", "second")
+CANVAS_NEAR_ROUTE_M = 4.0
+
+
+@lru_cache(maxsize=4)
+def load_map(name: str) -> RoadMap:
+    """A built-in map by name, or an OpenDRIVE file by path; kept, so that the next call is free.
+
+    Raises:
+        ScenarioError: there is no such map, or it cannot be read.
+    """
+    if name in BUILTIN_MAPS:
+        return RoadMap.from_opendrive(Path(__file__).parent / "assets" / f"{name}.xodr")
+    if not name.endswith(".xodr"):
+        known = ", ".join(BUILTIN_MAPS)
+        raise ScenarioError(f"the town simulator has no map {name!r}, expected {known} or the path of an .xodr file")
+    return RoadMap.from_opendrive(Path(name))
+
+
+def scenario_route(scenario: Scenario, road_map: RoadMap) -> Route:
+    """The route of a scenario, once all of it is known to fit the map.
+
+    Raises:
+        ScenarioError: the start is not along a lane, the goal cannot be reached, or the canvas is off the road or
+            away from the route.
+    """
+    try:
+        route = road_map.route(scenario.start, scenario.goal_m)
+        check_canvas(scenario.canvas, road_map)
+    except ScenarioError as error:
+        raise ScenarioError(f"scenario {scenario.name}: {error}") from error
+    nearest = route.locate(scenario.canvas.x_m, scenario.canvas.y_m)
+    if abs(nearest.lateral_m) > CANVAS_NEAR_ROUTE_M or not 0.0 < nearest.arclength_m < route.length_m:
+        raise ScenarioError(
+            f"scenario {scenario.name}: the canvas at ({scenario.canvas.x_m:.1f}, {scenario.canvas.y_m:.1f}) is not on "
+            f"the way from start to goal, expected its middle within {CANVAS_NEAR_ROUTE_M:.0f} m of the route; move it"
+        )
+    return route
+
+
+def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:
+    """Refuse a canvas of which some part lies beside the carriageway.
+
+    Raises:
+        ScenarioError: where, and on what.
+    """
+    points = canvas_points(canvas)
+    codes = road_map.surface_at(points)
+    off = np.flatnonzero((codes != Surface.DRIVING) & (codes != Surface.SHOULDER))
+    if len(off):
+        x, y = points[off[0]]
+        what = Surface(int(codes[off[0]])).name.lower()
+        raise ScenarioError(
+            f"the canvas at ({canvas.x_m:.1f}, {canvas.y_m:.1f}) is off the road at ({x:.1f}, {y:.1f}), where there is "
+            f"{'no pavement' if what == 'other' else what}; move, turn or shrink it"
+        )
+
+
+def canvas_points(canvas: CanvasPlacement) -> Float[np.ndarray, "n 2"]:
+    """World points (x, y) all over a canvas, its corners among them, less than a metre apart."""
+    steps = [int(np.ceil(extent)) + 1 for extent in (canvas.width_m, canvas.length_m)]
+    x, y = (np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, n) for n in steps)
+    pixels = np.stack([*(axis.ravel() for axis in np.meshgrid(x, y)), np.ones(len(x) * len(y))])
+    return (canvas.world_from_canvas @ pixels)[:2].T

@@ -1,0 +1,413 @@
+"""Reads the part of ASAM OpenDRIVE that towns use: what a file says, before anything is made of it.
+
+Lines, arcs, spirals and parametric cubics; elevation; lane offsets, sections, widths and road marks; links, junctions
+and their lane links. What would change the shape of a road and is not read (superelevation, lane borders, `poly3`,
+left-hand traffic, virtual junctions) is refused by name; what would not (signals, objects, user data) is skipped.
+
+Convention:
+    s runs along a road's reference line, t to its left, both in metres. Lane numbers are negative right of the
+    reference line (travelled along s) and positive left of it (travelled against s).
+
+References:
+    ASAM OpenDRIVE 1.7, chapters 7 to 10.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.errors import ScenarioError
+
+Stations = Float[np.ndarray, " n"]
+MAX_LENGTH_M = 50_000.0
+MAX_CURVATURE = 5.0
+MAX_WIDTH_M = 100.0
+GAP_M = 0.05
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cubics:
+    """A piecewise cubic a + b·ds + c·ds² + d·ds³, ds counted from the start of its piece."""
+
+    starts_m: Float[np.ndarray, " k"]
+    coefficients: Float[np.ndarray, "k 4"]
+
+    def __call__(self, s_m: Stations) -> Stations:
+        """Values at stations s_m."""
+        piece = np.maximum(np.searchsorted(self.starts_m, s_m, side="right") - 1, 0)
+        ds = s_m - self.starts_m[piece]
+        a, b, c, d = self.coefficients[piece].T
+        return a + ds * (b + ds * (c + ds * d))
+
+
+@dataclass(frozen=True, slots=True)
+class Clothoid:
+    """A curve whose curvature goes linearly from one value to another: line, arc and spiral."""
+
+    start_curvature: float
+    end_curvature: float
+
+    def local(self, ds_m: Stations, length_m: float) -> tuple[Stations, Stations, Stations]:
+        """Position (u, v) and heading in the frame of its start, by Gauss-Legendre quadrature of the heading."""
+        rate = (self.end_curvature - self.start_curvature) / length_m
+        heading = ds_m * (self.start_curvature + 0.5 * rate * ds_m)
+        if self.start_curvature == 0.0 and self.end_curvature == 0.0:
+            return ds_m, np.zeros_like(ds_m), heading
+        at = 0.5 * ds_m[:, None] * (_NODES + 1.0)
+        phase = at * (self.start_curvature + 0.5 * rate * at)
+        half = 0.5 * ds_m
+        return half * (np.cos(phase) @ _WEIGHTS), half * (np.sin(phase) @ _WEIGHTS), heading
+
+    def max_curvature(self) -> float:
+        """Largest curvature in 1/m, without sign."""
+        return max(abs(self.start_curvature), abs(self.end_curvature))
+
+
+@dataclass(frozen=True, slots=True)
+class ParamCubic:
+    """u(p), v(p) as cubics; p is the arc length, or runs from 0 to 1 where `normalized`."""
+
+    u: tuple[float, float, float, float]
+    v: tuple[float, float, float, float]
+    normalized: bool
+
+    def local(self, ds_m: Stations, length_m: float) -> tuple[Stations, Stations, Stations]:
+        """Position (u, v) and heading in the frame of its start."""
+        p = ds_m / length_m if self.normalized else ds_m
+        powers = np.stack([np.ones_like(p), p, p * p, p**3])
+        slopes = np.stack([np.zeros_like(p), np.ones_like(p), 2 * p, 3 * p * p])
+        u, v = np.array(self.u), np.array(self.v)
+        return u @ powers, v @ powers, np.unwrap(np.arctan2(v @ slopes, u @ slopes))
+
+    def max_curvature(self) -> float:
+        """Largest curvature in 1/m, without sign, over 33 points."""
+        p = np.linspace(0.0, 1.0, 33)
+        u, v = np.polynomial.Polynomial(self.u), np.polynomial.Polynomial(self.v)
+        if not self.normalized:
+            p = p * max(abs(self.u[1]), 1.0)
+        du, dv, ddu, ddv = u.deriv()(p), v.deriv()(p), u.deriv(2)(p), v.deriv(2)(p)
+        return float(np.max(np.abs(du * ddv - dv * ddu) / np.maximum(du * du + dv * dv, 1e-9) ** 1.5))
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """One piece of a reference line: where it starts, how long it is and its shape."""
+
+    s_m: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    length_m: float
+    shape: Clothoid | ParamCubic
+
+
+@dataclass(frozen=True, slots=True)
+class MarkRecord:
+    """A road mark on the outer border of a lane, from `offset_m` after the start of its section on."""
+
+    offset_m: float
+    kind: str
+    colour: str
+    width_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaneRecord:
+    """One lane of one section; lane 0 has no width and carries the centre line's marks."""
+
+    number: int
+    kind: str
+    width: Cubics | None
+    marks: tuple[MarkRecord, ...]
+    predecessor: int | None
+    successor: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """A stretch of road with a fixed set of lanes, from `start_m` to `end_m`."""
+
+    start_m: float
+    end_m: float
+    lanes: dict[int, LaneRecord]
+
+
+@dataclass(frozen=True, slots=True)
+class RoadLink:
+    """What a road's end touches: an end of another road, or a junction (no contact)."""
+
+    kind: Literal["road", "junction"]
+    target: str
+    contact: Literal["start", "end"] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Road:
+    """A reference line and the lanes along it."""
+
+    name: str
+    length_m: float
+    junction: str | None
+    predecessor: RoadLink | None
+    successor: RoadLink | None
+    plan: tuple[Geometry, ...]
+    elevation: Cubics
+    lane_offset: Cubics
+    sections: tuple[Section, ...]
+
+    def reference(self, s_m: Stations) -> tuple[Float[np.ndarray, "n 2"], Stations]:
+        """Position (x, y) and heading of the reference line at stations s_m."""
+        points, headings = np.empty((len(s_m), 2)), np.empty(len(s_m))
+        starts = np.array([piece.s_m for piece in self.plan])
+        owner = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, None)
+        pieces: list[int] = np.unique(owner).tolist()
+        for k in pieces:
+            piece, mine = self.plan[k], owner == k
+            u, v, turn = piece.shape.local(s_m[mine] - piece.s_m, piece.length_m)
+            c, s = math.cos(piece.heading_rad), math.sin(piece.heading_rad)
+            points[mine] = np.stack([piece.x_m + c * u - s * v, piece.y_m + s * u + c * v], axis=1)
+            headings[mine] = piece.heading_rad + turn
+        return points, headings
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """A way through a junction: from a road onto a connecting road, lane by lane (from, to)."""
+
+    incoming: str
+    connecting: str
+    contact: Literal["start", "end"]
+    lane_links: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenDrive:
+    """What a file says: roads by id, connections by junction id."""
+
+    roads: dict[str, Road]
+    junctions: dict[str, tuple[Connection, ...]]
+
+
+def read_opendrive(path: Path) -> OpenDrive:
+    """Read an OpenDRIVE file.
+
+    Raises:
+        ScenarioError: the file is missing, is not OpenDRIVE, or holds an element that is damaged or not supported; the
+            message names the road and the element.
+    """
+    try:
+        text = path.read_bytes()
+        if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+            raise ScenarioError(f"map {path} declares XML entities, expected plain OpenDRIVE")
+        root = ET.fromstring(text)  # noqa: S314  entities are refused above
+    except OSError as error:
+        raise ScenarioError(f"map {path} cannot be read ({error.strerror}); check the path") from error
+    except ET.ParseError as error:
+        raise ScenarioError(f"map {path} is not well-formed XML ({error})") from error
+    if root.tag != "OpenDRIVE":
+        raise ScenarioError(f"map {path} starts with <{root.tag}>, expected <OpenDRIVE>")
+    try:
+        roads = {road.name: road for road in (_road(element) for element in root.iterfind("road"))}
+        junctions = dict(_junction(element) for element in root.iterfind("junction"))
+        if not roads:
+            raise ScenarioError("no <road>, expected at least one")
+    except ScenarioError as error:
+        raise ScenarioError(f"map {path}: {error}") from error
+    return OpenDrive(roads, junctions)
+
+
+def _road(element: ET.Element) -> Road:
+    name = _text(element, "id", "road")
+    where = f"road {name}"
+    if element.get("rule", "RHT") != "RHT":
+        raise ScenarioError(
+            f"{where}: rule {element.get('rule')!r} is not supported, expected right-hand traffic (RHT)"
+        )
+    for lateral in ("superelevation", "shape"):
+        for record in element.iterfind(f"lateralProfile/{lateral}"):
+            if any(_number(record, key, where) != 0.0 for key in "abcd"):
+                raise ScenarioError(f"{where}: <{lateral}> that is not zero is not supported")
+    length = _number(element, "length", where)
+    plan = tuple(_geometry(piece, where) for piece in element.iterfind("planView/geometry"))
+    plan = tuple(piece for piece in plan if piece.length_m > 1e-9)
+    if not plan:
+        raise ScenarioError(f"{where}: <planView> has no <geometry> of some length")
+    starts = [piece.s_m for piece in plan]
+    if starts != sorted(starts):
+        raise ScenarioError(f"{where}: <geometry> elements are not ordered by s")
+    reach = plan[-1].s_m + plan[-1].length_m
+    if abs(reach - length) > GAP_M or starts[0] > GAP_M:
+        raise ScenarioError(
+            f"{where}: <geometry> goes from {starts[0]:.3f} to {reach:.3f} m, expected 0 to {length:.3f}"
+        )
+    junction = element.get("junction", "-1")
+    return Road(
+        name=name,
+        length_m=length,
+        junction=None if junction == "-1" else junction,
+        predecessor=_road_link(element.find("link/predecessor"), where),
+        successor=_road_link(element.find("link/successor"), where),
+        plan=plan,
+        elevation=_cubics(element.findall("elevationProfile/elevation"), "s", where),
+        lane_offset=_cubics(element.findall("lanes/laneOffset"), "s", where),
+        sections=_sections(element, length, where),
+    )
+
+
+def _geometry(element: ET.Element, where: str) -> Geometry:
+    length = _number(element, "length", where)
+    shape: Clothoid | ParamCubic | None = None
+    names = [child.tag for child in element if child.tag != "userData"]
+    for child in element:
+        if child.tag == "line":
+            shape = Clothoid(0.0, 0.0)
+        elif child.tag == "arc":
+            curvature = _number(child, "curvature", where)
+            shape = Clothoid(curvature, curvature)
+        elif child.tag == "spiral":
+            shape = Clothoid(_number(child, "curvStart", where), _number(child, "curvEnd", where))
+        elif child.tag == "paramPoly3":
+            u, v = (tuple(_number(child, f"{key}{axis}", where) for key in "abcd") for axis in "UV")
+            shape = ParamCubic((u[0], u[1], u[2], u[3]), (v[0], v[1], v[2], v[3]), child.get("pRange") != "arcLength")
+    if shape is None:
+        found = ", ".join(f"<{tag}>" for tag in names) or "nothing"
+        raise ScenarioError(
+            f"{where}: <geometry> holds {found}, which is not supported; expected line, arc, spiral or paramPoly3"
+        )
+    if not 0.0 <= length <= MAX_LENGTH_M:
+        raise ScenarioError(f"{where}: <geometry> has length {length} m, expected 0 to {MAX_LENGTH_M:.0f}")
+    if length > 1e-9 and shape.max_curvature() > MAX_CURVATURE:
+        raise ScenarioError(
+            f"{where}: <geometry> has a curvature of {shape.max_curvature():.3g} 1/m, expected at most {MAX_CURVATURE}"
+        )
+    heading = _number(element, "hdg", where)
+    return Geometry(
+        _number(element, "s", where), _number(element, "x", where), _number(element, "y", where), heading, length, shape
+    )
+
+
+def _sections(road: ET.Element, length_m: float, where: str) -> tuple[Section, ...]:
+    elements = road.findall("lanes/laneSection")
+    if not elements:
+        raise ScenarioError(f"{where}: no <laneSection>, expected at least one")
+    starts = [_number(element, "s", where) for element in elements]
+    if starts != sorted(starts):
+        raise ScenarioError(f"{where}: <laneSection> elements are not ordered by s")
+    if starts[0] < 0.0 or starts[-1] > length_m:
+        raise ScenarioError(f"{where}: <laneSection> starts outside the road's 0 to {length_m:.3f} m")
+    sections: list[Section] = []
+    for element, start, end in zip(elements, starts, [*starts[1:], length_m], strict=True):
+        lanes = [
+            _lane(lane, where) for side in ("left", "center", "right") for lane in element.iterfind(f"{side}/lane")
+        ]
+        sections.append(Section(start, end, {lane.number: lane for lane in lanes}))
+    return tuple(sections)
+
+
+def _lane(element: ET.Element, where: str) -> LaneRecord:
+    number = _integer(element, "id", where)
+    where = f"{where}: lane {number}"
+    widths = element.findall("width")
+    if number != 0 and not widths:
+        hint = "<border> is not supported, " if element.find("border") is not None else ""
+        raise ScenarioError(f"{where}: {hint}expected at least one <width>")
+    return LaneRecord(
+        number=number,
+        kind=element.get("type", "none"),
+        width=_cubics(widths, "sOffset", where) if number != 0 else None,
+        marks=tuple(_mark(mark, where) for mark in element.iterfind("roadMark")),
+        predecessor=_lane_link(element.find("link/predecessor"), where),
+        successor=_lane_link(element.find("link/successor"), where),
+    )
+
+
+def _mark(element: ET.Element, where: str) -> MarkRecord:
+    colour = element.get("color", "standard")
+    return MarkRecord(
+        offset_m=_number(element, "sOffset", where),
+        kind=element.get("type", "none"),
+        colour="white" if colour == "standard" else colour,
+        width_m=_number(element, "width", where) if "width" in element.attrib else 0.12,
+    )
+
+
+def _lane_link(element: ET.Element | None, where: str) -> int | None:
+    return None if element is None else _integer(element, "id", where)
+
+
+def _road_link(element: ET.Element | None, where: str) -> RoadLink | None:
+    if element is None:
+        return None
+    target = _text(element, "elementId", where)
+    if element.get("elementType") == "junction":
+        return RoadLink("junction", target, None)
+    return RoadLink("road", target, _contact(element, where))
+
+
+def _junction(element: ET.Element) -> tuple[str, tuple[Connection, ...]]:
+    name = _text(element, "id", "junction")
+    where = f"junction {name}"
+    if element.get("type", "default") != "default":
+        raise ScenarioError(f"{where}: type {element.get('type')!r} is not supported, expected 'default'")
+    connections = tuple(
+        Connection(
+            incoming=_text(connection, "incomingRoad", where),
+            connecting=_text(connection, "connectingRoad", where),
+            contact=_contact(connection, where),
+            lane_links=tuple(
+                (_integer(link, "from", where), _integer(link, "to", where)) for link in connection.iterfind("laneLink")
+            ),
+        )
+        for connection in element.iterfind("connection")
+    )
+    return name, connections
+
+
+def _contact(element: ET.Element, where: str) -> Literal["start", "end"]:
+    contact = element.get("contactPoint")
+    if contact == "start" or contact == "end":
+        return contact
+    raise ScenarioError(f"{where}: <{element.tag}> has contactPoint {contact!r}, expected 'start' or 'end'")
+
+
+def _cubics(elements: list[ET.Element], start: str, where: str) -> Cubics:
+    if not elements:
+        return Cubics(np.zeros(1), np.zeros((1, 4)))
+    starts = np.array([_number(element, start, where) for element in elements])
+    if (np.diff(starts) < 0).any():
+        raise ScenarioError(f"{where}: <{elements[0].tag}> elements are not ordered by {start}")
+    return Cubics(starts, np.array([[_number(element, key, where) for key in "abcd"] for element in elements]))
+
+
+def _text(element: ET.Element, name: str, where: str) -> str:
+    value = element.get(name)
+    if value is None:
+        raise ScenarioError(f"{where}: <{element.tag}> has no {name}")
+    return value
+
+
+def _integer(element: ET.Element, name: str, where: str) -> int:
+    text = _text(element, name, where)
+    try:
+        return int(text)
+    except ValueError:
+        raise ScenarioError(f"{where}: <{element.tag}> has {name}={text!r}, expected a whole number") from None
+
+
+def _number(element: ET.Element, name: str, where: str) -> float:
+    text = _text(element, name, where)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ScenarioError(f"{where}: <{element.tag}> has {name}={text!r}, expected a finite number")
+    return value

@@ -1,0 +1,192 @@
+"""Routes: the shortest way along lanes from a pose to a place, and what it commands at junctions."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from roadproof.datatypes import Command
+from roadproof.errors import ScenarioError
+from roadproof.simulators.town.lanes import Lane, Line, polyline_stations
+
+SPACING_M = 0.5
+COMMAND_LEAD_M = 20.0
+TURN_RAD = math.radians(35.0)
+
+
+@dataclass(frozen=True, slots=True)
+class RoutePosition:
+    """Where something is along a route: how far, how much left of it, the route's heading and command there."""
+
+    arclength_m: float
+    lateral_m: float
+    heading_rad: float
+    command: Command
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A junction on a route: where along it the route enters and leaves, and a circle round all of its lanes."""
+
+    junction: str
+    enters_m: float
+    leaves_m: float
+    command: Command
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """A way along lane centres.
+
+    Args:
+        points: about half a metre apart, (N, 3), metres.
+        headings_rad: direction of travel at each point, unwrapped.
+        arclengths_m: distance driven up to each point.
+        commands: codes of `Command`: a turn or straight on from 20 m before a junction to its end, else follow.
+        lanes: indices of the lanes it takes, in order.
+        crossings: the junctions it crosses, in order.
+    """
+
+    points: Line
+    headings_rad: Float[np.ndarray, " n"]
+    arclengths_m: Float[np.ndarray, " n"]
+    commands: Int[np.ndarray, " n"]
+    lanes: tuple[int, ...]
+    crossings: tuple[Crossing, ...]
+
+    @property
+    def length_m(self) -> float:
+        """Distance from start to goal."""
+        return float(self.arclengths_m[-1])
+
+    def locate(self, x_m: float, y_m: float, near_m: float | None = None) -> RoutePosition:
+        """Where a point is along the route.
+
+        Args:
+            x_m: world x.
+            y_m: world y.
+            near_m: the arc length where it was last, where that is known: only the 30 m around it are searched, so
+                that a route that meets itself is followed in order.
+        """
+        low, high = 0, len(self.points) - 1
+        if near_m is not None:
+            low = max(0, int(np.searchsorted(self.arclengths_m, near_m - 15.0)) - 1)
+            high = min(high, max(low + 1, int(np.searchsorted(self.arclengths_m, near_m + 15.0))))
+        start, step = self.points[low:high, :2], np.diff(self.points[low : high + 1, :2], axis=0)
+        reach = np.array([x_m, y_m]) - start
+        length = self.arclengths_m[low + 1 : high + 1] - self.arclengths_m[low:high]
+        along = np.clip((reach * step).sum(axis=1) / length, 0.0, length)
+        off = reach - step * (along / length)[:, None]
+        k = int(np.argmin((off * off).sum(axis=1)))
+        ux, uy = step[k] / length[k]
+        share = float(along[k] / length[k])
+        heading = self.headings_rad[low + k] * (1.0 - share) + self.headings_rad[low + k + 1] * share
+        return RoutePosition(
+            arclength_m=float(self.arclengths_m[low + k] + along[k]),
+            lateral_m=float(ux * reach[k, 1] - uy * reach[k, 0]),
+            heading_rad=float(heading),
+            command=Command(int(self.commands[low + k])),
+        )
+
+    def at(self, arclength_m: float) -> tuple[float, float, float, float]:
+        """(x, y, z, heading) at a distance from the start, held at both ends."""
+        x, y, z = (float(np.interp(arclength_m, self.arclengths_m, self.points[:, axis])) for axis in range(3))
+        return x, y, z, float(np.interp(arclength_m, self.arclengths_m, self.headings_rad))
+
+
+def shortest_way(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[int, float]) -> tuple[int, ...]:
+    """Lanes from a place (lane, arc length) to another, by A* over lane lengths with the straight line as its bound.
+
+    Raises:
+        ScenarioError: no way leads there.
+    """
+    (first, from_m), (last, to_m) = start, goal
+    if first == last and to_m >= from_m - SPACING_M:
+        return (first,)
+    goal_point = lanes[last].centre[0, :2]
+
+    def bound(index: int) -> float:
+        return float(np.linalg.norm(lanes[index].centre[-1, :2] - goal_point))
+
+    # Costs count to the end of a lane; the goal is reached when its lane is entered.
+    begin = lanes[first].length_m - from_m
+    queue: list[tuple[float, float, int, tuple[int, ...]]] = [(begin + bound(first), begin, first, (first,))]
+    done: set[int] = set()
+    while queue:
+        _, cost, index, way = heapq.heappop(queue)
+        if last in lanes[index].successors:
+            return (*way, last)
+        if index in done:
+            continue
+        done.add(index)
+        for after in lanes[index].successors:
+            if after not in done:
+                total = cost + lanes[after].length_m
+                heapq.heappush(queue, (total + bound(after), total, after, (*way, after)))
+    at, to = lanes[first].centre[0], lanes[last].centre[0]
+    raise ScenarioError(
+        f"no way leads from lane {lanes[first].number} of road {lanes[first].road} ({at[0]:.0f}, {at[1]:.0f}) to lane "
+        f"{lanes[last].number} of road {lanes[last].road} ({to[0]:.0f}, {to[1]:.0f}); move the goal or the start"
+    )
+
+
+def route_along(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, to_m: float) -> Route:
+    """The route along consecutive lanes, from an arc length of the first to one of the last."""
+    centre = np.concatenate([lanes[index].centre for index in way])
+    keep = np.concatenate([[True], np.linalg.norm(np.diff(centre, axis=0), axis=1) > 1e-4])
+    centre = centre[keep]
+    stations = polyline_stations(centre)
+    total = sum(lanes[index].length_m for index in way)
+    end_m = max(total - lanes[way[-1]].length_m + to_m, from_m + SPACING_M)
+    count = max(1, math.ceil((end_m - from_m) / SPACING_M)) + 1
+    at = np.linspace(from_m, end_m, count)
+    points = np.column_stack([np.interp(at, stations, centre[:, axis]) for axis in range(3)])
+    along = np.gradient(points[:, :2], axis=0)
+    crossings = _crossings(lanes, way, from_m, end_m)
+    return Route(
+        points=points,
+        headings_rad=np.unwrap(np.arctan2(along[:, 1], along[:, 0])),
+        arclengths_m=polyline_stations(points),
+        commands=_commands(crossings, at - from_m),
+        lanes=way,
+        crossings=crossings,
+    )
+
+
+def _crossings(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, end_m: float) -> tuple[Crossing, ...]:
+    ends = np.cumsum([lanes[index].length_m for index in way])
+    crossings: list[Crossing] = []
+    k = 0
+    while k < len(way):
+        junction, first = lanes[way[k]].junction, k
+        while k + 1 < len(way) and lanes[way[k + 1]].junction == junction:
+            k += 1
+        passed = [lanes[index] for index in way[first : k + 1]]
+        enters = float(ends[first] - passed[0].length_m)
+        if junction is not None and enters < end_m:
+            turn = sum(float(lane.headings_rad[-1] - lane.headings_rad[0]) for lane in passed)
+            command = Command.LEFT if turn > TURN_RAD else Command.RIGHT if turn < -TURN_RAD else Command.STRAIGHT
+            inside = [lane.centre[:, :2] for lane in lanes if lane.junction == junction and lane.kind == "driving"]
+            low, high = np.concatenate(inside).min(axis=0), np.concatenate(inside).max(axis=0)
+            x, y = (float(value) for value in 0.5 * (low + high))
+            radius = 0.5 * float((high - low).max())
+            crossings.append(Crossing(junction, enters - from_m, float(ends[k]) - from_m, command, x, y, radius))
+        k += 1
+    return tuple(crossings)
+
+
+def _commands(crossings: tuple[Crossing, ...], at_m: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    commands = np.full(len(at_m), int(Command.FOLLOW))
+    # Backwards, so that a junction close behind another one does not change what is asked at the first.
+    for crossing in reversed(crossings):
+        ahead = (at_m >= crossing.enters_m - COMMAND_LEAD_M) & (at_m <= crossing.leaves_m)
+        commands[ahead] = int(crossing.command)
+    return commands

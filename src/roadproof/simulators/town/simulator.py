@@ -1,0 +1,322 @@
+"""The embedded town as a simulator: map, renderer, physics and judge behind `roadproof.simulators.protocol`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+
+from roadproof.datatypes import Control, Observation, VehicleState, Weather
+from roadproof.errors import SimulatorError
+from roadproof.geometry import (
+    CANVAS_SIZE_PX,
+    CIL_CAMERA,
+    CIL_INPUT,
+    CameraModel,
+    CropResize,
+    Homography,
+    homography_from_pose,
+)
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.town.agents import NOBODY, Agents
+from roadproof.simulators.town.engine import make_pipe
+from roadproof.simulators.town.judge import Judge
+from roadproof.simulators.town.maps import load_map, scenario_route
+from roadproof.simulators.town.meshes import Pose
+from roadproof.simulators.town.physics import SUBSTEP_S, Physics
+from roadproof.simulators.town.renderer import Actor, Renderer
+from roadproof.simulators.town.roadmap import RoadMap, Surface
+from roadproof.simulators.town.routes import Route
+from roadproof.simulators.town.scenery import Scenery, build_scenery
+from roadproof.simulators.town.traffic import Traffic
+
+GOAL_M = 2.0
+
+
+@dataclass(slots=True)
+class _Town:
+    """What is kept from drive to drive: one map with all that stands on it."""
+
+    name: str
+    roads: RoadMap
+    scenery: Scenery
+    renderer: Renderer
+
+
+@dataclass(slots=True)
+class _Drive:
+    """One drive under way."""
+
+    scenario: Scenario
+    route: Route
+    physics: Physics
+    judge: Judge
+    traffic: Traffic | None
+    full_pictures: bool
+    state: VehicleState
+    steps: int = 0
+    arclength_m: float = 0.0
+
+    @property
+    def cars(self) -> Agents:
+        return NOBODY if self.traffic is None else self.traffic.cars
+
+    @property
+    def pedestrians(self) -> Agents:
+        return NOBODY if self.traffic is None else self.traffic.pedestrians
+
+
+class TownSimulator:
+    """A small town on one CPU core, without a screen, a GPU or a server.
+
+    Args:
+        camera: the camera on the car.
+        input: how the controller's frame is cut from its picture; it is rendered at twice its resolution and reduced
+            by a box, whatever `input.resampling` says.
+        dt_s: seconds per step, a multiple of 0.01.
+
+    Raises:
+        SimulatorError: `dt_s` is not a positive multiple of 0.01, or the crop leaves the camera picture.
+    """
+
+    def __init__(
+        self,
+        *,
+        camera: CameraModel = CIL_CAMERA,
+        input: CropResize = CIL_INPUT,  # noqa: A002
+        dt_s: float = 0.05,
+    ) -> None:
+        substeps = dt_s / SUBSTEP_S
+        if not (math.isfinite(dt_s) and round(substeps) >= 1 and abs(substeps - round(substeps)) < 1e-6):
+            raise SimulatorError(f"dt_s is {dt_s}, expected a positive multiple of {SUBSTEP_S}")
+        if input.right_px > camera.width_px or input.bottom_px > camera.height_px:
+            raise SimulatorError(
+                f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
+                f"{camera.width_px}×{camera.height_px} pixels"
+            )
+        self._camera, self._input, self._dt_s = camera, input, dt_s
+        self._open = False
+        self._town: _Town | None = None
+        self._drive: _Drive | None = None
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera on the car; full pictures have its size."""
+        return self._camera
+
+    @property
+    def input(self) -> CropResize:
+        """How the controller's frame is cut from the camera picture."""
+        return self._input
+
+    @property
+    def dt_s(self) -> float:
+        """Simulated seconds per step."""
+        return self._dt_s
+
+    @property
+    def roads(self) -> RoadMap:
+        """The map of the current drive.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        self._running()
+        assert self._town is not None
+        return self._town.roads
+
+    @property
+    def route(self) -> Route:
+        """The route of the current drive.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().route
+
+    @property
+    def state(self) -> VehicleState:
+        """Where the car is now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().state
+
+    @property
+    def cars(self) -> Agents:
+        """The other cars as they are now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().cars
+
+    @property
+    def pedestrians(self) -> Agents:
+        """The people as they are now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().pedestrians
+
+    def __enter__(self) -> TownSimulator:
+        make_pipe()
+        self._open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end_drive()
+        if self._town is not None:
+            self._town.renderer.close()
+            self._town = None
+        self._open = False
+
+    def reset(
+        self,
+        scenario: Scenario,
+        *,
+        weather: Weather = Weather.CLEAR_NOON,
+        pattern: PatternImage | None = None,
+        cars: int = 0,
+        pedestrians: int = 0,
+        seed: int = 0,
+        full_pictures: bool = False,
+    ) -> Observation:
+        """Begin a drive; see `roadproof.simulators.protocol.Simulator.reset`.
+
+        Raises:
+            SimulatorError: the simulator is not open, or an argument does not fit.
+            ScenarioError: the scenario does not fit its map.
+        """
+        if not self._open:
+            raise SimulatorError("the simulator is closed; use it in a with-block")
+        weather = Weather(weather)
+        _check_pattern(pattern)
+        town = self._town_of(scenario)
+        route = scenario_route(scenario, town.roads)
+        self._end_drive()
+        traffic = None
+        if cars != 0 or pedestrians != 0:
+            traffic = Traffic(town.roads, cars=cars, pedestrians=pedestrians, seed=seed, ego=scenario.start)
+        self._drive = _Drive(
+            scenario=scenario,
+            route=route,
+            physics=Physics(town.scenery.solids, scenario.start, [] if traffic is None else _poses(traffic.cars)),
+            judge=Judge(town.roads),
+            traffic=traffic,
+            full_pictures=full_pictures,
+            state=scenario.start,
+        )
+        town.renderer.set_weather(weather)
+        town.renderer.set_canvas(scenario.canvas, pattern)
+        town.renderer.set_actors(_actors(self._drive, town.roads))
+        return self._observe(self._drive)
+
+    def step(self, control: Control) -> Observation:
+        """Drive on for `dt_s`; values of the control outside their range are clipped.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        drive = self._running()
+        assert self._town is not None
+        if drive.traffic is not None:
+            drive.traffic.step(self._dt_s, drive.state)
+            drive.physics.move_cars(_poses(drive.cars))
+            self._town.renderer.move_actors(_actors(drive, self._town.roads))
+        drive.physics.step(control.clipped(), self._dt_s)
+        drive.state = drive.physics.state()
+        drive.steps += 1
+        return self._observe(drive)
+
+    def image_from_canvas(self) -> Homography:
+        """The exact homography of the current state: canvas px to camera px.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        drive = self._running()
+        return homography_from_pose(self._camera, drive.state, drive.scenario.canvas)
+
+    def _running(self) -> _Drive:
+        if self._drive is None:
+            raise SimulatorError("there is no drive; call reset first")
+        return self._drive
+
+    def _end_drive(self) -> None:
+        if self._drive is not None:
+            self._drive.physics.close()
+            self._drive = None
+
+    def _town_of(self, scenario: Scenario) -> _Town:
+        """The map of a scenario with everything on it; built when the map changes."""
+        if self._town is None or self._town.name != scenario.map_name:
+            roads = load_map(scenario.map_name)
+            self._end_drive()
+            if self._town is not None:
+                self._town.renderer.close()
+                self._town = None
+            scenery = build_scenery(roads)
+            renderer = Renderer(roads, scenery, self._camera, self._input)
+            self._town = _Town(scenario.map_name, roads, scenery, renderer)
+        return self._town
+
+    def _observe(self, drive: _Drive) -> Observation:
+        assert self._town is not None
+        state, time_s = drive.state, drive.steps * self._dt_s
+        place = drive.route.locate(state.x_m, state.y_m, drive.arclength_m if drive.steps else None)
+        drive.arclength_m = place.arclength_m
+        people = np.column_stack([drive.pedestrians.x_m, drive.pedestrians.y_m])
+        events = drive.judge.watch(state, time_s, drive.physics.contacts(), people)
+        frame = self._town.renderer.frame(state, drive.steps)
+        picture = self._town.renderer.picture(state, drive.steps) if drive.full_pictures else None
+        arrived = place.arclength_m >= drive.route.length_m - GOAL_M
+        return Observation(
+            frame=frame,
+            state=state,
+            command=place.command,
+            time_s=time_s,
+            events=events,
+            done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
+            picture=picture,
+        )
+
+
+def _check_pattern(pattern: PatternImage | None) -> None:
+    expected = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
+    if pattern is not None and (pattern.shape != expected or pattern.dtype != np.uint8):
+        raise SimulatorError(
+            f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {expected} (RGBA)"
+        )
+
+
+def _poses(cars: Agents) -> list[Pose]:
+    return [Pose(float(x), float(y), float(yaw)) for x, y, yaw in zip(cars.x_m, cars.y_m, cars.yaw_rad, strict=True)]
+
+
+def _actors(drive: _Drive, roads: RoadMap) -> list[Actor]:
+    """Everyone on the move, as the renderer wants them."""
+    people = drive.pedestrians
+    raised = np.zeros(0, bool)
+    if len(people):
+        raised = roads.surface_at(np.column_stack([people.x_m, people.y_m])) == Surface.SIDEWALK
+    return [
+        Actor(
+            person=person,
+            look=int(agents.look[i]),
+            x_m=float(agents.x_m[i]),
+            y_m=float(agents.y_m[i]),
+            yaw_rad=float(agents.yaw_rad[i]),
+            raised=person and bool(raised[i]),
+            walked_m=float(agents.travelled_m[i]),
+        )
+        for agents, person in ((drive.cars, False), (people, True))
+        for i in range(len(agents))
+    ]

@@ -1,0 +1,1 @@
+"""How the shipped drivers are made: an expert with privileged sight, the data it collects, imitation."""

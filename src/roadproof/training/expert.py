@@ -1,0 +1,156 @@
+"""A driver that sees everything: the route, the other cars, the people. Tests and training drive with it.
+
+Steering is pure pursuit from the rear axle; speed is the lowest of what is wanted, what bends ahead allow, and what the
+intelligent driver model allows behind whatever stands or moves in the way.
+
+References:
+    Coulter (1992), Implementation of the pure pursuit path tracking algorithm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.datatypes import Control, VehicleState
+from roadproof.simulators.town.agents import (
+    CAR_LENGTH_M,
+    CAR_WIDTH_M,
+    NOBODY,
+    Agents,
+    first_in_way,
+    idm_acceleration,
+    obstacles,
+)
+from roadproof.simulators.town.routes import Route
+
+WHEELBASE_M = 2.8
+MAX_STEER_RAD = 0.65
+FULL_THROTTLE_MPS2 = 4.2
+FULL_BRAKE_MPS2 = 7.9
+DRAG_PER_S = 0.025
+STOP_LINE_M = 5.5
+NEVER = -2
+AHEAD_M = np.arange(1.0, 36.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Manner:
+    """How the expert drives.
+
+    Args:
+        cruise_mps: speed on a free, straight road.
+        side_mps2: acceleration to the side that bends are taken with.
+        slow_mps2: how hard it slows before a bend.
+        sight_s: how far ahead of its rear axle it steers to, in seconds of travel.
+        sight_m: and at least so far.
+    """
+
+    cruise_mps: float = 7.5
+    side_mps2: float = 2.2
+    slow_mps2: float = 1.8
+    sight_s: float = 0.75
+    sight_m: float = 4.5
+
+
+class Expert:
+    """Drives one route; make a new one for every drive."""
+
+    def __init__(self, route: Route, manner: Manner | None = None) -> None:
+        self._route = route
+        self._manner = Manner() if manner is None else manner
+        self._limit_mps = speed_limits(route, self._manner)
+        self._at_m: float | None = None
+
+    def drive(self, state: VehicleState, cars: Agents = NOBODY, pedestrians: Agents = NOBODY) -> Control:
+        """What to do for the next step.
+
+        Args:
+            state: the driven car now.
+            cars: the others now.
+            pedestrians: the people now.
+        """
+        place = self._route.locate(state.x_m, state.y_m, self._at_m)
+        self._at_m = place.arclength_m
+        wanted = float(np.interp(self._at_m + 0.2 * state.speed_mps, self._route.arclengths_m, self._limit_mps))
+        acceleration = float(np.clip(1.5 * (wanted - state.speed_mps), -4.0, 2.5))
+        acceleration = min(acceleration, self._behind(state, wanted, cars, pedestrians))
+        acceleration = min(acceleration, self._before_junction(state, wanted, cars))
+        throttle, brake = pedals(acceleration, state.speed_mps)
+        return Control(steer=self._steer(state), throttle=throttle, brake=brake)
+
+    def _steer(self, state: VehicleState) -> float:
+        """Pure pursuit: the arc from the rear axle through a point of the route ahead; positive to the right."""
+        assert self._at_m is not None
+        c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+        rear_x, rear_y = state.x_m - 0.5 * WHEELBASE_M * c, state.y_m - 0.5 * WHEELBASE_M * s
+        sight = max(self._manner.sight_m, self._manner.sight_s * state.speed_mps)
+        aim = self._at_m - 0.5 * WHEELBASE_M + sight
+        x, y, _, heading = self._route.at(aim)
+        beyond = max(aim - self._route.length_m, 0.0)
+        dx, dy = x + beyond * math.cos(heading) - rear_x, y + beyond * math.sin(heading) - rear_y
+        aside, apart = dy * c - dx * s, math.hypot(dx, dy)
+        wheel = math.atan(2.0 * WHEELBASE_M * aside / max(apart * apart, 1e-6))
+        return min(max(-wheel / MAX_STEER_RAD, -1.0), 1.0)
+
+    def _behind(self, state: VehicleState, wanted: float, cars: Agents, pedestrians: Agents) -> float:
+        """Acceleration that keeps clear of the first thing in the way."""
+        if len(cars) + len(pedestrians) == 0:
+            return math.inf
+        assert self._at_m is not None
+        at = self._at_m + AHEAD_M
+        route = self._route
+        beyond = np.maximum(at - route.length_m, 0.0)
+        end = float(route.headings_rad[-1])
+        x = np.interp(at, route.arclengths_m, route.points[:, 0]) + beyond * math.cos(end)
+        y = np.interp(at, route.arclengths_m, route.points[:, 1]) + beyond * math.sin(end)
+        free_m, leader = first_in_way(
+            x[None],
+            y[None],
+            AHEAD_M,
+            obstacles(cars, pedestrians, None),
+            np.array([NEVER]),
+            margin_m=0.5 * CAR_WIDTH_M + 0.2,
+        )
+        return _idm(state.speed_mps, wanted, float(free_m[0]) - 0.5 * CAR_LENGTH_M, float(leader[0]))
+
+    def _before_junction(self, state: VehicleState, wanted: float, cars: Agents) -> float:
+        """Acceleration that stops at the line of a junction while another car is inside."""
+        assert self._at_m is not None
+        for crossing in self._route.crossings:
+            line_m = crossing.enters_m - STOP_LINE_M - 0.5 * CAR_LENGTH_M - self._at_m
+            if line_m < -1.0 or line_m > 30.0:
+                continue
+            inside = np.hypot(cars.x_m - crossing.x_m, cars.y_m - crossing.y_m) < crossing.radius_m
+            # Who drives on before us leaves the junction as we do: the distance to him is kept, not to the line.
+            along = np.cos(cars.yaw_rad - self._route.at(self._at_m)[3]) > 0.9
+            if (inside & ~along).any():
+                return _idm(state.speed_mps, wanted, max(line_m, 0.0) + 2.0, 0.0)
+        return math.inf
+
+
+def speed_limits(route: Route, manner: Manner) -> Float[np.ndarray, " n"]:
+    """Speed at each point of a route so that bends are entered slowly enough, m/s."""
+    ds = np.diff(route.arclengths_m)
+    smooth = np.convolve(np.pad(np.diff(route.headings_rad) / ds, 3, mode="edge"), np.full(7, 1 / 7), mode="valid")
+    curvature = np.abs(np.concatenate([smooth, smooth[-1:]]))
+    limit = np.minimum(np.sqrt(manner.side_mps2 / np.maximum(curvature, 1e-6)), manner.cruise_mps)
+    # v² may fall by 2·a·ds a point at most: the lower envelope of rising lines, from the end.
+    budget = 2.0 * manner.slow_mps2 * route.arclengths_m
+    return np.sqrt(np.minimum.accumulate((limit**2 + budget)[::-1])[::-1] - budget)
+
+
+def pedals(acceleration_mps2: float, speed_mps: float) -> tuple[float, float]:
+    """Throttle and brake for an acceleration."""
+    push = acceleration_mps2 + DRAG_PER_S * speed_mps
+    if push >= 0.0:
+        return min(push / FULL_THROTTLE_MPS2, 1.0), 0.0
+    return 0.0, min(-acceleration_mps2 / FULL_BRAKE_MPS2, 1.0)
+
+
+def _idm(speed: float, wanted: float, gap_m: float, leader: float) -> float:
+    one = (np.array([value]) for value in (speed, wanted, gap_m, leader))
+    return float(idm_acceleration(*one, gain=2.5)[0])

@@ -1,0 +1,62 @@
+"""The expert in the town itself: its physics, its traffic, its judge."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from roadproof.datatypes import Event
+from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+from roadproof.simulators.town import physics
+from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.training import expert as driver
+from roadproof.training.expert import Expert
+
+SCENARIOS = builtin_scenarios()
+FEW = [find_scenario(name, SCENARIOS) for name in ("straight-16", "left-03", "left-12", "right-07", "right-11")]
+
+
+@pytest.fixture(scope="module")
+def town() -> Iterator[TownSimulator]:
+    with TownSimulator() as simulator:
+        yield simulator
+
+
+def driven(town: TownSimulator, scenario: Scenario, agents: int, seed: int) -> tuple[bool, list[Event], float]:
+    """Whether the goal was reached, what happened, and the largest distance from the route."""
+    seen = town.reset(scenario, cars=agents, pedestrians=agents, seed=seed)
+    expert, events, at, aside = Expert(town.route), list(seen.events), 0.0, 0.0
+    while not seen.done:
+        seen = town.step(expert.drive(seen.state, town.cars, town.pedestrians))
+        events += seen.events
+        place = town.route.locate(seen.state.x_m, seen.state.y_m, at)
+        at, aside = place.arclength_m, max(aside, abs(place.lateral_m))
+    return seen.time_s < scenario.time_limit_s - 1e-6, events, aside
+
+
+@pytest.mark.parametrize("scenario", FEW, ids=lambda scenario: scenario.name)
+def test_the_expert_completes_a_scenario_alone(town: TownSimulator, scenario: Scenario) -> None:
+    arrived, events, aside = driven(town, scenario, 0, 0)
+    assert arrived
+    assert events == []
+    assert aside < 0.4
+
+
+def test_the_expert_completes_scenarios_in_traffic(town: TownSimulator) -> None:
+    for scenario in FEW[::2]:
+        arrived, events, _ = driven(town, scenario, 20, 0)
+        assert arrived
+        assert events == []
+
+
+@pytest.mark.slow
+def test_the_expert_completes_all_scenarios(town: TownSimulator) -> None:
+    for agents, least in ((0, 40), (20, 38)):
+        drives = [driven(town, scenario, agents, 1) for scenario in SCENARIOS]
+        assert sum(arrived and not events for arrived, events, _ in drives) >= least
+
+
+def test_the_expert_knows_the_car_it_drives() -> None:
+    assert driver.WHEELBASE_M == physics.WHEELBASE_M
+    assert driver.MAX_STEER_RAD == physics.MAX_STEER_RAD

@@ -1,0 +1,330 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from roadproof.datatypes import Command, Control, VehicleState, Weather
+from roadproof.errors import ScenarioError, SimulatorError
+from roadproof.geometry import (
+    CIL_CAMERA,
+    CIL_INPUT,
+    CameraModel,
+    CanvasPlacement,
+    CropResize,
+    apply_homography,
+    homography_from_pose,
+    homography_jacobian,
+)
+from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from town_driving import drive, fingerprint
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.town import engine
+from roadproof.simulators.town.simulator import TownSimulator
+
+SCENARIOS = builtin_scenarios()
+STRAIGHT = find_scenario("straight-01", SCENARIOS)
+LEFT = find_scenario("left-05", SCENARIOS)
+
+
+@pytest.fixture(scope="module")
+def town():
+    with TownSimulator() as simulator:
+        yield simulator
+
+
+def before_canvas(scenario, distance_m, aside_m=0.0, turned_rad=0.0):
+    """A vehicle pose at a distance before the canvas of a scenario."""
+    canvas = scenario.canvas
+    c, s = np.cos(canvas.yaw_rad), np.sin(canvas.yaw_rad)
+    x, y = canvas.x_m - distance_m * c - aside_m * s, canvas.y_m - distance_m * s + aside_m * c
+    return VehicleState(float(x), float(y), 0.0, canvas.yaw_rad + turned_rad, 0.0)
+
+
+def at_rest(scenario, state):
+    """The scenario started elsewhere: an observation of it shows what is seen from there."""
+    return Scenario(
+        name=scenario.name,
+        kind=scenario.kind,
+        map_name=scenario.map_name,
+        start=state,
+        goal_m=scenario.goal_m,
+        canvas=scenario.canvas,
+        time_limit_s=scenario.time_limit_s,
+    )
+
+
+def opaque(colour):
+    pattern = np.zeros((400, 400, 4), np.uint8)
+    pattern[:] = (*colour, 255)
+    return pattern
+
+
+def expected_middle(homography, left, top, size):
+    """Centre of gravity, in the picture, of a square of the canvas, and the extent of its outline."""
+    inside = (np.arange(40) + 0.5) / 40 * size - 0.5
+    x, y = np.meshgrid(left + inside, top + inside)
+    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+    area = np.abs(np.linalg.det(homography_jacobian(homography, points)))[:, None]
+    seen = apply_homography(homography, points)
+    return (seen * area).sum(axis=0) / area.sum(), seen.min(axis=0), seen.max(axis=0)
+
+
+def found_middle(painted, bare, full):
+    """Centre of gravity of the paint: what changed, as a share of what a canvas all in paint changes."""
+    full_change = (full.astype(float) - bare).sum(axis=-1)
+    share = np.where(full_change > 30, (painted.astype(float) - bare).sum(axis=-1) / np.maximum(full_change, 30), 0)
+    yy, xx = np.mgrid[0 : share.shape[0], 0 : share.shape[1]]
+    return np.array([(share * xx).sum(), (share * yy).sum()]) / share.sum()
+
+
+def test_it_is_a_simulator(town):
+    assert isinstance(town, Simulator)
+
+
+def test_a_reset_shows_the_start_of_the_scenario(town):
+    seen = town.reset(STRAIGHT)
+    assert seen.frame.shape == (88, 200, 3)
+    assert seen.frame.dtype == np.uint8
+    assert seen.frame.std() > 20
+    assert seen.picture is None
+    assert seen.state == STRAIGHT.start
+    assert seen.command is Command.FOLLOW
+    assert (seen.time_s, seen.events, seen.done) == (0.0, (), False)
+
+
+def test_the_full_picture_is_what_the_frame_is_cut_from(town):
+    seen = town.reset(STRAIGHT, full_pictures=True)
+    assert seen.picture.shape == (600, 800, 3)
+    difference = np.abs(CIL_INPUT(seen.picture).astype(float) - seen.frame)
+    assert difference.mean() < 4.0
+
+
+def test_steering_right_turns_right_and_time_passes_by_dt(town):
+    town.reset(STRAIGHT)
+    for _ in range(20):
+        seen = town.step(Control(0.5, throttle=0.6))
+    assert seen.time_s == pytest.approx(20 * 0.05)
+    assert seen.state.yaw_rad < STRAIGHT.start.yaw_rad - 0.05
+    assert seen.state.speed_mps > 1.0
+
+
+def test_a_drive_along_the_route_reaches_the_goal_without_events(town):
+    seen = drive(town, LEFT, 10)[-1]
+    events = [*seen.events]
+    commands = {seen.command}
+    from town_driving import pursue
+
+    while not seen.done:
+        seen = town.step(pursue(town))
+        events += seen.events
+        commands.add(seen.command)
+    assert np.hypot(seen.state.x_m - LEFT.goal_m[0], seen.state.y_m - LEFT.goal_m[1]) < 4.0
+    assert seen.time_s < LEFT.time_limit_s
+    assert events == []
+
+
+@pytest.mark.parametrize("scenario", [STRAIGHT, LEFT], ids=lambda s: s.name)
+def test_paint_lies_where_the_homography_says_over_a_drive(town, scenario):
+    errors = []
+    for distance in (20.0, 16.0, 13.0, 10.0, 8.0):
+        state = before_canvas(scenario, distance, aside_m=-1.5, turned_rad=0.02 * np.sin(distance))
+        start = at_rest(scenario, state)
+        bare = town.reset(start, full_pictures=True).picture
+        full = town.reset(start, pattern=opaque((255, 255, 255)), full_pictures=True).picture
+        homography = homography_from_pose(CIL_CAMERA, state, scenario.canvas)
+        np.testing.assert_array_equal(homography, town.image_from_canvas())
+        for left, top in ((20, 20), (180, 90), (320, 180), (60, 280), (250, 310)):
+            middle, low, high = expected_middle(homography, left, top, 60)
+            if low.min() < 4 or high[0] > 795 or high[1] > 595 or (high - low).min() < 3:
+                continue
+            pattern = np.zeros((400, 400, 4), np.uint8)
+            pattern[top : top + 60, left : left + 60] = 255
+            seen = town.reset(start, pattern=pattern, full_pictures=True).picture
+            errors.append(found_middle(seen, bare, full) - middle)
+    assert len(errors) >= 12
+    assert np.linalg.norm(errors, axis=1).max() < 0.3
+
+
+def test_the_canvas_is_exact_for_other_cameras_too():
+    camera = CameraModel(width_px=640, height_px=360, fov_deg=70.0, forward_m=0.5, left_m=0.3, up_m=1.7, pitch_deg=-9.0)
+    crop = CropResize(left_px=40, top_px=120, right_px=600, bottom_px=350, width_px=160, height_px=80)
+    state = before_canvas(STRAIGHT, 12.0, aside_m=-1.0, turned_rad=-0.05)
+    start = at_rest(STRAIGHT, state)
+    pattern = np.zeros((400, 400, 4), np.uint8)
+    pattern[150:250, 100:200] = 255
+    with TownSimulator(camera=camera, input=crop, dt_s=0.1) as simulator:
+        bare = simulator.reset(start).frame
+        full = simulator.reset(start, pattern=opaque((255, 255, 255))).frame
+        seen = simulator.reset(start, pattern=pattern).frame
+        homography = crop.input_from_camera @ simulator.image_from_canvas()
+    assert seen.shape == (80, 160, 3)
+    middle, _, _ = expected_middle(homography, 100, 150, 100)
+    assert np.linalg.norm(found_middle(seen, bare, full) - middle) < 0.15
+
+
+@pytest.mark.parametrize("weather", [Weather.CLEAR_NOON, Weather.CLEAR_SUNSET, Weather.RAINY_NOON])
+def test_seen_colours_are_linear_in_painted_ones(town, weather):
+    start = at_rest(STRAIGHT, before_canvas(STRAIGHT, 11.0))
+    levels = np.array([0, 64, 128, 192, 255])
+    seen = np.stack([town.reset(start, weather=weather, pattern=opaque((v, v, v))).frame for v in levels]).astype(float)
+    inside = np.ptp(seen, axis=0).max(axis=-1) > 40
+    assert inside.sum() > 100
+    line = seen[0] + (seen[-1] - seen[0]) * levels[:, None, None, None] / 255
+    assert np.abs(seen - line)[:, inside].max() < 2.0
+    assert np.abs(seen - line)[:, inside].mean() < 0.5
+
+
+def test_half_transparent_paint_is_half_way_to_opaque_paint(town):
+    start = at_rest(STRAIGHT, before_canvas(STRAIGHT, 11.0))
+    bare = town.reset(start).frame.astype(float)
+    full = town.reset(start, pattern=opaque((255, 40, 40))).frame.astype(float)
+    pattern = opaque((255, 40, 40))
+    pattern[..., 3] = 128
+    half = town.reset(start, pattern=pattern).frame
+    assert np.abs(half - (bare + (full - bare) * 128 / 255)).max() < 1.5
+
+
+def test_a_transparent_pattern_looks_like_none(town):
+    start = at_rest(STRAIGHT, before_canvas(STRAIGHT, 11.0))
+    bare = town.reset(start, pattern=None).frame
+    pattern = opaque((255, 0, 255))
+    pattern[..., 3] = 0
+    np.testing.assert_array_equal(town.reset(start, pattern=pattern).frame, bare)
+
+
+def test_every_weather_looks_different_and_none_is_dark_or_burnt_out(town):
+    frames = {weather: town.reset(STRAIGHT, weather=weather).frame.astype(float) for weather in Weather}
+    for weather, frame in frames.items():
+        assert 50 < frame.mean() < 200, weather
+        for other, its in frames.items():
+            assert weather is other or np.abs(frame - its).mean() > 3.0, (weather, other)
+
+
+def test_the_same_drive_twice_is_the_same_to_the_bit_even_after_other_drives(town):
+    options = {"cars": 6, "pedestrians": 6, "seed": 3, "weather": Weather.WET_NOON, "pattern": opaque((200, 30, 60))}
+    first = fingerprint(drive(town, LEFT, 60, **options))
+    drive(town, STRAIGHT, 5, cars=2, weather=Weather.FOGGY_MORNING)
+    assert fingerprint(drive(town, LEFT, 60, **options)) == first
+
+
+def test_another_seed_gives_other_traffic(town):
+    one, two = (drive(town, LEFT, 20, cars=15, pedestrians=15, seed=seed) for seed in (0, 1))
+    assert fingerprint(one) != fingerprint(two)
+
+
+SCRIPT = """
+import json, sys
+sys.path[:0] = json.loads(sys.argv[1])
+from town_driving import drive, fingerprint
+from roadproof.datatypes import Weather
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.simulators.town.simulator import TownSimulator
+scenario = find_scenario("left-05", builtin_scenarios())
+with TownSimulator() as simulator:
+    for weather in sys.argv[2:]:
+        print(fingerprint(drive(simulator, scenario, 150, weather=Weather(weather), cars=5, pedestrians=5, seed=1)))
+"""
+
+
+def in_another_process(weathers):
+    paths = [str(Path(__file__).parent), *[path for path in sys.path if path]]
+    command = [sys.executable, "-c", SCRIPT, json.dumps(paths), *weathers]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=600).stdout.split()
+
+
+def assert_same_in_two_processes(town, weathers):
+    here = [fingerprint(drive(town, LEFT, 150, weather=weather, cars=5, pedestrians=5, seed=1)) for weather in weathers]
+    assert in_another_process(weathers) == here
+
+
+def test_150_frames_are_the_same_in_two_processes(town):
+    assert_same_in_two_processes(town, [Weather.CLEAR_NOON])
+
+
+@pytest.mark.slow
+def test_150_frames_are_the_same_in_two_processes_in_every_weather(town):
+    assert_same_in_two_processes(town, list(Weather))
+
+
+def test_running_into_a_car_is_one_event(town):
+    seen = town.reset(STRAIGHT, cars=20, seed=0)
+    other = min(
+        range(len(town.cars)),
+        key=lambda i: np.hypot(town.cars.x_m[i] - seen.state.x_m, town.cars.y_m[i] - seen.state.y_m),
+    )
+    assert len(town.cars) == 20
+    x, y, yaw = (float(v[other]) for v in (town.cars.x_m, town.cars.y_m, town.cars.yaw_rad))
+    behind = VehicleState(x - 12 * np.cos(yaw), y - 12 * np.sin(yaw), 0.0, yaw, 14.0)
+    from roadproof.simulators.town.physics import Physics, Pose
+
+    physics = Physics([], behind, [Pose(x, y, yaw)])
+    for _ in range(30):
+        physics.step(Control(0.0, throttle=1.0), 0.05)
+        if physics.contacts():
+            break
+    assert [contact.kind for contact in physics.contacts()] == ["vehicle"]
+
+
+def test_a_closed_simulator_says_so():
+    simulator = TownSimulator()
+    with pytest.raises(SimulatorError, match="with-block"):
+        simulator.reset(STRAIGHT)
+    with pytest.raises(SimulatorError, match="call reset first"):
+        simulator.step(Control(0.0))
+
+
+def test_bad_arguments_are_one_clear_line(town):
+    with pytest.raises(SimulatorError, match="weather 'snow' is unknown"):
+        town.reset(STRAIGHT, weather=Weather("snow"))
+    with pytest.raises(SimulatorError, match=r"dt_s is 0\.033, expected a positive multiple of 0\.01"):
+        TownSimulator(dt_s=0.033)
+    with pytest.raises(SimulatorError, match=r"the crop ends at \(900, 88\)"):
+        TownSimulator(input=CropResize(left_px=0, top_px=0, right_px=900, bottom_px=88, width_px=200, height_px=88))
+    with pytest.raises(SimulatorError, match=r"-1 cars were asked for"):
+        town.reset(STRAIGHT, cars=-1)
+
+
+def test_a_canvas_off_the_road_is_refused(town):
+    moved = CanvasPlacement(x_m=STRAIGHT.canvas.x_m, y_m=STRAIGHT.canvas.y_m + 12, yaw_rad=STRAIGHT.canvas.yaw_rad)
+    scenario = Scenario(
+        name="beside", kind="straight", map_name="town", start=STRAIGHT.start, goal_m=STRAIGHT.goal_m, canvas=moved,
+        time_limit_s=30.0,
+    )  # fmt: skip
+    with pytest.raises(ScenarioError, match="off the road"):
+        town.reset(scenario)
+
+
+def test_a_missing_libx11_is_named(monkeypatch):
+    class NoPipe:
+        @staticmethod
+        def get_global_ptr():
+            return NoPipe
+
+        @staticmethod
+        def make_pipe(*_):
+            return None
+
+    monkeypatch.setattr(engine.core, "GraphicsPipeSelection", NoPipe)
+    with pytest.raises(SimulatorError, match="libx11-6") as caught, TownSimulator():
+        pass
+    assert "\n" not in str(caught.value)
+
+
+def test_closing_frees_the_town_so_that_memory_does_not_grow():
+    script = SCRIPT.split("scenario =")[0] + (
+        "import resource\n"
+        "scenario = builtin_scenarios()[0]\n"
+        "for i in range(4):\n"
+        "    with TownSimulator() as simulator:\n"
+        "        simulator.reset(scenario)\n"
+        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)\n"
+    )
+    paths = [str(Path(__file__).parent), *[path for path in sys.path if path]]
+    command = [sys.executable, "-c", script, json.dumps(paths)]
+    peaks = [int(v) for v in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
+    assert peaks[-1] - peaks[1] < 40
