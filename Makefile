@@ -3,18 +3,27 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+OUT ?= out/demo
 
 .PHONY: demo test lint bench clean
 
 $(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit("roadproof needs Python 3.11 or newer, this is " + sys.version.split()[0] + "; set PYTHON=...") if sys.version_info < (3, 11) else None'
+	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; \
+	  sys.exit(0 if sys.version_info >= (3, 11) else f"roadproof needs Python 3.11 or newer, this is {v}: set PYTHON=...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx,town,video]' --group dev
 	touch $(STAMP)
 
+# Recorded drives are attacked; without any, the built-in town is driven.
 demo: $(STAMP)
-	$(BIN)/roadproof attack $(RECORDINGS)
+ifdef RECORDINGS
+	@test -n "$(CONTROLLER)" || { echo "make demo RECORDINGS=... also needs CONTROLLER=..., e.g. CONTROLLER=pilotnet:pilotnet.safetensors" >&2; exit 2; }
+	$(BIN)/roadproof attack "$(RECORDINGS)" --controller "$(CONTROLLER)" --out "$(OUT)"
+else
+	$(BIN)/roadproof drive --scenario left-03 --cars 20 --pedestrians 20 --out "$(OUT)"
+	@echo "To attack recorded drives: make demo RECORDINGS=path/to/a/set CONTROLLER=pilotnet:path/to/pilotnet.safetensors"
+endif
 
 test: $(STAMP)
 	$(BIN)/python -m pytest
@@ -24,6 +33,12 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+
+# What needs no development data; each file of benchmarks/ says how to run it.
+bench: $(STAMP)
+	mkdir -p out
+	$(BIN)/python benchmarks/gradopt_step.py --json out/gradopt_step.json
+	$(BIN)/python benchmarks/simulator_speed.py --json out/simulator_speed.json
 
 clean:
 	rm -rf $(VENV) build dist out

@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--figures", type=int, default=5)
     parser.add_argument("--iterations", type=int, default=250)
     parser.add_argument("--restarts", type=int, default=4)
+    parser.add_argument("--draws", type=int, default=16, help="random points a start is the best of; 1 as published")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--random-patterns", type=int, default=500)
     args = parser.parse_args()
@@ -43,7 +44,9 @@ def main() -> None:
     runs = []
     for seed in (int(word) for word in args.seeds.split(",")):
         schedule = Schedule.stretched(args.iterations)
-        found = attack(recordings, controller, space, schedule=schedule, restarts=args.restarts, seed=seed)
+        found = attack(
+            recordings, controller, space, schedule=schedule, restarts=args.restarts, draws=args.draws, seed=seed
+        )
         start = time.perf_counter()
         surrogate = Surrogate(recordings, controller, GROUPS)
         _, by_chance = random_search(surrogate, space, patterns=args.random_patterns, seed=seed)
@@ -67,6 +70,7 @@ def main() -> None:
         "figures": args.figures,
         "iterations": args.iterations,
         "restarts": args.restarts,
+        "draws": args.draws,
         "random_patterns": args.random_patterns,
         "runs": runs,
         "median": {

@@ -104,6 +104,15 @@ def test_each_drop_of_the_rate_starts_from_the_best_so_far():
     torch.testing.assert_close(search.history[6], search.history[:6].amax(0), rtol=1e-4, atol=1e-5)
 
 
+def test_drawn_starts_are_the_best_of_their_draws():
+    surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP, LEFT_GROUP))
+    space, one_step = SearchSpace(figures=2), Schedule(iterations=1)
+    drawn = gradopt(surrogate, space, schedule=one_step, restarts=2, draws=5, seed=3).history[0]
+    points = space.random((2, 10), torch.Generator().manual_seed(3))
+    best = surrogate.values(space, points).view(2, 2, 5).amax(-1)
+    torch.testing.assert_close(drawn, best, rtol=1e-4, atol=1e-5)
+
+
 class InterruptionError(Exception):
     pass
 

@@ -31,6 +31,7 @@ def attack(
     groups: Sequence[Group] = (RIGHT_GROUP, LEFT_GROUP),
     schedule: Schedule | None = None,
     restarts: int = 4,
+    draws: int = 16,
     seed: int = 0,
     device: torch.device | str = "cpu",
     gradient: Gradient = "exact",
@@ -46,7 +47,8 @@ def attack(
         space: the patterns allowed.
         groups: drives attacked together; the paper's two sides by default, of which the stronger is kept.
         schedule: the paper's by default.
-        restarts: random starts of every group.
+        restarts: starts of every group.
+        draws: random points drawn for each start, which is the best of them; 1 as published.
         seed: of the starts.
         device: where to search.
         gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
@@ -63,7 +65,14 @@ def attack(
     surrogate = kind(recordings, controller, groups, device=device)
     start = time.perf_counter()
     search = gradopt(
-        surrogate, space, schedule=schedule, restarts=restarts, seed=seed, checkpoint=checkpoint, on_step=on_step
+        surrogate,
+        space,
+        schedule=schedule,
+        restarts=restarts,
+        draws=draws,
+        seed=seed,
+        checkpoint=checkpoint,
+        on_step=on_step,
     )
     cost = Cost(controller_frames=surrogate.frames_evaluated, seconds=time.perf_counter() - start)
     checks = check_search(surrogate, space, search, random_patterns=random_patterns, seed=seed)
@@ -81,5 +90,6 @@ def attack(
         space=space,
         schedule=schedule,
         restarts=restarts,
+        draws=draws,
         seed=seed,
     )

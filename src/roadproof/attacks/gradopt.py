@@ -83,6 +83,7 @@ def gradopt(
     *,
     schedule: Schedule,
     restarts: int,
+    draws: int = 1,
     seed: int,
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], None] = lambda _iteration, _best: None,
@@ -93,7 +94,8 @@ def gradopt(
         surrogate: what is driven up, for all groups.
         space: where to look.
         schedule: steps and rates.
-        restarts: random starts of every group.
+        restarts: starts of every group.
+        draws: random points drawn for each start, which is the best of them; 1, a random start, in the paper.
         seed: of the starts.
         checkpoint: a file that keeps the search after every step; where it is there already and belongs to the same
             search, that search goes on, to the same result.
@@ -105,13 +107,13 @@ def gradopt(
     References:
         Eqs. tloss and composite; "Computing Adversarial Perturbations" of the paper.
     """
-    if restarts < 1:
-        raise RoadproofError(f"restarts is {restarts}, expected 1 or more")
-    generator = torch.Generator().manual_seed(seed)
-    unit = space.random((len(surrogate.groups), restarts), generator).to(surrogate.device)
-    identity = repr((space, schedule, restarts, seed, surrogate.fingerprint()))
+    for name, value in (("restarts", restarts), ("draws", draws)):
+        if value < 1:
+            raise RoadproofError(f"{name} is {value}, expected 1 or more")
+    identity = repr((space, schedule, restarts, draws, seed, surrogate.fingerprint()))
     state = load_checkpoint(checkpoint, identity, surrogate.device) if checkpoint else None
     if state is None:
+        unit = _starts(surrogate, space, restarts, draws, seed)
         best = torch.full(unit.shape[:2], -torch.inf, device=unit.device)
         state = {"unit": unit, "best_unit": unit.clone(), "best": best, "history": best.new_empty(0, *best.shape)}
     stopped = "all iterations done"
@@ -124,6 +126,16 @@ def gradopt(
             stopped = f"no restart gained 0.1 % in the last {schedule.patience} iterations"
             break
     return Search(state["best_unit"], state["best"], state["history"].cpu(), stopped)
+
+
+def _starts(surrogate: Surrogate, space: SearchSpace, restarts: int, draws: int, seed: int) -> Float[Tensor, "g r k n"]:
+    generator = torch.Generator().manual_seed(seed)
+    points = space.random((len(surrogate.groups), restarts * draws), generator).to(surrogate.device)
+    if draws == 1:
+        return points
+    value = surrogate.values(space, points).unflatten(1, (restarts, draws))
+    best = value.argmax(-1, keepdim=True)[..., None, None]
+    return points.unflatten(1, (restarts, draws)).take_along_dim(best, dim=2).squeeze(2)
 
 
 def _step(surrogate: Surrogate, space: SearchSpace, schedule: Schedule, state: dict[str, Tensor]) -> dict[str, Tensor]:

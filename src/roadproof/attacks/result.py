@@ -52,7 +52,8 @@ class AttackResult:
         checks: what the attack found when it distrusted itself.
         space: where it looked.
         schedule: its steps.
-        restarts: random starts of every group.
+        restarts: starts of every group.
+        draws: random points drawn for each start.
         seed: of the starts.
     """
 
@@ -67,6 +68,7 @@ class AttackResult:
     space: SearchSpace
     schedule: Schedule
     restarts: int
+    draws: int
     seed: int
 
     def save(self, folder: Path) -> None:
@@ -86,6 +88,7 @@ class AttackResult:
             "space": asdict(self.space),
             "schedule": asdict(self.schedule),
             "restarts": self.restarts,
+            "draws": self.draws,
             "seed": self.seed,
             "history": np.round(self.history.astype(float), 6).tolist(),
         }
@@ -109,7 +112,7 @@ class AttackResult:
                 history=np.array(fields["history"], dtype=np.float64),
                 **{
                     name: fields[name]
-                    for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed")
+                    for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "draws", "seed")
                 },
             )
         except (KeyError, TypeError, ValueError) as error:

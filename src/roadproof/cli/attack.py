@@ -34,7 +34,8 @@ def attack(
         str, typer.Option(help="Drives attacked together: clean+right,clean+left, or all.")
     ] = "clean+right,clean+left",
     iterations: Annotated[int, typer.Option(help="Steps of every restart.")] = 250,
-    restarts: Annotated[int, typer.Option(help="Random starts of every group.")] = 4,
+    restarts: Annotated[int, typer.Option(help="Starts of every group.")] = 4,
+    draws: Annotated[int, typer.Option(help="Random points a start is the best of; 1 as published.")] = 16,
     gradient: Annotated[str, typer.Option(help="exact, or published: the authors' way, to compare with.")] = "exact",
     patience: Annotated[
         int | None, typer.Option(help="Stop after so many late steps without gain.", show_default=False)
@@ -82,6 +83,7 @@ def attack(
             groups=chosen,
             schedule=schedule,
             restarts=restarts,
+            draws=draws,
             seed=seed,
             device=device,
             gradient=choice(gradient, "gradient", GRADIENTS),

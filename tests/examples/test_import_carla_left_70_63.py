@@ -1,0 +1,46 @@
+"""The published CARLA recordings become a set, and the whole attack runs on them with a network others trained."""
+
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadproof.cli import main
+from roadproof.recordings import load_recordings
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "import_carla_left_70_63.py"
+
+
+@pytest.fixture(scope="module")
+def imported(carla_data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("imported") / "set"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(EXAMPLE), str(carla_data), str(folder)])
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
+    return folder
+
+
+def test_the_consistent_frames_of_three_drives_are_imported(imported):
+    recordings = load_recordings(imported)
+    assert {drive.name: len(drive.frames) for drive in recordings.recordings} == {"clean": 23, "right": 17, "left": 20}
+    clean = recordings.recordings[0]
+    assert clean.speed_mps.min() > 5
+    assert set(clean.command) == {2}
+    assert clean.frames.std() > 20
+
+
+def test_real_recordings_and_a_real_network_are_attacked(imported, pilotnet_data, tmp_path, monkeypatch):
+    weights = pilotnet_data / "pilotnet.safetensors"
+    arguments = ["attack", str(imported), "--controller", f"pilotnet:{weights}", "--out", str(tmp_path)]
+    few = ["--iterations", "4", "--restarts", "1", "--draws", "4", "--figures", "3", "--random-patterns", "0"]
+    monkeypatch.setattr(sys, "argv", ["roadproof", *arguments, *few])
+    try:
+        main()
+    except SystemExit as stopped:
+        assert not stopped.code
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert min(result["by_group"].values()) > 0
+    assert all(check["passed"] for check in result["checks"][:2])
+    assert (tmp_path / f"film-{result['group'].split('+')[1]}.png").exists()
