@@ -510,16 +510,15 @@ class _ActorNode:
         half = np.array((0.42, 0.42) if actor.person else (2.55, 1.25))
         builder = MeshBuilder()
         builder.quad(np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * np.append(half, 1))
-        self._shade = root.attach_new_node(_node(builder.build(), np.full((4, 4), 255, np.uint8)))
+        self._shade = self._path.attach_new_node(_node(builder.build(), np.full((4, 4), 255, np.uint8)))
         self._shade.set_texture(renderer.texture("shade"))
         dress(self._shade, Layer.PAVEMENT_SHADE if actor.raised else Layer.SHADE)
         self._raised = actor.raised
         self._shown: Node = None
 
     def move(self, actor: Actor) -> None:
-        z, degrees = (KERB_M if actor.raised else 0.0), math.degrees(actor.yaw_rad)
-        self._path.set_pos_hpr(actor.x_m, actor.y_m, z, degrees, 0.0, 0.0)
-        self._shade.set_pos_hpr(actor.x_m, actor.y_m, z + 0.005, degrees, 0.0, 0.0)
+        z = KERB_M if actor.raised else 0.0
+        self._path.set_pos_hpr(actor.x_m, actor.y_m, z, math.degrees(actor.yaw_rad), 0.0, 0.0)
         if actor.raised != self._raised:
             self._raised = actor.raised
             dress(self._shade, Layer.PAVEMENT_SHADE if actor.raised else Layer.SHADE)
@@ -530,13 +529,13 @@ class _ActorNode:
         shade = HEADINGS if self._renderer.in_shade(actor.x_m, actor.y_m) else 0
         wanted = self._renderer.models(actor, stride)[heading + shade]
         if wanted is not self._shown:
-            self._holder.remove_all_children()
+            if self._shown is not None:
+                self._holder.remove_child(self._shown)
             self._holder.add_child(wanted)
             self._shown = wanted
 
     def remove(self) -> None:
         self._path.remove_node()
-        self._shade.remove_node()
 
 
 def _static_textures(grain: UInt8[np.ndarray, "g g 3"]) -> dict[str, Texture]:
