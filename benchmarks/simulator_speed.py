@@ -3,8 +3,8 @@
     python benchmarks/simulator_speed.py --json OUT
 
 Frames per second are those of closed-loop drives of the expert at 200×88, rendered at 400×176: expert, traffic,
-physics, events, rendering and read-back. Each figure is the median over drives of a scenario each; two processes run at the same
-time. Start-up is measured in a fresh process, from the import to the first frame, with nothing cached.
+physics, events, rendering and read-back. Each figure is the median over drives of a scenario each; two processes run
+at the same time. Start-up is measured in a fresh process, from the import to the first frame, with nothing cached.
 """
 
 from __future__ import annotations

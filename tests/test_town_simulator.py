@@ -179,6 +179,41 @@ def test_seen_colours_are_linear_in_painted_ones(town, weather):
     assert np.abs(seen - line)[:, inside].mean() < 0.5
 
 
+def area_average(pattern, canvas_from_frame, samples=8):
+    """What each pixel of a frame sees of a pattern, averaged over its footprint; the slow and plain way."""
+    offsets = (np.arange(samples) + 0.5) / samples - 0.5
+    y, x = np.mgrid[0:88, 0:200]
+    total = np.zeros((88, 200, 3))
+    for dy in offsets:
+        for dx in offsets:
+            points = np.stack([(x + dx).ravel(), (y + dy).ravel()], axis=-1)
+            at = np.clip(np.nan_to_num(apply_homography(canvas_from_frame, points)), 0, 399).round().astype(int)
+            total += pattern[at[:, 1], at[:, 0], :3].reshape(88, 200, 3)
+    return total / samples**2
+
+
+@pytest.mark.parametrize(("distance_m", "levels"), [(14.0, 2.5), (10.0, 1.0), (7.0, 1.0)])
+def test_each_pixel_shows_the_average_of_the_paint_in_its_footprint(town, distance_m, levels):
+    rng = np.random.default_rng(0)
+    pattern = opaque((0, 0, 0))
+    for _ in range(6):
+        left, top, width, height = rng.integers(0, 330), rng.integers(0, 330), *rng.integers(30, 200, 2)
+        pattern[top : top + height, left : left + width, :3] = rng.integers(0, 256, 3)
+    start = at_rest(STRAIGHT, before_canvas(STRAIGHT, distance_m, aside_m=-1.5))
+    black, white, seen = (
+        town.reset(start, pattern=paint).frame.astype(float)
+        for paint in (opaque((0, 0, 0)), opaque((255, 255, 255)), pattern)
+    )
+    canvas_from_frame = np.linalg.inv(CIL_INPUT.input_from_camera @ town.image_from_canvas())
+    expected = black + (white - black) * area_average(pattern, canvas_from_frame) / 255
+    painted = (white - black).max(axis=-1) > 30
+    inner = (
+        painted & np.roll(painted, 1, 0) & np.roll(painted, -1, 0) & np.roll(painted, 1, 1) & np.roll(painted, -1, 1)
+    )
+    assert inner.sum() > 200
+    assert np.abs(seen - expected)[inner].mean() < levels
+
+
 def test_half_transparent_paint_is_half_way_to_opaque_paint(town):
     start = at_rest(STRAIGHT, before_canvas(STRAIGHT, 11.0))
     bare = town.reset(start).frame.astype(float)

@@ -26,8 +26,9 @@ BORDER_M = 30.0
 NOISE_M = 64.0
 UNIT = 190
 WET_FROM = 0.3
+EDGE_M = 0.4
 
-ASPHALT, SHOULDER, PAVEMENT, LAWN = (96, 96, 98), (104, 103, 102), (172, 168, 160), (88, 106, 58)
+ASPHALT, SHOULDER, PAVEMENT, LAWN = (108, 107, 107), (114, 113, 111), (176, 172, 164), (90, 108, 60)
 KINDS = (LAWN, PAVEMENT, SHOULDER, ASPHALT)
 
 Plane = Float[np.ndarray, "_ _"]
@@ -114,6 +115,10 @@ def _surfaces(canvas: _Canvas, roads: RoadMap, scenery: Scenery) -> Image.Image:
             pen.polygon(canvas.points(np.concatenate([lane.left, lane.right[::-1]])), fill=layers[lane.kind])
     for area in roads.junctions:
         pen.polygon(canvas.points(area.outline), fill=3)
+    # Sidewalks get an edge of stone, which also fills the chinks where strips meet at an angle.
+    near = image.point([0, 255, 0, 0] + [0] * 252).filter(ImageFilter.BoxBlur(EDGE_M / canvas.pixel_m))
+    bare = image.point([255] + [0] * 255)
+    image.paste(1, mask=ImageChops.multiply(near.point([0] + [255] * 255), bare))
     return image
 
 

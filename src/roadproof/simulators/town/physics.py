@@ -101,6 +101,8 @@ class Physics:
     def contacts(self) -> list[Contact]:
         """What the car touches now, the ground aside, in order of name."""
         found: set[Contact] = set()
+        node: Node
+        part: int
         for contact in self._world.contact_test(self._chassis).get_contacts():
             if contact.get_manifold_point().get_distance() > TOUCH_M:
                 continue

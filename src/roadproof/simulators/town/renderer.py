@@ -59,7 +59,8 @@ from roadproof.simulators.town.weather import SKIES, Sky, sky_picture
 
 CELL_M, CELL_MARGIN_M = 30.0, 1.0
 CULL_M = 60.0
-NEAR_SEEN_M = 80.0
+NEAR_SEEN_M = 65.0
+NEAR_GRID_M = 4.0
 HIDDEN_DEPTH = 4.0
 SKY_M = 640.0
 FAR_LAND_M = 520.0
@@ -152,6 +153,7 @@ class Renderer:
         self._weather: Weather | None = None
         self._lit: LitGround
         self._lit_nodes: Path = None
+        self._shown_from: tuple[int, int] | None = None
         self._districts: dict[tuple[int, int, bool], Path] = {}
         self._land = _CellTextures(self._ground.size_m)
         whole = CropResize(
@@ -178,6 +180,7 @@ class Renderer:
             self._lit_nodes.remove_node()
         self._lit_nodes = self._root.attach_new_node("lit")
         self._districts.clear()
+        self._shown_from = None
         self._build_land(sky)
         self._build_streets(sky)
         self._build_scenery(sky)
@@ -258,7 +261,11 @@ class Renderer:
 
     def _aim(self, screen: Screen, state: VehicleState, tick: int) -> None:
         x, y, z = screen.look_from(state)
-        self._show_near(x, y)
+        # A grid, so that what is shown depends on the place alone and is seldom decided anew.
+        place = (round(x / NEAR_GRID_M), round(y / NEAR_GRID_M))
+        if place != self._shown_from:
+            self._shown_from = place
+            self._show_near(place[0] * NEAR_GRID_M, place[1] * NEAR_GRID_M)
         self._follow.set_pos(x, y, z)
         self._haze.set_pos_hpr(x, y, z, math.degrees(state.yaw_rad) - 90.0, 0.0, 0.0)
         for k, drop in enumerate(self._drops):
@@ -503,16 +510,15 @@ class _ActorNode:
         half = np.array((0.42, 0.42) if actor.person else (2.55, 1.25))
         builder = MeshBuilder()
         builder.quad(np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * np.append(half, 1))
-        self._shade = root.attach_new_node(_node(builder.build(), np.full((4, 4), 255, np.uint8)))
+        self._shade = self._path.attach_new_node(_node(builder.build(), np.full((4, 4), 255, np.uint8)))
         self._shade.set_texture(renderer.texture("shade"))
         dress(self._shade, Layer.PAVEMENT_SHADE if actor.raised else Layer.SHADE)
         self._raised = actor.raised
         self._shown: Node = None
 
     def move(self, actor: Actor) -> None:
-        z, degrees = (KERB_M if actor.raised else 0.0), math.degrees(actor.yaw_rad)
-        self._path.set_pos_hpr(actor.x_m, actor.y_m, z, degrees, 0.0, 0.0)
-        self._shade.set_pos_hpr(actor.x_m, actor.y_m, z + 0.005, degrees, 0.0, 0.0)
+        z = KERB_M if actor.raised else 0.0
+        self._path.set_pos_hpr(actor.x_m, actor.y_m, z, math.degrees(actor.yaw_rad), 0.0, 0.0)
         if actor.raised != self._raised:
             self._raised = actor.raised
             dress(self._shade, Layer.PAVEMENT_SHADE if actor.raised else Layer.SHADE)
@@ -523,13 +529,13 @@ class _ActorNode:
         shade = HEADINGS if self._renderer.in_shade(actor.x_m, actor.y_m) else 0
         wanted = self._renderer.models(actor, stride)[heading + shade]
         if wanted is not self._shown:
-            self._holder.remove_all_children()
+            if self._shown is not None:
+                self._holder.remove_child(self._shown)
             self._holder.add_child(wanted)
             self._shown = wanted
 
     def remove(self) -> None:
         self._path.remove_node()
-        self._shade.remove_node()
 
 
 def _static_textures(grain: UInt8[np.ndarray, "g g 3"]) -> dict[str, Texture]:
@@ -613,7 +619,7 @@ def _haze_cards(sky: Sky, tangent: float, eye_m: float) -> list[tuple[Mesh, UInt
     nearest = min(40.0, max(4.0, 0.11 / sky.density_per_m))
     distances = [nearest]
     while distances[-1] < 260.0:
-        distances.append(max(1.6 * distances[-1], distances[-1] + 0.045 / sky.density_per_m))
+        distances.append(max(1.6 * distances[-1], distances[-1] + 0.07 / sky.density_per_m))
     cards: list[tuple[Mesh, UInt8[np.ndarray, "n 4"]]] = []
     for d, beyond in reversed(list(zip(distances, [*distances[1:], 1.5 * distances[-1]], strict=True))):
         strength = 1 - math.exp(-sky.density_per_m * (beyond - d if d > nearest else beyond))
