@@ -11,7 +11,7 @@ import pytest
 
 from roadproof.simulators.town.roadmap import RoadMap, Surface
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 ASSETS = ROOT / "src" / "roadproof" / "simulators" / "town" / "assets"
 
 

@@ -14,7 +14,7 @@ from roadproof.errors import ScenarioError
 from roadproof.simulators.town.junctions import triangulated
 from roadproof.simulators.town.roadmap import RoadMap, Surface, lane_triangles
 
-SECOND = Path(__file__).parents[1] / "src" / "roadproof" / "simulators" / "town" / "assets" / "second.xodr"
+SECOND = Path(__file__).parents[3] / "src" / "roadproof" / "simulators" / "town" / "assets" / "second.xodr"
 
 
 def street(number: int, x: float, *, link: str = "", junction: str = "-1", width: float = 3.5) -> str:

@@ -267,7 +267,7 @@ with TownSimulator() as simulator:
 
 
 def in_another_process(weathers):
-    paths = [str(Path(__file__).parent), *[path for path in sys.path if path]]
+    paths = [str(Path(__file__).parents[2]), *[path for path in sys.path if path]]
     command = [sys.executable, "-c", SCRIPT, json.dumps(paths), *weathers]
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=600).stdout.split()
 
@@ -359,7 +359,7 @@ def test_closing_frees_the_town_so_that_memory_does_not_grow():
         "        simulator.reset(scenario)\n"
         "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)\n"
     )
-    paths = [str(Path(__file__).parent), *[path for path in sys.path if path]]
+    paths = [str(Path(__file__).parents[2]), *[path for path in sys.path if path]]
     command = [sys.executable, "-c", script, json.dumps(paths)]
     peaks = [int(v) for v in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
     assert peaks[-1] - peaks[1] < 40
