@@ -11,30 +11,23 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.geometry import (
-    CANVAS_SIZE_PX,
     CameraModel,
     CanvasPlacement,
     CropResize,
-    homography_from_pose,
 )
 from roadproof.simulators.town import textures
+from roadproof.simulators.town.air import dome, haze_cards, rain_card
 from roadproof.simulators.town.canvas import (
-    COARSEST,
     GRAIN_TILE_M,
-    PATCH_PX,
-    Raster,
-    RoadPatch,
-    copies,
-    reductions_for,
     road_patch,
 )
+from roadproof.simulators.town.canvas_node import CanvasNode
 from roadproof.simulators.town.engine import (
     VERTEX,
     Node,
@@ -47,13 +40,14 @@ from roadproof.simulators.town.engine import (
     make_node,
     make_pipe,
     make_texture,
-    refill_node,
 )
 from roadproof.simulators.town.ground import FINE_M, LitGround, build_ground, light_ground
+from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder, joined
 from roadproof.simulators.town.models import PAINTS, Body, car, person
 from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.scenery import FACADES, SHOPS, TREES, Scenery
+from roadproof.simulators.town.shading import rgba, shaded, turned
 from roadproof.simulators.town.streets import KERB_M, build_streets
 from roadproof.simulators.town.weather import SKIES, Sky, sky_picture
 
@@ -62,16 +56,11 @@ CULL_M = 60.0
 NEAR_SEEN_M = 65.0
 NEAR_GRID_M = 4.0
 HIDDEN_DEPTH = 4.0
-SKY_M = 640.0
 FAR_LAND_M = 520.0
-HAZE_TOP_M = 19.0
 HEADINGS = 8
 PERSON_LOOKS = 12
 STRIDES = (-1.0, -0.4, 0.4, 1.0)
-PIECE_CORNERS = 12
 FRAME, PICTURE = 0, 1
-# The renderer interpolates between the texel hit and the one before it: half a texel too late.
-LINEAR_SHIFT = 0.5
 RAIN_VARIANTS = 6
 
 
@@ -86,24 +75,6 @@ SOLID_TEXTURES: dict[str, Callable[[], UInt8[np.ndarray, "h w c"]]] = {
     "plain": textures.plain,
 }
 FURNITURE = ("plain", "hedge", "rail")
-
-
-class Layer(IntEnum):
-    """Order of drawing; up to the pavement nothing is tested for depth."""
-
-    GROUND = 1
-    PAINT = 2
-    CANVAS = 3
-    SHADE = 4
-    PAVEMENT = 5
-    PAVEMENT_SHADE = 6
-    SOLID = 10
-    SMALL = 11
-    CUT_OUT = 20
-    FAR_LAND = 21
-    HAZE = 22
-    SKY = 23
-    RAIN = 30
 
 
 NEAR_LAYERS = (Layer.PAINT, Layer.PAVEMENT, Layer.SMALL)
@@ -161,7 +132,7 @@ class Renderer:
             width_px=camera.width_px, height_px=camera.height_px,
         )  # fmt: skip
         self._crops = ((crop, 2), (whole, 2))
-        self._canvas = _CanvasNode(self._root, camera, self._crops)
+        self._canvas = CanvasNode(self._root, camera, self._crops)
         self._follow = self._root.attach_new_node("follow")
         self._haze = self._root.attach_new_node("haze")
         self._drops: list[Path] = []
@@ -242,7 +213,7 @@ class Renderer:
                 mesh = car(Body(look % len(Body)), PAINTS[look // len(Body)])
             sky = self._lit.sky
             self._models[key] = [
-                _node(mesh, _shaded(_turned(mesh, 2 * math.pi * k / HEADINGS), sky, np.full(len(mesh.points), sun)))
+                _node(mesh, shaded(turned(mesh, 2 * math.pi * k / HEADINGS), sky, np.full(len(mesh.points), sun)))
                 for sun in (1.0, 0.0)
                 for k in range(HEADINGS)
             ]
@@ -300,9 +271,7 @@ class Renderer:
                     corners = np.array([(u, v, 0.0), (s, v, 0), (s, t, 0), (u, t, 0)])
                     builder.quad(corners, corners[:, :2] / 8.0, (0.36, 0.44, 0.24))
         mesh = builder.build()
-        self._attach(
-            _node(mesh, _shaded(mesh, sky, np.ones(len(mesh.points)))), Layer.FAR_LAND, self._textures["grass"]
-        )
+        self._attach(_node(mesh, shaded(mesh, sky, np.ones(len(mesh.points)))), Layer.FAR_LAND, self._textures["grass"])
 
     def _build_streets(self, sky: Sky) -> None:
         streets, low = self._streets, self._ground.low_m
@@ -324,7 +293,7 @@ class Renderer:
         mirrored = np.array(self._lit.mirrored)
         share = self._lit.water_at(points)[:, None] * (mesh.normals[:, 2:] > 0.5) * (mesh.points[:, 2:] < 0.01)
         damp = 1 - 0.15 * sky.wetness
-        return _rgba(mesh.albedo * light * damp * (1 - share) + share * mirrored / 255)
+        return rgba(mesh.albedo * light * damp * (1 - share) + share * mirrored / 255)
 
     def _build_scenery(self, sky: Sky) -> None:
         for layer, name, mesh in (
@@ -365,12 +334,12 @@ class Renderer:
     def _build_air(self, sky: Sky) -> None:
         for old in (*self._follow.get_children(), *self._haze.get_children()):
             old.remove_node()
-        dome = self._follow.attach_new_node(_node(*_dome()))
+        heaven = self._follow.attach_new_node(_node(*dome()))
         self._sky_texture = make_texture(sky_picture(sky), repeat=True, mipmaps=False)
-        dome.set_texture(self._sky_texture)
-        dress(dome, Layer.SKY)
+        heaven.set_texture(self._sky_texture)
+        dress(heaven, Layer.SKY)
         tangent = 1.3 * math.tan(math.radians(self._camera.fov_deg) / 2)
-        for mesh, colours in _haze_cards(sky, tangent, self._camera.up_m):
+        for mesh, colours in haze_cards(sky, tangent, self._camera.up_m):
             card = self._haze.attach_new_node(_node(mesh, colours))
             card.set_texture(self._textures["plain"])
             dress(card, Layer.HAZE)
@@ -378,26 +347,11 @@ class Renderer:
         if sky.drops:
             texture = make_texture(textures.rain_streaks(sky.drops), repeat=True, mipmaps=False)
             for k in range(RAIN_VARIANTS):
-                mesh, colours = _rain_card(tangent, k)
+                mesh, colours = rain_card(tangent, k)
                 drop = self._haze.attach_new_node(_node(mesh, colours))
                 drop.set_texture(texture)
                 dress(drop, Layer.RAIN)
                 self._drops.append(drop)
-
-
-def dress(path: Path, layer: Layer) -> None:
-    """Set how a node is drawn from its layer."""
-    path.set_bin("fixed", int(layer))
-    if layer in (Layer.GROUND, Layer.PAINT, Layer.CANVAS, Layer.SHADE, Layer.PAVEMENT_SHADE, Layer.RAIN):
-        path.set_depth_test(False)
-        path.set_depth_write(layer is Layer.GROUND)
-    if layer in (Layer.SHADE, Layer.PAVEMENT_SHADE, Layer.HAZE, Layer.RAIN):
-        path.set_transparency(core.TransparencyAttrib.M_alpha)
-        path.set_depth_write(False)
-    if layer is Layer.CUT_OUT:
-        path.set_transparency(core.TransparencyAttrib.M_binary)
-    if layer in (Layer.CUT_OUT, Layer.SKY, Layer.HAZE, Layer.RAIN):
-        path.set_two_sided(True)
 
 
 class _CellTextures:
@@ -426,76 +380,6 @@ class _CellTextures:
         """Coordinates of points in the picture of a cell."""
         corner = np.array(low) + np.array(cell) * CELL_M - CELL_MARGIN_M
         return (points[:, :2] - corner) / (CELL_M + 2 * CELL_MARGIN_M)
-
-
-class _CanvasNode:
-    """The patch of road with the pattern: as many nodes as there are copies, each drawn where its copy suits."""
-
-    def __init__(self, root: Path, camera: CameraModel, crops: tuple[tuple[CropResize, int], ...]) -> None:
-        self._root = root.attach_new_node("canvas")
-        self._camera, self._crops = camera, crops
-        self._placement: CanvasPlacement | None = None
-        self._patch: RoadPatch | None = None
-        self._rasters: list[Raster] = []
-        self._reductions: list[tuple[int, int]] = []
-        self._textures: list[Texture] = []
-        fan = np.array([[0, i, i + 1] for i in range(1, PIECE_CORNERS - 1)])
-        self._fans = [make_node("canvas", np.zeros(PIECE_CORNERS, VERTEX), fan) for _ in range(COARSEST + 1)]
-        self._paths = [self._root.attach_new_node(node) for node in self._fans]
-        for path in self._paths:
-            dress(path, Layer.CANVAS)
-
-    def forget(self) -> None:
-        """The light has changed: bake anew."""
-        self._placement = None
-
-    def lay(self, placement: CanvasPlacement, bake: Callable[[], RoadPatch]) -> None:
-        """Choose the place; `bake` makes the road there."""
-        if placement == self._placement:
-            return
-        self._placement, self._patch = placement, bake()
-        crop, magnified = self._crops[0]
-        across, down = crop.input_from_camera[0, 0] * magnified, crop.input_from_camera[1, 1] * magnified
-        focal = self._camera.focal_px
-        self._reductions = reductions_for(placement, self._camera, (focal * across, focal * down))
-        blank = np.zeros((PATCH_PX, PATCH_PX, 3), np.uint8)
-        self._textures = [make_texture(copy, mipmaps=False, smooth=True) for copy in copies(blank, self._reductions)]
-        for path, texture in zip(self._paths, self._textures, strict=True):
-            path.set_texture(texture)
-        texel = placement.length_m / PATCH_PX
-        self._rasters = [
-            Raster.of(self._camera, crop, magnified, texel, len(self._reductions)) for crop, magnified in self._crops
-        ]
-
-    def paint(self, pattern: UInt8[np.ndarray, "400 400 4"] | None) -> None:
-        """Mix a pattern with the road."""
-        assert self._patch is not None
-        made = copies(self._patch.painted(pattern), self._reductions)
-        for texture, copy in zip(self._textures, made, strict=True):
-            fill_texture(texture, copy)
-
-    def see(self, state: VehicleState, which: int) -> None:
-        """Shape the canvas for one view from one screen."""
-        if self._placement is None:
-            return
-        homography = homography_from_pose(self._camera, state, self._placement)
-        pieces = {piece.copy: piece for piece in self._rasters[which].pieces(homography)}
-        for k, (path, node) in enumerate(zip(self._paths, self._fans, strict=True)):
-            if k not in pieces:
-                path.hide()
-                continue
-            path.show()
-            outline = pieces[k].outline
-            # A fan of fixed size: the last corner is repeated.
-            corners = outline[np.minimum(np.arange(PIECE_CORNERS), len(outline) - 1)]
-            vertices = np.zeros(PIECE_CORNERS, VERTEX)
-            homogeneous = np.column_stack([corners, np.ones(PIECE_CORNERS)])
-            vertices["position"] = (homogeneous @ self._placement.world_from_canvas.T)[:, :3]
-            across, along = self._reductions[k]
-            texel = np.array([2**across, 2**along]) / PATCH_PX
-            vertices["uv"] = (corners + 0.5) / CANVAS_SIZE_PX * (1, -1) + (0, 1) + LINEAR_SHIFT * texel
-            vertices["colour"] = 255
-            refill_node(node, vertices)
 
 
 class _ActorNode:
@@ -572,73 +456,4 @@ def _node(mesh: Mesh, colours: UInt8[np.ndarray, "n 4"], ground_uv: Float[np.nda
 
 
 def _lit_nodes(mesh: Mesh, sky: Sky) -> list[Node]:
-    return [_node(part, _shaded(part, sky, np.ones(len(part.points)))) for _, part in mesh.cells(CULL_M)]
-
-
-def _shaded(mesh: Mesh, sky: Sky, sunlit: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 4"]:
-    """Vertex colours of what stands in the open: walls see half of the sky."""
-    facing = np.clip(mesh.normals @ sky.to_sun, 0, None)
-    open_sky = 0.78 + 0.22 * np.clip(mesh.normals[:, 2], -1, 1)
-    return _rgba(mesh.albedo * sky.light(facing, sunlit, open_sky) * (1 - 0.10 * sky.wetness))
-
-
-def _turned(mesh: Mesh, yaw_rad: float) -> Mesh:
-    """The mesh with its normals turned, for light."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Mesh(mesh.points, (mesh.normals @ rotation.T).round(4), mesh.uv, mesh.albedo, mesh.triangles)
-
-
-def _rgba(colour: Float[np.ndarray, "n 3"], alpha: float = 1.0) -> UInt8[np.ndarray, "n 4"]:
-    levels = np.column_stack([colour, np.full(len(colour), alpha)])
-    return (np.clip(levels, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def _dome() -> tuple[Mesh, UInt8[np.ndarray, "n 4"]]:
-    """The sky around the eye: azimuth and elevation are the texture's coordinates."""
-    around, up = 24, 6
-    azimuth = np.arange(around + 1) / around * 2 * math.pi
-    elevation = np.concatenate([[-0.06], np.linspace(0, math.pi / 2, up)])
-    a, e = np.meshgrid(azimuth, elevation)
-    points = SKY_M * np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1).reshape(-1, 3)
-    uv = np.stack([a / (2 * math.pi), 0.002 + 0.996 * np.clip(e, 0, None) / (math.pi / 2)], axis=-1).reshape(-1, 2)
-    i, j = np.meshgrid(np.arange(up), np.arange(around), indexing="ij")
-    first = (i * (around + 1) + j).ravel()
-    above = first + around + 1
-    triangles = np.concatenate([np.stack([first, first + 1, above + 1], -1), np.stack([first, above + 1, above], -1)])
-    n = len(points)
-    mesh = Mesh(points.round(4), np.zeros((n, 3)), uv.round(5), np.ones((n, 3)), triangles)
-    return mesh, np.full((n, 4), 255, np.uint8)
-
-
-def _haze_cards(sky: Sky, tangent: float, eye_m: float) -> list[tuple[Mesh, UInt8[np.ndarray, "n 4"]]]:
-    """Translucent cards across the view, the farthest first.
-
-    Each card's foot fades out, so that on the ground the haze grows steadily from one card to the next.
-    """
-    nearest = min(40.0, max(4.0, 0.11 / sky.density_per_m))
-    distances = [nearest]
-    while distances[-1] < 260.0:
-        distances.append(max(1.6 * distances[-1], distances[-1] + 0.07 / sky.density_per_m))
-    cards: list[tuple[Mesh, UInt8[np.ndarray, "n 4"]]] = []
-    for d, beyond in reversed(list(zip(distances, [*distances[1:], 1.5 * distances[-1]], strict=True))):
-        strength = 1 - math.exp(-sky.density_per_m * (beyond - d if d > nearest else beyond))
-        x = tangent * d
-        foot, shoulder, top = -eye_m, -eye_m + eye_m * (1 - d / beyond), min(0.8 * d, HAZE_TOP_M)
-        points = np.array([(s * x, d, z) for z in (foot, shoulder, top) for s in (-1, 1)], float)
-        triangles = np.array([[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]])
-        mesh = Mesh(points.round(4), np.zeros((6, 3)), np.zeros((6, 2)), np.ones((6, 3)), triangles)
-        colours = np.tile(_rgba(np.array([sky.haze]), strength), (6, 1))
-        colours[:2, 3] = 0
-        cards.append((mesh, colours))
-    return cards
-
-
-def _rain_card(tangent: float, variant: int) -> tuple[Mesh, UInt8[np.ndarray, "n 4"]]:
-    """A card right before the eye that fills the view."""
-    d, rng = 1.0, np.random.default_rng(70 + variant)
-    x = tangent * d
-    builder = MeshBuilder()
-    corners = np.array([(-x, d, -x), (x, d, -x), (x, d, x), (-x, d, x)])
-    builder.quad(corners, np.array([[0.0, 0], [2.0, 0], [2.0, 2.0], [0, 2.0]]) + rng.random(2))
-    return builder.build(), np.full((4, 4), 255, np.uint8)
+    return [_node(part, shaded(part, sky, np.ones(len(part.points)))) for _, part in mesh.cells(CULL_M)]

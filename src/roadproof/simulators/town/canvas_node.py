@@ -1,0 +1,88 @@
+"""The canvas in the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from roadproof.datatypes import VehicleState
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
+from roadproof.simulators.town.canvas import COARSEST, PATCH_PX, Raster, RoadPatch, copies, reductions_for
+from roadproof.simulators.town.engine import VERTEX, Path, Texture, fill_texture, make_node, make_texture, refill_node
+from roadproof.simulators.town.layers import Layer, dress
+
+PIECE_CORNERS = 12
+# The renderer interpolates between the texel hit and the one before it: half a texel too late.
+LINEAR_SHIFT = 0.5
+
+
+class CanvasNode:
+    """The patch of road with the pattern: as many nodes as there are copies, each drawn where its copy suits."""
+
+    def __init__(self, root: Path, camera: CameraModel, crops: tuple[tuple[CropResize, int], ...]) -> None:
+        self._root = root.attach_new_node("canvas")
+        self._camera, self._crops = camera, crops
+        self._placement: CanvasPlacement | None = None
+        self._patch: RoadPatch | None = None
+        self._rasters: list[Raster] = []
+        self._reductions: list[tuple[int, int]] = []
+        self._textures: list[Texture] = []
+        fan = np.array([[0, i, i + 1] for i in range(1, PIECE_CORNERS - 1)])
+        self._fans = [make_node("canvas", np.zeros(PIECE_CORNERS, VERTEX), fan) for _ in range(COARSEST + 1)]
+        self._paths = [self._root.attach_new_node(node) for node in self._fans]
+        for path in self._paths:
+            dress(path, Layer.CANVAS)
+
+    def forget(self) -> None:
+        """The light has changed: bake anew."""
+        self._placement = None
+
+    def lay(self, placement: CanvasPlacement, bake: Callable[[], RoadPatch]) -> None:
+        """Choose the place; `bake` makes the road there."""
+        if placement == self._placement:
+            return
+        self._placement, self._patch = placement, bake()
+        crop, magnified = self._crops[0]
+        across, down = crop.input_from_camera[0, 0] * magnified, crop.input_from_camera[1, 1] * magnified
+        focal = self._camera.focal_px
+        self._reductions = reductions_for(placement, self._camera, (focal * across, focal * down))
+        blank = np.zeros((PATCH_PX, PATCH_PX, 3), np.uint8)
+        self._textures = [make_texture(copy, mipmaps=False, smooth=True) for copy in copies(blank, self._reductions)]
+        for path, texture in zip(self._paths, self._textures, strict=True):
+            path.set_texture(texture)
+        texel = placement.length_m / PATCH_PX
+        self._rasters = [
+            Raster.of(self._camera, crop, magnified, texel, len(self._reductions)) for crop, magnified in self._crops
+        ]
+
+    def paint(self, pattern: UInt8[np.ndarray, "400 400 4"] | None) -> None:
+        """Mix a pattern with the road."""
+        assert self._patch is not None
+        made = copies(self._patch.painted(pattern), self._reductions)
+        for texture, copy in zip(self._textures, made, strict=True):
+            fill_texture(texture, copy)
+
+    def see(self, state: VehicleState, which: int) -> None:
+        """Shape the canvas for one view from one screen."""
+        if self._placement is None:
+            return
+        homography = homography_from_pose(self._camera, state, self._placement)
+        pieces = {piece.copy: piece for piece in self._rasters[which].pieces(homography)}
+        for k, (path, node) in enumerate(zip(self._paths, self._fans, strict=True)):
+            if k not in pieces:
+                path.hide()
+                continue
+            path.show()
+            outline = pieces[k].outline
+            # A fan of fixed size: the last corner is repeated.
+            corners = outline[np.minimum(np.arange(PIECE_CORNERS), len(outline) - 1)]
+            vertices = np.zeros(PIECE_CORNERS, VERTEX)
+            homogeneous = np.column_stack([corners, np.ones(PIECE_CORNERS)])
+            vertices["position"] = (homogeneous @ self._placement.world_from_canvas.T)[:, :3]
+            across, along = self._reductions[k]
+            texel = np.array([2**across, 2**along]) / PATCH_PX
+            vertices["uv"] = (corners + 0.5) / CANVAS_SIZE_PX * (1, -1) + (0, 1) + LINEAR_SHIFT * texel
+            vertices["colour"] = 255
+            refill_node(node, vertices)

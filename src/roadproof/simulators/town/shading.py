@@ -1,0 +1,31 @@
+"""Vertex colours: albedo under the light of a weather."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from roadproof.simulators.town.meshes import Mesh
+from roadproof.simulators.town.weather import Sky
+
+
+def shaded(mesh: Mesh, sky: Sky, sunlit: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 4"]:
+    """Vertex colours of what stands in the open: walls see half of the sky."""
+    facing = np.clip(mesh.normals @ sky.to_sun, 0, None)
+    open_sky = 0.78 + 0.22 * np.clip(mesh.normals[:, 2], -1, 1)
+    return rgba(mesh.albedo * sky.light(facing, sunlit, open_sky) * (1 - 0.10 * sky.wetness))
+
+
+def turned(mesh: Mesh, yaw_rad: float) -> Mesh:
+    """The mesh with its normals turned, for light."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Mesh(mesh.points, (mesh.normals @ rotation.T).round(4), mesh.uv, mesh.albedo, mesh.triangles)
+
+
+def rgba(colour: Float[np.ndarray, "n 3"], alpha: float = 1.0) -> UInt8[np.ndarray, "n 4"]:
+    """Bytes of a colour in [0, 1]."""
+    levels = np.column_stack([colour, np.full(len(colour), alpha)])
+    return (np.clip(levels, 0, 1) * 255 + 0.5).astype(np.uint8)
