@@ -50,7 +50,7 @@ def workplace(tmp_path_factory):
     left = find_scenario("left-03", builtin_scenarios())
     # As far as the canvas, so that the paint is in view at once.
     short = dataclasses.replace(left, name="short", time_limit_s=0.4)
-    save_scenarios([short, dataclasses.replace(left, name="longer", time_limit_s=4.0)], folder / "own.toml")
+    save_scenarios([short, dataclasses.replace(left, name="longer", time_limit_s=2.0)], folder / "own.toml")
     pattern = Pattern(
         (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]])
     )
