@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from roadproof.coverage import Shape, polygon_vertices
 from roadproof.errors import OutputError, PatternError
@@ -15,6 +16,7 @@ from roadproof.patterns import (
     boxes_from_published,
     load_pattern,
     raster,
+    read_paint,
     rectangles_from_published,
     save_pattern,
     visibilities,
@@ -160,3 +162,20 @@ def test_patterns_need_figures_of_equal_number():
         Pattern((), torch.zeros(0, 5), torch.zeros(0, 3))
     with pytest.raises(PatternError, match="4 \\(black\\) or 7"):
         rectangles_from_published([[1.0, 2.0]])
+
+
+def test_paint_is_read_from_a_pattern_or_from_a_picture(tmp_path):
+    pattern = rectangles_from_published(PUBLISHED)
+    save_pattern(pattern, tmp_path / "pattern.json")
+    for name in ("pattern.json", "pattern.png"):
+        np.testing.assert_array_equal(read_paint(tmp_path / name), raster(pattern))
+    Image.new("RGB", (400, 400), (1, 2, 3)).save(tmp_path / "own.png")
+    np.testing.assert_array_equal(read_paint(tmp_path / "own.png")[7, 9], [1, 2, 3, 255])
+
+
+def test_what_cannot_be_painted_is_refused(tmp_path):
+    Image.new("RGB", (400, 300)).save(tmp_path / "low.png")
+    (tmp_path / "text.png").write_text("not a picture")
+    for name, message in (("low.png", "400×300 pixels"), ("text.png", "no picture"), ("none.png", "no pattern")):
+        with pytest.raises(PatternError, match=message):
+            read_paint(tmp_path / name)

@@ -24,6 +24,10 @@ class RecordingError(RoadproofError, ValueError):
     """A recording on disk is incomplete, damaged or inconsistent."""
 
 
+class EpisodeError(RoadproofError, ValueError):
+    """A driven episode, or its file, is incomplete, damaged or inconsistent."""
+
+
 class ControllerError(RoadproofError, ValueError):
     """A controller cannot be loaded or does not do what attacks need of it."""
 

@@ -200,6 +200,29 @@ def load_pattern(path: Path) -> Pattern:
     return Pattern(tuple(shapes), torch.tensor(boxes), torch.tensor(colours))
 
 
+def read_paint(path: Path) -> UInt8[np.ndarray, "s s 4"]:
+    """What a file says to paint, as RGBA of the canvas: the raster of a pattern (.json), or a picture as it is.
+
+    Raises:
+        PatternError: it is neither a pattern nor a picture of the canvas' size.
+    """
+    if path.suffix == ".json":
+        return raster(load_pattern(path))
+    try:
+        with Image.open(path) as picture:
+            paint = np.array(picture.convert("RGBA"))
+    except FileNotFoundError:
+        raise PatternError(f"no pattern {path}; check the path") from None
+    except (OSError, SyntaxError, ValueError) as error:
+        raise PatternError(f"{path} is no pattern (.json) and no picture ({error})") from None
+    if paint.shape[:2] != (CANVAS_SIZE_PX, CANVAS_SIZE_PX):
+        raise PatternError(
+            f"{path} has {paint.shape[1]}×{paint.shape[0]} pixels, expected the canvas' "
+            f"{CANVAS_SIZE_PX}×{CANVAS_SIZE_PX}; resize it"
+        )
+    return paint
+
+
 def _parse_figure(path: Path, k: int, figure: Any) -> tuple[Shape, list[float], list[float]]:  # noqa: ANN401
     try:
         shape = Shape(figure["shape"])

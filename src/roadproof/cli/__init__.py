@@ -13,6 +13,8 @@ from rich.console import Console
 
 from roadproof import __version__
 from roadproof.cli.attack import attack
+from roadproof.cli.drive import drive
+from roadproof.cli.scenarios import scenarios
 from roadproof.errors import RoadproofError
 
 app = typer.Typer(
@@ -21,7 +23,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-app.command()(attack)
+for verb in (attack, drive, scenarios):
+    app.command()(verb)
 
 
 def _version(wanted: bool | None) -> None:
@@ -48,5 +51,5 @@ def main() -> None:
         complain(f"roadproof: {error}")
         sys.exit(2)
     except KeyboardInterrupt:
-        complain("roadproof: interrupted; the same command goes on from here")
+        complain("roadproof: interrupted; give the same command again to go on")
         sys.exit(130)

@@ -10,12 +10,14 @@ References:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.datatypes import Control, VehicleState
+from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.simulators.town.agents import (
     CAR_LENGTH_M,
     CAR_WIDTH_M,
@@ -54,6 +56,32 @@ class Manner:
     slow_mps2: float = 1.8
     sight_s: float = 0.75
     sight_m: float = 4.5
+
+
+@runtime_checkable
+class OpenWorld(Protocol):
+    """A simulator that hides nothing of the drive under way; the town is one."""
+
+    @property
+    def route(self) -> Route:
+        """The way to the goal."""
+        ...
+
+    @property
+    def cars(self) -> Agents:
+        """The others now."""
+        ...
+
+    @property
+    def pedestrians(self) -> Agents:
+        """The people now."""
+        ...
+
+
+def expert(world: OpenWorld) -> Callable[[Observation], Control]:
+    """The expert as the driver of a `rollout`: gets in after the reset and drives what is under way."""
+    driver = Expert(world.route)
+    return lambda seen: driver.drive(seen.state, world.cars, world.pedestrians)
 
 
 class Expert:

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -102,6 +103,17 @@ def test_the_full_picture_is_what_the_frame_is_cut_from(town):
     assert seen.picture.shape == (600, 800, 3)
     difference = np.abs(CIL_INPUT(seen.picture).astype(float) - seen.frame)
     assert difference.mean() < 4.0
+
+
+def test_it_says_how_its_frames_are_reduced_whatever_was_asked_for(town):
+    assert CIL_INPUT.resampling != "area"
+    assert town.input == dataclasses.replace(CIL_INPUT, resampling="area")
+    picture = town.reset(STRAIGHT, full_pictures=True)
+    # The box tells the frame better than the tent does.
+    boxed, smoothed = (
+        np.abs(cut(picture.picture).astype(float) - picture.frame).mean() for cut in (town.input, CIL_INPUT)
+    )
+    assert boxed < smoothed
 
 
 def test_steering_right_turns_right_and_time_passes_by_dt(town):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 
 import numpy as np
@@ -75,7 +75,7 @@ class TownSimulator:
     Args:
         camera: the camera on the car.
         input: how the controller's frame is cut from its picture; it is rendered at twice its resolution and reduced
-            by a box, whatever `input.resampling` says.
+            by a box, so the simulator's own `input` says "area", whatever this one said.
         dt_s: seconds per step, a multiple of 0.01.
 
     Raises:
@@ -97,7 +97,7 @@ class TownSimulator:
                 f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
                 f"{camera.width_px}×{camera.height_px} pixels"
             )
-        self._camera, self._input, self._dt_s = camera, input, dt_s
+        self._camera, self._input, self._dt_s = camera, replace(input, resampling="area"), dt_s
         self._open = False
         self._town: _Town | None = None
         self._drive: _Drive | None = None

@@ -1,0 +1,135 @@
+"""`roadproof drive`: one scenario driven in the town; its film and its episode out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from roadproof.controllers import Controller
+    from roadproof.datatypes import Control, Observation
+    from roadproof.report.video import DriveVideo
+    from roadproof.rollout import Episode, OnStep, Policy
+    from roadproof.simulators.town.simulator import TownSimulator
+
+
+def drive(
+    scenario: Annotated[str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")] = "left-03",
+    scenarios: Annotated[
+        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
+    ] = None,
+    driver: Annotated[
+        str,
+        typer.Option(
+            help="expert, or a controller: a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
+            "module:factory."
+        ),
+    ] = "expert",
+    weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
+    pattern: Annotated[
+        Path | None,
+        typer.Option(help="pattern.json of an attack, or a 400×400 picture, painted on the road.", show_default=False),
+    ] = None,
+    cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
+    pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the other cars and the people.")] = 0,
+    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),
+) -> None:
+    """Drive a scenario in the town and film it."""
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.cli.options import choice
+    from roadproof.datatypes import Weather
+    from roadproof.files import check_writable
+    from roadproof.patterns import read_paint
+    from roadproof.rollout import rollout
+    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.simulators.town.maps import load_map, scenario_route
+
+    driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
+    sky = Weather(choice(weather, "weather", tuple(Weather)))
+    paint = None if pattern is None else read_paint(pattern)
+    check_writable(out)
+    who = _driver(driver, device)
+    roads = load_map(driven.map_name)
+    route = scenario_route(driven, roads)
+
+    # Panda3D and PyAV are extras.
+    from roadproof.report.video import DriveVideo
+    from roadproof.simulators.town.simulator import TownSimulator
+
+    with (
+        TownSimulator() as town,
+        DriveVideo(
+            out / "drive.mp4", roads=roads, route=route, canvas=driven.canvas, pattern=paint, dt_s=town.dt_s
+        ) as film,
+        _watched(town, film, f"Driving {driven.name}", route.length_m) as on_step,
+    ):
+        episode = rollout(
+            town,
+            who,
+            driven,
+            weather=sky,
+            pattern=paint,
+            cars=cars,
+            pedestrians=pedestrians,
+            seed=seed,
+            full_pictures=True,
+            on_step=on_step,
+        )
+    episode.save(out / "episode.npz")
+    _summarise(episode, out)
+
+
+def _driver(spec: str, device: str) -> Controller | Callable[[TownSimulator], Policy]:
+    """The expert, or the controller of a spec."""
+    from roadproof.controllers import load_controller
+    from roadproof.controllers.loading import SPECS
+    from roadproof.errors import ControllerError
+    from roadproof.training.expert import expert
+
+    if spec == "expert":
+        return expert
+    if spec.isidentifier():
+        raise ControllerError(f"--driver is {spec!r}, expected expert or a controller: {SPECS}")
+    return load_controller(spec, device=device)
+
+
+@contextmanager
+def _watched(town: TownSimulator, film: DriveVideo, title: str, length_m: float) -> Generator[OnStep]:
+    """Films every step and shows how far the car is."""
+    import numpy as np
+
+    from roadproof.cli.progress import progress
+    from roadproof.datatypes import Control
+
+    at_m = 0.0
+
+    def on_step(seen: Observation, control: Control | None) -> None:
+        nonlocal at_m
+        others, people = (np.column_stack([agents.x_m, agents.y_m]) for agents in (town.cars, town.pedestrians))
+        film.add(seen, Control(0.0) if control is None else control, cars=others, people=people)
+        at_m = town.route.locate(seen.state.x_m, seen.state.y_m, at_m).arclength_m
+        show(round(at_m), 3.6 * seen.state.speed_mps)
+
+    with progress(title, round(length_m), "m, {:.0f} km/h") as show:
+        yield on_step
+
+
+def _summarise(episode: Episode, out: Path) -> None:
+    from rich.console import Console
+
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    road = "painted" if episode.painted else "bare"
+    say(
+        f"{episode.scenario}, {episode.weather}, {road} road, {episode.cars} cars, {episode.pedestrians} pedestrians: "
+        f"{episode.ending} after {episode.time_s[-1]:.1f} s, {len(episode.events) or 'no'} event"
+        f"{'' if len(episode.events) == 1 else 's'}"
+    )
+    for event in episode.events:
+        say(f"  {event.time_s:5.1f} s  {event.kind}  {event.detail}")
+    say(f"Results in {out}: drive.mp4, episode.npz")

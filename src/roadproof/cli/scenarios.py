@@ -1,0 +1,56 @@
+"""`roadproof scenarios`: what can be driven, as a table and on the map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def scenarios(
+    file: Annotated[
+        Path | None,
+        typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Picture to draw them to on their map.", show_default=False)] = None,
+) -> None:
+    """List the scenarios, and draw them on their map."""
+    # Matplotlib takes a second to import; `--help` should not.
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from roadproof.errors import ScenarioError
+    from roadproof.scenarios import BUILTIN_FILE, load_scenarios
+    from roadproof.simulators.town.maps import load_map, scenario_route
+
+    listed = load_scenarios(file or BUILTIN_FILE)
+    table = Table("name", "kind", "map", box=box.SIMPLE)
+    for column in ("route m", "to canvas m", "canvas m", "limit s"):
+        table.add_column(column, justify="right")
+    for scenario in listed:
+        route, canvas = scenario_route(scenario, load_map(scenario.map_name)), scenario.canvas
+        table.add_row(
+            Text(scenario.name),
+            scenario.kind,
+            Text(Path(scenario.map_name).name),
+            f"{route.length_m:.0f}",
+            f"{route.locate(canvas.x_m, canvas.y_m).arclength_m:.0f}",
+            f"{canvas.width_m:.1f} × {canvas.length_m:.1f}",
+            f"{scenario.time_limit_s:.0f}",
+        )
+    console = Console(soft_wrap=True)
+    console.print(table)
+    if out is None:
+        return
+    from roadproof.report.scenario_map import draw_scenarios
+
+    maps = sorted({scenario.map_name for scenario in listed})
+    if len(maps) > 1:
+        raise ScenarioError(
+            f"the scenarios lie on {len(maps)} maps ({', '.join(maps)}); draw those of one map at a time"
+        )
+    draw_scenarios(listed, load_map(maps[0]), out)
+    console.print(f"Drawn to {out}", markup=False, highlight=False)
