@@ -133,9 +133,10 @@ def _starts(surrogate: Surrogate, space: SearchSpace, restarts: int, draws: int,
     points = space.random((len(surrogate.groups), restarts * draws), generator).to(surrogate.device)
     if draws == 1:
         return points
-    value = surrogate.values(space, points).unflatten(1, (restarts, draws))
-    best = value.argmax(-1, keepdim=True)[..., None, None]
-    return points.unflatten(1, (restarts, draws)).take_along_dim(best, dim=2).squeeze(2)
+    groups = len(points)
+    best = surrogate.values(space, points).view(groups, restarts, draws).argmax(-1)
+    drawn = points.view(groups, restarts, draws, *points.shape[2:])
+    return drawn[torch.arange(groups)[:, None], torch.arange(restarts), best]
 
 
 def _step(surrogate: Surrogate, space: SearchSpace, schedule: Schedule, state: dict[str, Tensor]) -> dict[str, Tensor]:
