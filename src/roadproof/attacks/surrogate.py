@@ -59,6 +59,7 @@ class Surrogate:
         self.groups = tuple(groups)
         self.controller = controller
         self.frames_evaluated = 0
+        self._kept: tuple[int, Compositor] | None = None
         drives = [group.select(recordings) for group in groups]
         self.lengths = [[len(drive.frames) for drive in members] for members in drives]
         self.views = [_view(recordings, members, device) for members in drives]
@@ -141,8 +142,8 @@ class Surrogate:
         return unit.chunk(-(-unit.shape[1] // at_once), dim=1)
 
     def _compositor(self, copies: int) -> Compositor:
-        kept = getattr(self, "_kept", None)
-        if kept is None or kept[0] != copies:
+        # Batches of a search are of one size, or two: the frames are kept until another size comes.
+        if self._kept is None or self._kept[0] != copies:
             self._kept = (copies, Compositor(self.views, copies))
         return self._kept[1]
 
