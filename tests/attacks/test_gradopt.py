@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from roadproof.attacks import AttackResult, Schedule, Surrogate, attack
 from roadproof.attacks.gradopt import gradopt, random_search
 from roadproof.attacks.published import PublishedSurrogate
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
-from roadproof.errors import ControllerError, PatternError, RoadproofError
+from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.patterns import Pattern, boxes_from_published
 from roadproof.search_space import SearchSpace
@@ -153,6 +154,18 @@ def test_a_checkpoint_of_another_search_or_a_damaged_one_is_not_used(tmp_path):
     assert not torch.equal(first.history, second.history)
     checkpoint.write_bytes(b"not a checkpoint")
     assert torch.equal(run(0).history, first.history)
+
+
+def test_a_checkpoint_on_a_full_disk_is_one_clear_error(tmp_path, monkeypatch):
+    def full(*args, **kwargs):
+        raise SafetensorError("No space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
+    checkpoint, short = tmp_path / "search.safetensors", Schedule.stretched(2)
+    with pytest.raises(OutputError, match="No space left"):
+        gradopt(surrogate, SearchSpace(figures=1), schedule=short, restarts=1, seed=0, checkpoint=checkpoint)
+    assert not list(tmp_path.iterdir())
 
 
 def test_patience_ends_a_search_that_gains_nothing():

@@ -8,10 +8,9 @@ from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file  # pyright: ignore[reportUnknownVariableType]
 from torch import Tensor
 
-from roadproof.files import write_atomically
+from roadproof.files import write_tensors
 
 
 def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None:
@@ -21,7 +20,7 @@ def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None
         OutputError: the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-    write_atomically(path, lambda part: save_file(tensors, part, {"identity": _digest(identity)}))
+    write_tensors(path, tensors, {"identity": _digest(identity)})
 
 
 def load_checkpoint(path: Path, identity: str, device: torch.device) -> dict[str, Tensor] | None:

@@ -12,7 +12,6 @@ from typing import Any, cast
 import torch
 from jaxtyping import Shaped
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file  # pyright: ignore[reportUnknownVariableType]
 from torch import Tensor, nn
 
 from roadproof.controllers.cards import ControllerCard, read_card
@@ -20,7 +19,8 @@ from roadproof.controllers.cil import CIL
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
 from roadproof.controllers.protocol import Controller
 from roadproof.controllers.steering import CruiseControl, SteeringController
-from roadproof.errors import ControllerError, DeviceError, OutputError
+from roadproof.errors import ControllerError, DeviceError
+from roadproof.files import write_tensors
 
 ARCHITECTURES = ("cil", "pilotnet")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
@@ -97,16 +97,7 @@ def save_controller(controller: CIL | SteeringController, path: Path) -> None:
     else:
         raise ControllerError(f"cannot save a {type(network).__name__}, expected CIL or PilotNet; export it instead")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, partial, metadata={_METADATA_KEY: card.to_json()})
-        partial.replace(path)
-    except (OSError, SafetensorError) as error:
-        raise OutputError(f"cannot write {path}: {error}") from error
-    finally:
-        if partial.is_file():
-            partial.unlink()
+    write_tensors(path, tensors, {_METADATA_KEY: card.to_json()})
 
 
 def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:

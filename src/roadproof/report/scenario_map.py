@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from roadproof.errors import OutputError, ScenarioError
+from roadproof.files import write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.scenarios import Scenario
 from roadproof.simulators.town.maps import scenario_route
@@ -50,12 +50,9 @@ def draw_scenarios(scenarios: Sequence[Scenario], road_map: RoadMap, path: Path)
     for scenario, route in zip(scenarios, routes, strict=True):
         _draw_scenario(axes, scenario, route.points[:, :2], taken)
     _draw_legend(axes, scenarios)
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(partial, dpi=110)
-        partial.replace(path)
-    except (OSError, ValueError) as error:
+        write_atomically(path, lambda part: figure.savefig(part, dpi=110))
+    except ValueError as error:
         raise OutputError(f"the map cannot be drawn to {path} ({error}); choose another place or a .png") from error
 
 
