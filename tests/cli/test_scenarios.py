@@ -49,7 +49,7 @@ def test_mistakes_are_one_clear_line(scenarios, tmp_path):
     for options, message in (
         (["--file", tmp_path / "none.toml"], "cannot be read"),
         (["--file", tmp_path / "city.toml"], "has no map 'city'"),
-        (["--out", tmp_path / "file" / "map.png"], "cannot be drawn"),
+        (["--out", tmp_path / "file" / "map.png"], "cannot write"),
         (["--out", tmp_path / "map.mp3"], "cannot be drawn"),
     ):
         code, printed = scenarios(*options)
