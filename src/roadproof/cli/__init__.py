@@ -13,6 +13,7 @@ from rich.console import Console
 
 from roadproof import __version__
 from roadproof.cli.attack import attack
+from roadproof.cli.carla import carla
 from roadproof.cli.drive import drive
 from roadproof.cli.scenarios import scenarios
 from roadproof.errors import RoadproofError
@@ -25,6 +26,7 @@ app = typer.Typer(
 )
 for verb in (attack, drive, scenarios):
     app.command()(verb)
+app.add_typer(carla, name="carla")
 
 
 def _version(wanted: bool | None) -> None:

@@ -65,12 +65,7 @@ class Physics:
         self._parts: dict[str, list[Contact]] = {}
         self._surround(start.x_m, start.y_m)
         self._cars: list[Path] = []
-        for i, pose in enumerate(cars):
-            node = self._box(f"car-{i}", CAR_HALF_M, HEIGHT_M)
-            node.set_kinematic(True)
-            self._kinds[node.get_name()] = Contact("vehicle", f"car {i}")
-            self._cars.append(self._place(node))
-            self._stand(self._cars[-1], pose, HEIGHT_M)
+        self.move_cars(cars)
         self._chassis, self._path, self._vehicle = self._make_car(start)
         self._steer_rad = 0.0
         self._settle(start)
@@ -86,7 +81,16 @@ class Physics:
         self._advance(count)
 
     def move_cars(self, poses: Sequence[Pose]) -> None:
-        """Put the other cars where they are now."""
+        """Put the other cars where they are now; there may be more or fewer than before."""
+        for path in self._cars[len(poses) :]:
+            self._world.remove(path.node())
+            path.remove_node()
+        del self._cars[len(poses) :]
+        for i in range(len(self._cars), len(poses)):
+            node = self._box(f"car-{i}", CAR_HALF_M, HEIGHT_M)
+            node.set_kinematic(True)
+            self._kinds[node.get_name()] = Contact("vehicle", f"car {i}")
+            self._cars.append(self._place(node))
         for path, pose in zip(self._cars, poses, strict=True):
             self._stand(path, pose, HEIGHT_M)
 

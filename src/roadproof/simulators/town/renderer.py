@@ -102,6 +102,16 @@ class Actor:
     raised: bool = False
     walked_m: float = 0.0
 
+    @property
+    def z_m(self) -> float:
+        """Height of what it stands on."""
+        return KERB_M if self.raised else 0.0
+
+    @property
+    def stride(self) -> int:
+        """Which of `STRIDES` its legs show: two steps are 1.5 m."""
+        return (0, 1, 2, 3, 2, 1)[int(self.walked_m / 1.5 * 6) % 6]
+
 
 class Renderer:
     """Draws one town from one camera."""
@@ -121,17 +131,14 @@ class Renderer:
         self._trees = _with_atlas(scenery.meshes, [f"tree{kind}" for kind in range(TREES)])
         self._stage = ground_stage()
         self._screens: dict[int, Screen] = {}
+        self._views: dict[CameraModel, Screen] = {}
         self._weather: Weather | None = None
         self._lit: LitGround
         self._lit_nodes: Path = None
         self._shown_from: tuple[int, int] | None = None
         self._districts: dict[tuple[int, int, bool], Path] = {}
         self._land = _CellTextures(self._ground.size_m)
-        whole = CropResize(
-            left_px=0, top_px=0, right_px=camera.width_px, bottom_px=camera.height_px,
-            width_px=camera.width_px, height_px=camera.height_px,
-        )  # fmt: skip
-        self._crops = ((crop, 2), (whole, 2))
+        self._crops = ((crop, 2), (whole(camera), 2))
         self._canvas = CanvasNode(self._root, camera, self._crops)
         self._follow = self._root.attach_new_node("follow")
         self._haze = self._root.attach_new_node("haze")
@@ -184,6 +191,14 @@ class Renderer:
         """The full camera picture, rendered at twice its resolution."""
         return self._shoot(PICTURE, state, tick)
 
+    def view(self, camera: CameraModel, state: VehicleState, tick: int = 0) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture of any camera, for worlds without a canvas."""
+        if camera not in self._views:
+            self._views[camera] = Screen(self._pipe, self._root, camera, whole(camera), 2)
+        screen = self._views[camera]
+        self._aim(screen, state, tick)
+        return screen.shoot()
+
     def _shoot(self, which: int, state: VehicleState, tick: int) -> UInt8[np.ndarray, "h w 3"]:
         crop, magnified = self._crops[which]
         if which not in self._screens:
@@ -195,9 +210,10 @@ class Renderer:
 
     def close(self) -> None:
         """Give everything back."""
-        for screen in self._screens.values():
+        for screen in (*self._screens.values(), *self._views.values()):
             screen.close()
         self._screens.clear()
+        self._views.clear()
         self._root.remove_node()
         self._models.clear()
         self._actors.clear()
@@ -354,6 +370,14 @@ class Renderer:
                 self._drops.append(drop)
 
 
+def whole(camera: CameraModel) -> CropResize:
+    """All of a camera's picture."""
+    return CropResize(
+        left_px=0, top_px=0, right_px=camera.width_px, bottom_px=camera.height_px,
+        width_px=camera.width_px, height_px=camera.height_px,
+    )  # fmt: skip
+
+
 class _CellTextures:
     """One baked picture of the ground per cell; coarser where nothing is paved."""
 
@@ -401,14 +425,11 @@ class _ActorNode:
         self._shown: Node = None
 
     def move(self, actor: Actor) -> None:
-        z = KERB_M if actor.raised else 0.0
-        self._path.set_pos_hpr(actor.x_m, actor.y_m, z, math.degrees(actor.yaw_rad), 0.0, 0.0)
+        self._path.set_pos_hpr(actor.x_m, actor.y_m, actor.z_m, math.degrees(actor.yaw_rad), 0.0, 0.0)
         if actor.raised != self._raised:
             self._raised = actor.raised
             dress(self._shade, Layer.PAVEMENT_SHADE if actor.raised else Layer.SHADE)
-        # Two steps are 1.5 m; cars have one shape.
-        step = int(actor.walked_m / 1.5 * 6) % 6 if actor.person else 0
-        stride = (0, 1, 2, 3, 2, 1)[step]
+        stride = actor.stride if actor.person else 0
         heading = round(actor.yaw_rad / (2 * math.pi / HEADINGS)) % HEADINGS
         shade = HEADINGS if self._renderer.in_shade(actor.x_m, actor.y_m) else 0
         wanted = self._renderer.models(actor, stride)[heading + shade]
