@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from roadproof.datatypes import Control, VehicleState
+from roadproof.simulators.town.body import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.scenery import Solid
 
-LENGTH_M, WIDTH_M, HEIGHT_M = 4.5, 1.9, 1.45
-WHEELBASE_M, TRACK_M, WHEEL_RADIUS_M = 2.8, 1.6, 0.33
+WHEEL_RADIUS_M = 0.33
 MASS_KG = 1500.0
 MAX_STEER_RAD = 0.65
 STEER_RATE_RAD_S = 2.5
@@ -29,14 +28,6 @@ SETTLE_STEPS = 60
 CAR_HALF_M = (2.25, 0.93)
 TOUCH_M = 0.02
 BLOCK_M = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class Contact:
-    """The car touches something: what kind of thing, and which one."""
-
-    kind: str
-    name: str
 
 
 class Physics:
