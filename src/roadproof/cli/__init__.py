@@ -13,6 +13,7 @@ from rich.console import Console
 
 from roadproof import __version__
 from roadproof.cli.attack import attack
+from roadproof.cli.calibrate import calibrate
 from roadproof.cli.drive import drive
 from roadproof.cli.record import record
 from roadproof.cli.scenarios import scenarios
@@ -24,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-for verb in (record, attack, drive, scenarios):
+for verb in (record, calibrate, attack, drive, scenarios):
     app.command()(verb)
 
 
