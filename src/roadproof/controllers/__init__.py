@@ -14,5 +14,8 @@ from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA as PILOTNET_ON_CARL
 from roadproof.controllers.pilotnet import PilotNet as PilotNet
 from roadproof.controllers.pilotnet import pilotnet_controller as pilotnet_controller
 from roadproof.controllers.protocol import Controller as Controller
+from roadproof.controllers.shipped import ModelCard as ModelCard
+from roadproof.controllers.shipped import model_card as model_card
+from roadproof.controllers.shipped import shipped_names as shipped_names
 from roadproof.controllers.steering import CruiseControl as CruiseControl
 from roadproof.controllers.steering import SteeringController as SteeringController

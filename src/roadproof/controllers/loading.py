@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from roadproof.controllers.cil import CIL
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
 from roadproof.controllers.protocol import Controller
+from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.steering import CruiseControl, SteeringController
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.files import write_tensors
@@ -26,7 +28,7 @@ from roadproof.files import write_tensors
 ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
-    "FILE.safetensors, cil:FILE.safetensors, pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx "
+    "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx "
     "or module:factory (a function in your Python)"
 )
 
@@ -50,6 +52,7 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
 
     Args:
         spec: one of
+            `cil`, `pilotnet` …: one that comes with the package, see `shipped`;
             `FILE.safetensors`: weights; the card in its header (`save_controller`) or beside it as `FILE.json` says
             of which network;
             `cil:FILE.safetensors`, `pilotnet:FILE.safetensors`: weights without a card, of the published network on
@@ -73,6 +76,8 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
     head, _, tail = text.partition(":")
     if head in ARCHITECTURES and tail:
         controller = _from_weights(Path(tail), ControllerCard(architecture=head))
+    elif re.fullmatch(r"[a-z][a-z0-9-]*", text):
+        controller = _from_weights(shipped_weights(text), None)
     elif text.endswith(".safetensors"):
         controller = _from_weights(Path(text), None)
     elif text.endswith((".pt2", ".onnx")):

@@ -18,18 +18,16 @@ class Augmentation:
         brightness: of the factor on all channels, as a power of e.
         contrast: of the factor on the distance from the picture's mean, likewise.
         tint: of the factor on each channel, likewise.
-        saturation: of the factor on the distance from grey.
-        gamma: of the exponent, as a power of e.
+        saturation: of the factor on the distance from grey, likewise.
         noise: largest deviation of a pixel's noise.
         noisy: share of the pictures with noise.
         blurred: share of the pictures blurred over 3×3 pixels.
     """
 
     brightness: float = 0.15
-    contrast: float = 0.15
+    contrast: float = 0.2
     tint: float = 0.05
     saturation: float = 0.25
-    gamma: float = 0.12
     noise: float = 0.04
     noisy: float = 0.3
     blurred: float = 0.15
@@ -43,18 +41,18 @@ class Augmentation:
         """
         count = len(frames)
 
-        def factor(deviation: float, channels: int = 1) -> Float[Tensor, "b c 1 1"]:
-            drawn = torch.randn(count, channels, 1, 1, generator=generator).mul(deviation).exp()
+        def factor(deviation: float, channels: int = 1) -> Float[Tensor, "b c 1"]:
+            drawn = torch.randn(count, channels, 1, generator=generator).mul(deviation).exp()
             return drawn.to(frames)
 
-        gain, contrast, saturation = factor(self.brightness), factor(self.contrast), factor(self.saturation)
-        mean = frames.mean(dim=(1, 2, 3), keepdim=True)
-        grey = frames.mean(dim=1, keepdim=True)
-        # (frame − grey)·saturation + grey, then about the mean, then the gains: one affine map of frame and grey.
-        scale = gain * factor(self.tint, 3)
-        varied = torch.addcmul(frames * (scale * contrast * saturation), grey, scale * contrast * (1 - saturation))
-        varied = (varied + scale * mean * (1 - contrast)).clamp_(0.004, 1.0) ** factor(self.gamma)
-        varied = self._blurred(varied, generator)
+        contrast, saturation = factor(self.contrast), factor(self.saturation)
+        gain = factor(self.brightness) * factor(self.tint, 3)
+        # Towards or away from grey, then from the picture's mean, then the gains: one matrix and offset a picture.
+        mean = frames.mean(dim=(1, 2, 3)).reshape(-1, 1, 1)
+        mixing = saturation * torch.eye(3).to(frames) + (1.0 - saturation) / 3.0
+        pixels = frames.contiguous().flatten(2)
+        varied = torch.baddbmm(gain * mean * (1.0 - contrast), gain * contrast * mixing, pixels)
+        varied = self._blurred(varied.unflatten(2, frames.shape[2:]).clamp_(0.0, 1.0), generator)
         return self._noisy(varied, generator).clamp_(0.0, 1.0)
 
     def _blurred(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
