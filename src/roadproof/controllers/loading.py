@@ -28,8 +28,8 @@ from roadproof.files import write_tensors
 ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
-    "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx "
-    "or module:factory (a function in your Python)"
+    "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, "
+    "pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx or module:factory (a function in your Python)"
 )
 
 _METADATA_KEY = "roadproof"

@@ -52,7 +52,7 @@ class Augmentation:
         mixing = saturation * torch.eye(3).to(frames) + (1.0 - saturation) / 3.0
         pixels = frames.contiguous().flatten(2)
         varied = torch.baddbmm(gain * mean * (1.0 - contrast), gain * contrast * mixing, pixels)
-        varied = self._blurred(varied.unflatten(2, frames.shape[2:]).clamp_(0.0, 1.0), generator)
+        varied = self._blurred(varied.reshape(frames.shape).clamp_(0.0, 1.0), generator)
         return self._noisy(varied, generator).clamp_(0.0, 1.0)
 
     def _blurred(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:

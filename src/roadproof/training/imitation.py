@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from pickle import UnpicklingError  # what torch raises for a file that holds more than numbers
 from typing import Any
 
 import torch
@@ -228,6 +229,6 @@ def _resume(
             average.load_state_dict(content["average"])
             optimiser.load_state_dict(content["optimiser"])
             return int(content["step"])
-    except (RuntimeError, ValueError, KeyError, TypeError, OSError, EOFError) as error:
-        raise TrainingError(f"checkpoint {path} is damaged or of another network ({error}); delete it") from None
+    except (RuntimeError, ValueError, KeyError, TypeError, OSError, EOFError, UnpicklingError):
+        raise TrainingError(f"checkpoint {path} is damaged or of another network; delete it") from None
     raise TrainingError(f"checkpoint {path} was made with other settings; delete it or choose another folder")
