@@ -31,6 +31,7 @@ def test_a_quiet_drive_follows_the_route_and_a_knocked_one_leaves_it(seat):
     assert np.corrcoef(knocked.lateral_m, knocked.expert[:, 0])[0, 1] > 0.2
     assert quiet.frames.shape[1:] == (88, 200, 3)
     assert quiet.about["weather"] == knocked.about["weather"]
+    assert (quiet.about["knocked"], knocked.about["knocked"]) == (False, True)
 
 
 def test_drives_start_at_rest_and_the_expert_wants_to_go(seat):

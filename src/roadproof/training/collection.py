@@ -152,7 +152,10 @@ def _record(seat: Seat, work: tuple[CollectionPlan, int, Path]) -> None:
 
 def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
     generator = np.random.default_rng([plan.seed, number])
+    # First what does not depend on the shares, so that plans that differ in them alone share weathers and numbers.
     knocked, busy, painted = generator.uniform(size=3) < (plan.knocked, plan.traffic, plan.painted)
+    weather = WEATHERS[int(generator.integers(len(WEATHERS)))]
+    cars, pedestrians = (int(generator.integers(10, 41)) for _ in range(2))
     scenario = random_scenario(
         load_map(plan.map_name),
         plan.map_name,
@@ -161,11 +164,10 @@ def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
         command=COMMANDS[number % len(COMMANDS)],
         displacement=Displacement() if knocked else None,
     )
-    cars, pedestrians = (int(generator.integers(10, 41)) for _ in range(2))
     steps = int(scenario.time_limit_s / STEP_S) + 2
     return _Conditions(
         scenario=scenario,
-        weather=WEATHERS[int(generator.integers(len(WEATHERS)))],
+        weather=weather,
         cars=cars if busy else 0,
         pedestrians=pedestrians if busy else 0,
         pattern=_random_paint(generator) if painted else None,
