@@ -46,3 +46,7 @@ class SimulatorError(RoadproofError, RuntimeError):
 
 class ScenarioError(RoadproofError, ValueError):
     """A scenario, its map or its route is not valid."""
+
+
+class TrainingError(RoadproofError, ValueError):
+    """Recorded drives or training settings that nothing can be learnt from."""

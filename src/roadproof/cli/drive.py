@@ -25,8 +25,10 @@ def drive(
     driver: Annotated[
         str,
         typer.Option(
-            help="expert, or a controller: a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
-            "module:factory."
+            "--controller",
+            "--driver",
+            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
+            "file, cil:FILE, pilotnet:FILE or module:factory.",
         ),
     ] = "expert",
     weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
@@ -87,15 +89,15 @@ def drive(
 
 def _driver(spec: str, device: str) -> Controller | Callable[[TownSimulator], Policy]:
     """The expert, or the controller of a spec."""
-    from roadproof.controllers import load_controller
+    from roadproof.controllers import load_controller, shipped_names
     from roadproof.controllers.loading import SPECS
     from roadproof.errors import ControllerError
     from roadproof.training.expert import expert
 
     if spec == "expert":
         return expert
-    if spec.isidentifier():
-        raise ControllerError(f"--driver is {spec!r}, expected expert or a controller: {SPECS}")
+    if spec.isidentifier() and spec not in shipped_names():
+        raise ControllerError(f"--controller is {spec!r}, expected expert or a controller: {SPECS}")
     return load_controller(spec, device=device)
 
 
