@@ -46,3 +46,7 @@ class SimulatorError(RoadproofError, RuntimeError):
 
 class ScenarioError(RoadproofError, ValueError):
     """A scenario, its map or its route is not valid."""
+
+
+class StudyError(RoadproofError, ValueError):
+    """A study's plan, or a folder with its results, is not valid."""
