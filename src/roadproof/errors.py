@@ -50,3 +50,7 @@ class ScenarioError(RoadproofError, ValueError):
 
 class TrainingError(RoadproofError, ValueError):
     """Recorded drives or training settings that nothing can be learnt from."""
+
+
+class StudyError(RoadproofError, ValueError):
+    """A study's plan, or a folder with its results, is not valid."""
