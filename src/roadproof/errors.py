@@ -28,6 +28,10 @@ class EpisodeError(RoadproofError, ValueError):
     """A driven episode, or its file, is incomplete, damaged or inconsistent."""
 
 
+class CalibrationError(RoadproofError, RuntimeError):
+    """A calibration that cannot be trusted; the message says why and what to do."""
+
+
 class ControllerError(RoadproofError, ValueError):
     """A controller cannot be loaded or does not do what attacks need of it."""
 

@@ -16,6 +16,7 @@ from roadproof.cli.attack import attack
 from roadproof.cli.check_controller import check_controller
 from roadproof.cli.controllers import controllers
 from roadproof.cli.drive import drive
+from roadproof.cli.record import record
 from roadproof.cli.scenarios import scenarios
 from roadproof.cli.train import train
 from roadproof.errors import RoadproofError
@@ -26,7 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-for verb in (attack, check_controller, controllers, drive, scenarios, train):
+for verb in (record, attack, drive, check_controller, controllers, scenarios, train):
     app.command()(verb)
 
 
