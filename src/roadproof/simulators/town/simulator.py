@@ -229,7 +229,7 @@ class TownSimulator:
         assert self._town is not None
         if drive.traffic is not None:
             drive.traffic.step(self._dt_s, drive.state)
-            drive.physics.move_cars(_poses(drive.cars))
+            drive.physics.move_cars(np.stack([drive.cars.x_m, drive.cars.y_m, drive.cars.yaw_rad], axis=1))
             self._town.renderer.move_agents(drive.cars, drive.pedestrians)
         drive.physics.step(control.clipped(), self._dt_s)
         drive.state = drive.physics.state()
