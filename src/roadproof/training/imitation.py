@@ -26,6 +26,7 @@ from roadproof.errors import TrainingError
 from roadproof.files import write_atomically
 from roadproof.training.augmentation import Augmentation
 from roadproof.training.dataset import Batch, Dataset
+from roadproof.training.pasting import PastedPaint
 
 Learner = CIL | ConditionalPilotNet
 """A network that can be trained: frames, speed and command in, `CILOutput` out."""
@@ -54,6 +55,7 @@ class TrainingPlan:
         weight_decay: AdamW's.
         averaging: decay of the running average of the weights; the average is what is kept.
         dropout: factor on the network's own dropout; short training learns more with less.
+        pasted: share of the pictures with coloured rectangles pasted on the road.
         loss: how much each answer counts.
         augmentation: how the pictures are varied.
 
@@ -69,6 +71,7 @@ class TrainingPlan:
     weight_decay: float = 1e-2
     averaging: float = 0.997
     dropout: float = 0.4
+    pasted: float = 0.0
     loss: LossWeights = field(default_factory=LossWeights)
     augmentation: Augmentation = field(default_factory=Augmentation)
 
@@ -76,7 +79,7 @@ class TrainingPlan:
         for name in ("batch", "learning_rate"):
             if not getattr(self, name) > 0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a value above 0")
-        for name in ("averaging", "dropout", "warm_up"):
+        for name in ("averaging", "dropout", "pasted", "warm_up"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a value in [0, 1]")
         if self.steps < 1:
@@ -140,13 +143,14 @@ def imitate(
     average = copy.deepcopy(network).eval()
     optimiser = torch.optim.AdamW(network.parameters(), plan.learning_rate, weight_decay=plan.weight_decay)
     first = 0 if checkpoint is None else _resume(checkpoint, plan, network, average, optimiser)
+    paste = PastedPaint(plan.pasted)
     weights, sums, counted = data.weights(), torch.zeros(2), 0
     for step in range(first, plan.steps):
         for group in optimiser.param_groups:
             group["lr"] = plan.rate(step)
         draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
         batch = data.batch(torch.multinomial(weights, plan.batch, replacement=True, generator=draw), place)
-        batch = batch._replace(frames=plan.augmentation(batch.frames, draw))
+        batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw))
         with seeded(plan.seed * 1_000_003 + step), torch.autocast(place.type, torch.bfloat16):
             answer: CILOutput = network(batch.frames, batch.speed_mps, batch.command)
         loss = imitation_loss(answer, batch, plan.loss)

@@ -51,6 +51,7 @@ class Recipe:
         start: weights file to go on from; None begins with fresh weights.
         drives: of the expert.
         painted_drives: of the expert over random paint, besides.
+        pasted: share of the pictures learnt from with coloured rectangles pasted on the road.
         samples: frames seen in the first training, repetitions counted.
         learning_rate: the largest of the first training; rounds take a third of it.
         rounds: how often the network then drives itself and learns from the expert's answers.
@@ -58,7 +59,7 @@ class Recipe:
         round_samples: frames seen in the training after each round.
 
     Raises:
-        TrainingError: an unknown network, or a number below 0.
+        TrainingError: an unknown network, a number that makes no sense.
     """
 
     network: str = "cil"
@@ -67,6 +68,7 @@ class Recipe:
     start: str | None = None
     drives: int = 260
     painted_drives: int = 0
+    pasted: float = 0.0
     samples: int = 200_000
     learning_rate: float = 1.2e-3
     rounds: int = 1
@@ -79,6 +81,11 @@ class Recipe:
         for name in ("painted_drives", "rounds"):
             if getattr(self, name) < 0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected 0 or more")
+        # Found out now rather than after an hour of driving.
+        self.expert_plans()
+        for number in range(self.rounds + 1):
+            self.round_plan(number, Path())
+            self.training_plan(number)
 
     def fresh(self) -> Learner:
         """The network before it has seen anything of this recipe."""
@@ -107,10 +114,12 @@ class Recipe:
 
     def training_plan(self, number: int) -> TrainingPlan:
         """The training after a round; round 0 is the expert's."""
-        if number == 0:
-            return TrainingPlan(samples=self.samples, learning_rate=self.learning_rate, seed=self.seed)
+        first = number == 0
         return TrainingPlan(
-            samples=self.round_samples, learning_rate=self.learning_rate / 3, seed=self.seed + 1000 * number
+            samples=self.samples if first else self.round_samples,
+            learning_rate=self.learning_rate if first else self.learning_rate / 3,
+            seed=self.seed + 1000 * number,
+            pasted=self.pasted,
         )
 
 
@@ -124,6 +133,7 @@ def gather(recipe: Recipe, folder: Path, *, processes: int = 1, on_stage: OnStag
         TrainingError: the folder belongs to another recipe.
         OutputError: the folder cannot be written.
     """
+    recipe.fresh()  # weights to start from are read before the first drive
     _claim(recipe, folder)
     shards: list[Path] = []
     for name, plan in recipe.expert_plans().items():
