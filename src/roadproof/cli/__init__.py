@@ -14,6 +14,8 @@ from rich.console import Console
 from roadproof import __version__
 from roadproof.cli.attack import attack
 from roadproof.cli.drive import drive
+from roadproof.cli.evaluate import evaluate
+from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
 from roadproof.errors import RoadproofError
 
@@ -23,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-for verb in (attack, drive, scenarios):
+for verb in (attack, drive, evaluate, report, scenarios):
     app.command()(verb)
 
 
