@@ -13,7 +13,7 @@ from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from runs import CRASH, read_result, write_attack, write_evaluation, write_run
 
-SECTIONS = ("film", "above", "pattern", "strip", "steering", "conditions", "search", "calibration", "cost", "again")
+SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
 HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)>"&'{{7*7}}$\\frac{1}{2}$"""
 
 
@@ -60,7 +60,7 @@ def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
         "Fails over the paint",
         "collision static (tree 7)",
         "rainy noon",
-        "20 cars, 20 people",
+        "20 cars and 20 people",
         "use more restarts",
     ):
         assert words in text

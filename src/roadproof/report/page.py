@@ -154,6 +154,7 @@ def _judged(judged: Judged | None) -> Fields | None:
     return {
         "controller": evaluation.controller,
         "weather": _words(shown.weather),
+        "traffic": f"{evaluation.cars} cars and {evaluation.pedestrians} people",
         "film": _data_url("video/mp4", judged.film),
         "poster": _data_url("image/jpeg", judged.poster),
         "events": charts.told(counted(judged.painted.events)),
@@ -175,10 +176,10 @@ def _judged(judged: Judged | None) -> Fields | None:
         ],
         "rows": [
             {
-                "pattern": "the attack" if row.pattern == "attack" else "random patterns",
+                "pattern": row.pattern,
                 "weather": "all weathers" if row.weather is None else _words(row.weather),
                 "all": row.weather is None,
-                "traffic": f"{evaluation.cars} cars, {evaluation.pedestrians} people" if row.traffic else "alone",
+                "traffic": "in traffic" if row.traffic else "alone",
                 "count": row.points.count,
                 "deviation": mean_in_words(row.deviation_m, 2),
                 "lateral": mean_in_words(row.lateral_m, 2),

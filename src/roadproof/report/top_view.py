@@ -27,7 +27,7 @@ from roadproof.simulators.town.maps import load_map
 from roadproof.simulators.town.roadmap import RoadMap
 
 MARGIN_M = 6.0
-AFTER_STEPS_S = 3.0
+BEFORE_M, AFTER_S = 10.0, 3.0
 GROUND = {"sidewalk": VARIABLES["kerb"], "shoulder": VARIABLES["asphalt"], "driving": VARIABLES["asphalt"]}
 SCALE_M = 5.0
 
@@ -45,8 +45,8 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
     """
     around = _around(scenario.canvas)
     bare, driven = around(path_of(clean)), around(path_of(painted))
-    seen = passage(path_of(clean), scenario.canvas)
-    shown = slice(seen.start, seen.stop + round(AFTER_STEPS_S / clean.dt_s))
+    seen = passage(path_of(clean), scenario.canvas, horizon_m=BEFORE_M)
+    shown = slice(seen.start, seen.stop + round(AFTER_S / clean.dt_s))
     near = np.concatenate([bare[shown], driven[shown], [[0.0, 0.0]]])
     (left, low), (right, high) = near.min(0) - MARGIN_M, near.max(0) + MARGIN_M
     # Neither a slit nor a strip: people should see the lanes.
