@@ -50,3 +50,11 @@ class SimulatorError(RoadproofError, RuntimeError):
 
 class ScenarioError(RoadproofError, ValueError):
     """A scenario, its map or its route is not valid."""
+
+
+class TrainingError(RoadproofError, ValueError):
+    """Recorded drives or training settings that nothing can be learnt from."""
+
+
+class StudyError(RoadproofError, ValueError):
+    """A study's plan, or a folder with its results, is not valid."""

@@ -1,0 +1,145 @@
+"""Run folders for tests, made by the real stages on drives whose paths are known."""
+
+import dataclasses
+import json
+
+import numpy as np
+import torch
+from PIL import Image
+
+from roadproof.attacks import AttackResult, Schedule
+from roadproof.attacks.checks import Check
+from roadproof.attacks.result import Cost
+from roadproof.coverage import Shape
+from roadproof.datatypes import Event, EventKind, Weather
+from roadproof.evaluation import Evaluation
+from roadproof.evaluation.result import judge
+from roadproof.patterns import Pattern, raster
+from roadproof.report.film import Strip
+from roadproof.rollout import Ending, Episode
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.town.maps import load_map, scenario_route
+
+PATTERN = Pattern(
+    (Shape.RECTANGLE, Shape.RECTANGLE),
+    torch.tensor([[150.0, 200.0, 60.0, 340.0, 20.0], [260.0, 200.0, 40.0, 300.0, 160.0]]),
+    torch.tensor([[0.9, 0.8, 0.1], [0.1, 0.2, 0.9]]),
+)
+WEATHERS = (Weather.CLEAR_NOON, Weather.RAINY_NOON)
+DT_S = 0.05
+
+
+def driven(scenario, aside_m=0.0, *, weather=WEATHERS[0], traffic=False, seed=0, events=(), painted=False):
+    """An episode along a scenario's route, up to so many metres left of it from the canvas on."""
+    route = scenario_route(scenario, load_map(scenario.map_name))
+    canvas_m = route.locate(scenario.canvas.x_m, scenario.canvas.y_m).arclength_m
+    at = np.arange(0.0, route.length_m - 2.0, 0.35)
+    x, y = np.array([route.at(s)[:2] for s in at]).T
+    heading = np.arctan2(np.gradient(y), np.gradient(x))
+    aside = aside_m / (1 + np.exp(-(at - canvas_m) / 2))
+    steps = len(at) - 1
+    steer = 0.1 * np.sin(at / 5)[:-1] - 0.05 * aside[:-1]
+    return Episode(
+        scenario=scenario.name,
+        weather=weather,
+        painted=painted,
+        cars=20 if traffic else 0,
+        pedestrians=20 if traffic else 0,
+        seed=seed,
+        dt_s=DT_S,
+        ending=Ending.GOAL_REACHED,
+        events=tuple(events),
+        time_s=DT_S * np.arange(steps + 1),
+        x_m=x - aside * np.sin(heading),
+        y_m=y + aside * np.cos(heading),
+        z_m=np.zeros(steps + 1),
+        yaw_rad=heading,
+        speed_mps=np.full(steps + 1, 7.0),
+        command=np.full(steps + 1, 2),
+        steer=np.clip(steer, -1, 1),
+        throttle=np.full(steps, 0.4),
+        brake=np.zeros(steps),
+    )
+
+
+def write_evaluation(folder, *, aside_m=1.5, clean_events=(), events=(), scenario=None, controller="cil", runs=2):
+    """An evaluation of drives that go so far aside, in two weathers."""
+    scenario = scenario or find_scenario("left-03", builtin_scenarios())
+    trials = []
+    for weather in WEATHERS:
+        for run, traffic in [(0, False), *((run, True) for run in range(runs))]:
+            one = driven(scenario, weather=weather, traffic=traffic, seed=run, events=clean_events)
+            two = driven(
+                scenario, aside_m + 0.2 * run, weather=weather, traffic=traffic, seed=run, events=events, painted=True
+            )
+            names = [f"{weather}-{traffic}-{run}-{which}.npz" for which in ("clean", "attack")]
+            for name, episode in zip(names, (one, two), strict=True):
+                episode.save(folder / "episodes" / name)
+            trials.append(
+                judge(one, two, scenario.canvas, pattern="attack", clean_file=names[0], painted_file=names[1])
+            )
+    evaluation = Evaluation(
+        scenario=scenario,
+        controller=controller,
+        weathers=WEATHERS,
+        runs=runs,
+        cars=20,
+        pedestrians=20,
+        seed=0,
+        trials=tuple(trials),
+        simulator_calls=2 * len(trials),
+        seconds=12.5,
+    )
+    evaluation.save(folder, raster(PATTERN))
+    return evaluation
+
+
+def write_attack(folder):
+    """A search that gained."""
+    steps = np.linspace(0.0, 0.3, 20)
+    AttackResult(
+        pattern=PATTERN,
+        group="clean+left",
+        surrogate_shift=0.31,
+        by_group={"clean+right": 0.21, "clean+left": 0.31},
+        history=np.stack([np.stack([steps, 0.8 * steps], -1), np.stack([1.1 * steps, steps], -1)], 1),
+        stopped="all iterations done",
+        cost=Cost(controller_frames=4800, seconds=31.0),
+        checks=(Check("non-zero gradients", True, "0% of the parameters have no gradient"),
+                Check("better than random search", False, "random found more", "use more restarts")),
+        space=SearchSpace(figures=2),
+        schedule=Schedule.stretched(20),
+        restarts=2,
+        draws=16,
+        seed=0,
+    ).save(folder)  # fmt: skip
+
+
+def write_strip(folder):
+    """Six pairs of pictures."""
+    pictures = np.random.default_rng(0).integers(0, 255, (2, 6, 60, 80, 3), np.uint8)
+    beside = np.linspace(0.0, 1.5, 6)
+    Strip(time_s=np.arange(6.0), lateral_m=beside, clean=pictures[0], painted=pictures[1]).save(folder / "strip.npz")
+    Image.fromarray(pictures[0, 0]).resize((320, 144)).save(folder / "film.jpg")
+
+
+CRASH = (
+    Event(EventKind.WRONG_LANE, 5.0, "1.2 m beside its lane"),
+    Event(EventKind.COLLISION_STATIC, 6.0, "tree 7"),
+)
+
+
+def write_run(folder, **options):
+    """A whole run but for recordings and film."""
+    write_attack(folder / "attack")
+    evaluation = write_evaluation(folder / "evaluation", **options)
+    write_strip(folder / "evaluation")
+    clean = driven(evaluation.scenario)
+    for name in ("clean", "left", "right"):
+        dataclasses.replace(clean, seed=1).save(folder / "record" / name / "episode.npz")
+    return evaluation
+
+
+def read_result(folder):
+    return json.loads((folder / "result.json").read_text())
