@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -122,6 +123,18 @@ def write_strip(folder):
     beside = np.linspace(0.0, 1.5, 6)
     Strip(time_s=np.arange(6.0), lateral_m=beside, clean=pictures[0], painted=pictures[1]).save(folder / "strip.npz")
     Image.fromarray(pictures[0, 0]).resize((320, 144)).save(folder / "film.jpg")
+
+
+def write_film(folder):
+    """A film of one second and a bit."""
+    av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
+    pages = np.random.default_rng(0).integers(0, 255, (3, 9, 20, 3), np.uint8).repeat(8, 0).repeat(64, 1).repeat(64, 2)
+    with av.open(str(folder / "film.mp4"), "w", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 1280, 576, "yuv420p"
+        for page in pages:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(page, "rgb24")))
+        container.mux(stream.encode())
 
 
 CRASH = (
