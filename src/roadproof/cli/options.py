@@ -11,7 +11,7 @@ from roadproof.errors import RoadproofError
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.rollout import Policy
-    from roadproof.simulators.town.simulator import TownSimulator
+    from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
 
@@ -30,19 +30,19 @@ def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:
     raise RoadproofError(f"--{option} is {value!r}, expected one of {', '.join(allowed)}{hint}")
 
 
-def driver_of(spec: str, device: str) -> Controller | Callable[[TownSimulator], Policy]:
+def driver_of(spec: str, device: str) -> Controller | Callable[[MappedSimulator], Policy]:
     """The expert, or the controller of a spec.
 
     Raises:
         ControllerError: it is neither, or cannot be loaded.
     """
-    from roadproof.controllers import load_controller
+    from roadproof.controllers import load_controller, shipped_names
     from roadproof.controllers.loading import SPECS
     from roadproof.errors import ControllerError
     from roadproof.training.expert import expert
 
     if spec == "expert":
         return expert
-    if spec.isidentifier():
-        raise ControllerError(f"--driver is {spec!r}, expected expert or a controller: {SPECS}")
+    if spec.isidentifier() and spec not in shipped_names():
+        raise ControllerError(f"--controller is {spec!r}, expected expert or a controller: {SPECS}")
     return load_controller(spec, device=device)
