@@ -1,6 +1,5 @@
 """Run folders for tests, made by the real stages on drives whose paths are known."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -13,9 +12,13 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
 from roadproof.coverage import Shape
 from roadproof.datatypes import Event, EventKind, Weather
+from roadproof.drives import Drive, Trajectories, Window
+from roadproof.drives.drives import Settings, write_drive, write_settings
 from roadproof.evaluation import Evaluation
 from roadproof.evaluation.result import judge
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
+from roadproof.recordings import Push
 from roadproof.report.film import Strip
 from roadproof.rollout import Ending, Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario
@@ -148,10 +151,40 @@ def write_run(folder, **options):
     write_attack(folder / "attack")
     evaluation = write_evaluation(folder / "evaluation", **options)
     write_strip(folder / "evaluation")
-    clean = driven(evaluation.scenario)
-    for name in ("clean", "left", "right"):
-        dataclasses.replace(clean, seed=1).save(folder / "record" / name / "episode.npz")
+    write_record(folder / "record", evaluation.scenario)
     return evaluation
+
+
+def write_record(folder, scenario):
+    """Three recorded drives, of which one had to be tried twice."""
+    settings = Settings(
+        scenario=scenario,
+        weather=WEATHERS[0],
+        trajectories=Trajectories(),
+        window=Window(),
+        seed=0,
+        driver="cil",
+        camera=CIL_CAMERA,
+        view=CIL_INPUT,
+        dt_s=DT_S,
+    )
+    write_settings(settings, folder)
+    steps = np.arange(40, 60, 5)
+    for name, right_m, calls in (("clean", 0.0, 1), ("right", 1.5, 2), ("left", -1.4, 1)):
+        write_drive(
+            Drive(
+                name=name,
+                push=Push(name),
+                episode=driven(scenario, -right_m),
+                frame_number=steps,
+                frames=np.zeros((4, 88, 200, 3), np.uint8),
+                steer=np.zeros(4),
+                right_m=np.full(4, right_m),
+                calls=calls,
+                note="perturbed less than asked" if calls > 1 else "",
+            ),
+            folder,
+        )
 
 
 def read_result(folder):

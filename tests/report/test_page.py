@@ -62,6 +62,8 @@ def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
         "rainy noon",
         "20 cars and 20 people",
         "use more restarts",
+        "perturbed less than asked",
+        "1.40 m left",
     ):
         assert words in text
     assert "#e5cc1a" in text, "the paint's own colour"
@@ -74,6 +76,8 @@ def test_the_numbers_shown_are_those_of_the_evaluation(run):
         trial.deviation_m for trial in evaluation.trials
     ]
     assert content["surrogate"]["shift"] == 0.31
+    calls = {each["stage"]: each["simulator_calls"] for each in content["cost"]}
+    assert calls == {"record": 4, "attack": 0, "evaluate": 12}
     assert not {"shift", "by_group"} & set(content["closed_loop"])
     text = Page((folder / "report.html").read_text()).text
     for row in evaluation.rows():

@@ -105,7 +105,7 @@ def _name(run: Run) -> str:
     if run.judged is not None:
         return run.judged.evaluation.scenario.name
     if run.drives:
-        return next(iter(run.drives.values())).scenario
+        return run.drives.settings.scenario.name
     return run.folder.resolve().name
 
 
@@ -168,7 +168,7 @@ def _judged(judged: Judged | None) -> Fields | None:
         else [
             {
                 "time": f"{strip.time_s[k]:.1f} s",
-                "beside": f"{abs(strip.lateral_m[k]):.2f} m {'left' if strip.lateral_m[k] > 0 else 'right'}",
+                "beside": _aside(float(strip.lateral_m[k])),
                 "clean": _picture(strip.clean[k]),
                 "painted": _picture(strip.painted[k]),
             }
@@ -281,18 +281,19 @@ def _fidelity(judged: Judged | None) -> Fields | None:
 def _recorded(run: Run) -> Fields | None:
     if run.drives is None and run.recordings is None:
         return None
-    pushes = {} if run.recordings is None else {each.name: each for each in run.recordings.recordings}
-    names: list[str] = [*(run.drives or {}), *(name for name in pushes if name not in (run.drives or {}))]
+    drives = {} if run.drives is None else {each.name: each for each in run.drives.drives}
+    calibrated = {} if run.recordings is None else {each.name: each for each in run.recordings.recordings}
     rows: list[Fields] = []
-    for name in names:
-        episode, recording = (run.drives or {}).get(name), pushes.get(name)
+    for name in [*drives, *(name for name in calibrated if name not in drives)]:
+        drive, recording = drives.get(name), calibrated.get(name)
+        kept = recording or drive
         rows.append(
             {
                 "name": name,
-                "push": MISSING if recording is None else str(recording.push),
-                "frames": MISSING if recording is None else str(len(recording.frames)),
-                "seconds": MISSING if episode is None else f"{episode.time_s[-1]:.1f}",
-                "ending": MISSING if episode is None else str(episode.ending),
+                "push": MISSING if kept is None else str(kept.push),
+                "frames": MISSING if kept is None else str(len(kept.frames)),
+                "aside": MISSING if drive is None else _aside(-drive.deviation_m),
+                "note": "" if drive is None else drive.note,
             }
         )
     return {"rows": rows, "origin": "" if run.recordings is None else run.recordings.origin}
@@ -335,7 +336,7 @@ def _costs(run: Run) -> list[Fields]:
     """Simulator calls and seconds of each stage; None where the stage did not note them."""
     costs: list[Fields] = []
     if run.drives is not None:
-        costs.append({"stage": "record", "simulator_calls": len(run.drives), "seconds": None, "frames": None})
+        costs.append({"stage": "record", "simulator_calls": run.drives.calls, "seconds": None, "frames": None})
     if run.calibration is not None:
         calls, seconds = (run.calibration.get(key) for key in ("simulator_calls", "seconds"))
         costs.append({"stage": "calibrate", "simulator_calls": calls, "seconds": seconds, "frames": None})
@@ -355,6 +356,10 @@ def _costs(run: Run) -> list[Fields]:
             }
         )
     return costs
+
+
+def _aside(left_m: float) -> str:
+    return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "0"
 
 
 def _words(weather: str) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 
 from roadproof.attacks import AttackResult
 from roadproof.datatypes import Weather
+from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Trial
 from roadproof.evaluation.result import load_paint
@@ -63,7 +64,7 @@ class Run:
 
     Args:
         folder: the run.
-        drives: recorded drives by name.
+        drives: as recorded.
         recordings: the calibrated set.
         calibration: what the calibration says of itself.
         attack: the attack's result.
@@ -72,7 +73,7 @@ class Run:
     """
 
     folder: Path
-    drives: dict[str, Episode] | None
+    drives: Drives | None
     recordings: RecordingSet | None
     calibration: dict[str, Any] | None
     attack: AttackResult | None
@@ -90,7 +91,7 @@ def read_run(folder: Path) -> Run:
         raise RoadproofError(f"no folder {folder}; expected a run with record, recordings, attack or evaluation in it")
     run = Run(
         folder=folder,
-        drives=_drives(folder / "record"),
+        drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
         calibration=_calibration(folder / "recordings" / "calibration.json"),
         attack=AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None,
@@ -102,11 +103,6 @@ def read_run(folder: Path) -> Run:
             f"{folder} has neither record, recordings, attack nor evaluation in it; nothing to report yet"
         )
     return run
-
-
-def _drives(folder: Path) -> dict[str, Episode] | None:
-    files = sorted(folder.glob("*/episode.npz"), key=lambda path: (path.parent.name != "clean", path.parent.name))
-    return {path.parent.name: Episode.load(path) for path in files} or None
 
 
 def _calibration(path: Path) -> dict[str, Any] | None:
