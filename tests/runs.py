@@ -10,6 +10,7 @@ from PIL import Image
 from roadproof.attacks import AttackResult, Schedule
 from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
+from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
 from roadproof.coverage import Shape
 from roadproof.datatypes import Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window
@@ -18,12 +19,13 @@ from roadproof.evaluation import Evaluation
 from roadproof.evaluation.result import judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
-from roadproof.recordings import Push
+from roadproof.recordings import Push, save_recordings
 from roadproof.report.film import Strip
 from roadproof.rollout import Ending, Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.maps import load_map, scenario_route
+from scenes import recording_set
 
 PATTERN = Pattern(
     (Shape.RECTANGLE, Shape.RECTANGLE),
@@ -115,7 +117,6 @@ def write_attack(folder):
         space=SearchSpace(figures=2),
         schedule=Schedule.stretched(20),
         restarts=2,
-        draws=16,
         seed=0,
     ).save(folder)  # fmt: skip
 
@@ -147,12 +148,27 @@ CRASH = (
 
 
 def write_run(folder, **options):
-    """A whole run but for recordings and film."""
+    """A whole run but for the film."""
     write_attack(folder / "attack")
     evaluation = write_evaluation(folder / "evaluation", **options)
     write_strip(folder / "evaluation")
     write_record(folder / "record", evaluation.scenario)
+    save_recordings(recording_set(frames=3), folder / "recordings")
+    write_calibration(folder / "calibration")
     return evaluation
+
+
+def write_calibration(folder):
+    """One good calibration."""
+    drives = tuple(
+        DriveReport(
+            name=name, frames=4, dropped=((45, "too few points"),), residual_px=Spread(0.2, 0.4), stated_px=None
+        )
+        for name in ("clean", "right", "left")
+    )
+    CalibrationReport(method="two-paint", drives=drives, colour_residual=None, calls=10, seconds=4.0).save(
+        folder / "report.json"
+    )
 
 
 def write_record(folder, scenario):

@@ -64,6 +64,8 @@ def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
         "use more restarts",
         "perturbed less than asked",
         "1.40 m left",
+        "45: too few points",
+        "0.21 (0.43)",
     ):
         assert words in text
     assert "#e5cc1a" in text, "the paint's own colour"
@@ -77,7 +79,7 @@ def test_the_numbers_shown_are_those_of_the_evaluation(run):
     ]
     assert content["surrogate"]["shift"] == 0.31
     calls = {each["stage"]: each["simulator_calls"] for each in content["cost"]}
-    assert calls == {"record": 4, "attack": 0, "evaluate": 12}
+    assert calls == {"record": 4, "calibrate": 6, "attack": 0, "evaluate": 12}
     assert not {"shift", "by_group"} & set(content["closed_loop"])
     text = Page((folder / "report.html").read_text()).text
     for row in evaluation.rows():

@@ -17,6 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
 import roadproof
+from roadproof.calibration.report import Spread
 from roadproof.files import write_atomically
 from roadproof.metrics import counted
 from roadproof.patterns import Pattern, raster
@@ -98,7 +99,8 @@ def result_of(run: Run) -> Fields:
         surrogate |= {"shift": run.attack.surrogate_shift, "by_group": run.attack.by_group}
     if run.judged is not None and run.judged.fidelity is not None:
         surrogate |= {"agreement": asdict(run.judged.fidelity.agreement)}
-    return content | {"surrogate": surrogate or None, "calibration": run.calibration, "cost": _costs(run)}
+    calibration = None if run.calibration is None else asdict(run.calibration)
+    return content | {"surrogate": surrogate or None, "calibration": calibration, "cost": _costs(run)}
 
 
 def _name(run: Run) -> str:
@@ -303,33 +305,29 @@ def _calibration(run: Run) -> Fields | None:
     if run.recordings is None:
         return None
     maps = sum(each.maps is not None for each in run.recordings.recordings)
-    response = type(run.recordings.colour.response).__name__.removesuffix("Response").lower() or "unknown"
-    facts = [
-        ("colour model", response),
-        ("drives with gain and offset of every pixel", f"{maps} of {len(run.recordings.recordings)}"),
-    ]
-    return {"facts": facts + [(key.replace("_", " "), _fact(value)) for key, value in _leaves(run.calibration or {})]}
+    facts = [("drives with gain and offset of every pixel", f"{maps} of {len(run.recordings.recordings)}")]
+    report = run.calibration
+    if report is None:
+        return {"facts": facts, "drives": []}
+    colour = MISSING if report.colour_residual is None else f"{report.colour_residual:.1f} of 255 levels"
+    facts = [("method", report.method), ("colours fit within", colour), *facts]
+    return {
+        "facts": facts,
+        "drives": [
+            {
+                "name": drive.name,
+                "frames": drive.frames,
+                "residual": _spread(drive.residual_px),
+                "stated": _spread(drive.stated_px),
+                "dropped": "; ".join(f"{number}: {reason}" for number, reason in drive.dropped) or "none",
+            }
+            for drive in report.drives
+        ],
+    }
 
 
-def _leaves(content: Fields, prefix: str = "") -> list[tuple[str, object]]:
-    """What a calibration says of itself, flattened; format and version are of no interest here."""
-    found: list[tuple[str, object]] = []
-    for key, value in content.items():
-        if key in ("format", "version", "units"):
-            continue
-        if isinstance(value, dict):
-            found += _leaves(value, f"{prefix}{key}: ")  # pyright: ignore[reportUnknownArgumentType]
-        else:
-            found.append((f"{prefix}{key}", value))
-    return found
-
-
-def _fact(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, list):
-        return ", ".join(map(_fact, value)) or "none"  # pyright: ignore[reportUnknownArgumentType]
-    return MISSING if value is None else str(value)
+def _spread(spread: Spread | None) -> str:
+    return MISSING if spread is None else f"{spread.mean:.2f} ({spread.p95:.2f})"
 
 
 def _costs(run: Run) -> list[Fields]:
@@ -338,8 +336,11 @@ def _costs(run: Run) -> list[Fields]:
     if run.drives is not None:
         costs.append({"stage": "record", "simulator_calls": run.drives.calls, "seconds": None, "frames": None})
     if run.calibration is not None:
-        calls, seconds = (run.calibration.get(key) for key in ("simulator_calls", "seconds"))
-        costs.append({"stage": "calibrate", "simulator_calls": calls, "seconds": seconds, "frames": None})
+        # Its own count includes recording.
+        calls = run.calibration.calls - (0 if run.drives is None else run.drives.calls)
+        costs.append(
+            {"stage": "calibrate", "simulator_calls": calls, "seconds": run.calibration.seconds, "frames": None}
+        )
     if run.attack is not None:
         cost = run.attack.cost
         costs.append(

@@ -9,15 +9,14 @@ RUN/commands.txt               optional: the commands that made it, one a line
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 
 from roadproof.attacks import AttackResult
+from roadproof.calibration.report import CalibrationReport, load_report
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
@@ -75,7 +74,7 @@ class Run:
     folder: Path
     drives: Drives | None
     recordings: RecordingSet | None
-    calibration: dict[str, Any] | None
+    calibration: CalibrationReport | None
     attack: AttackResult | None
     judged: Judged | None
     commands: tuple[str, ...]
@@ -93,7 +92,7 @@ def read_run(folder: Path) -> Run:
         folder=folder,
         drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
-        calibration=_calibration(folder / "recordings" / "calibration.json"),
+        calibration=load_report(report) if (report := folder / "calibration" / "report.json").exists() else None,
         attack=AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None,
         judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,
         commands=_commands(folder / "commands.txt"),
@@ -103,16 +102,6 @@ def read_run(folder: Path) -> Run:
             f"{folder} has neither record, recordings, attack nor evaluation in it; nothing to report yet"
         )
     return run
-
-
-def _calibration(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
-        return None
-    try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RoadproofError(f"{path} cannot be read ({error}); calibrate again") from None
-    return cast("dict[str, Any]", content) if isinstance(content, dict) else None
 
 
 def _commands(path: Path) -> tuple[str, ...]:
