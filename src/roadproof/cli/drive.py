@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from roadproof.controllers import Controller
     from roadproof.datatypes import Control, Observation
     from roadproof.report.video import DriveVideo
-    from roadproof.rollout import Episode, OnStep, Policy
+    from roadproof.rollout import Episode, OnStep
     from roadproof.simulators.loading import MappedSimulator
 
 
@@ -25,8 +24,10 @@ def drive(
     driver: Annotated[
         str,
         typer.Option(
-            help="expert, or a controller: a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
-            "module:factory."
+            "--controller",
+            "--driver",
+            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
+            "file, cil:FILE, pilotnet:FILE or module:factory.",
         ),
     ] = "expert",
     weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
@@ -43,7 +44,7 @@ def drive(
 ) -> None:
     """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice
+    from roadproof.cli.options import choice, driver_of
     from roadproof.datatypes import Weather
     from roadproof.files import check_writable
     from roadproof.patterns import read_paint
@@ -56,7 +57,7 @@ def drive(
     sky = Weather(choice(weather, "weather", tuple(Weather)))
     paint = None if pattern is None else read_paint(pattern)
     check_writable(out)
-    who = _driver(driver, device)
+    who = driver_of(driver, device)
 
     # PyAV is an extra.
     from roadproof.report.video import DriveVideo
@@ -85,20 +86,6 @@ def drive(
         )
     episode.save(out / "episode.npz")
     _summarise(episode, out)
-
-
-def _driver(spec: str, device: str) -> Controller | Callable[[MappedSimulator], Policy]:
-    """The expert, or the controller of a spec."""
-    from roadproof.controllers import load_controller
-    from roadproof.controllers.loading import SPECS
-    from roadproof.errors import ControllerError
-    from roadproof.training.expert import expert
-
-    if spec == "expert":
-        return expert
-    if spec.isidentifier():
-        raise ControllerError(f"--driver is {spec!r}, expected expert or a controller: {SPECS}")
-    return load_controller(spec, device=device)
 
 
 @contextmanager

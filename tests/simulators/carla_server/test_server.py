@@ -17,14 +17,20 @@ pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]"
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 
 PATIENCE_S = 60.0
+LISTENING = []
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory):
-    with serving("--map", straight_map(tmp_path_factory.mktemp("maps"))) as (_, port):
-        connected = carla.Client("127.0.0.1", port, worker_threads=1)
-        connected.set_timeout(PATIENCE_S)
-        yield connected
+def port(tmp_path_factory):
+    with serving("--map", straight_map(tmp_path_factory.mktemp("maps"))) as (_, opened):
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def client(port):
+    connected = carla.Client("127.0.0.1", port, worker_threads=1)
+    connected.set_timeout(PATIENCE_S)
+    return connected
 
 
 @pytest.fixture
@@ -37,10 +43,14 @@ def world(client):
     found.apply_settings(settings)
     yield found
     found.tick()  # only then are actors listed that were spawned last
+    # By the objects that listen: the client ends with the process if others are destroyed in their place.
+    for made in LISTENING:
+        made.stop()
+        made.destroy()
+    LISTENING.clear()
     for actor in found.get_actors():
-        if actor.type_id.startswith("sensor") and actor.is_listening:
-            actor.stop()
-        actor.destroy()
+        if not actor.type_id.startswith("sensor"):
+            actor.destroy()
     found.tick()
     assert list(found.get_actors()) == []
     found.apply_settings(before)
@@ -60,6 +70,7 @@ def sensor(world, parent, name, place=None, **attributes):
     # Kept with the queue: a sensor that goes out of scope stops listening.
     seen.sensor = world.spawn_actor(blueprint, place or carla.Transform(), attach_to=parent)
     seen.sensor.listen(seen.put)
+    LISTENING.append(seen.sensor)
     return seen
 
 
@@ -310,3 +321,45 @@ def test_depth_and_kinds_of_things_fit_the_picture(world):
     assert np.median(depth[vehicle]) == pytest.approx(back, abs=0.3)
     assert (labels[:5] == int(carla.CityObjectLabel.Sky)).mean() > 0.5
     assert depth[0, 80] > 999
+
+
+TRAFFIC = """
+import socket, sys
+import carla
+client = carla.Client("127.0.0.1", int(sys.argv[1]), worker_threads=1)
+client.set_timeout(60.0)
+world = client.get_world()
+found = world.get_settings()
+settings = world.get_settings()
+settings.synchronous_mode, settings.fixed_delta_seconds = True, 0.05
+world.apply_settings(settings)
+with socket.socket() as free:
+    free.bind(("", 0))
+    port = free.getsockname()[1]
+manager = client.get_trafficmanager(port)
+manager.set_synchronous_mode(True)
+manager.set_random_device_seed(7)
+command, blueprint = carla.command, world.get_blueprint_library().find("vehicle.tesla.model3")
+places = [carla.Transform(carla.Location(x, 1.75, 0.3)) for x in (20.0, 50.0)]
+pilot = command.SetAutopilot(command.FutureActor, True, port)
+ids = [a.actor_id for a in client.apply_batch_sync([command.SpawnActor(blueprint, p).then(pilot) for p in places], True)]
+for _ in range(60):
+    world.tick()
+for car in world.get_actors(ids):
+    print("car", car.get_location().x, car.get_location().y, car.get_velocity().length())
+client.apply_batch_sync([command.DestroyActor(i) for i in ids], True)
+manager.set_synchronous_mode(False)
+world.apply_settings(found)
+"""
+
+
+def test_carlas_own_traffic_manager_drives_cars(port):
+    # In a process of its own: the manager's threads live until its end.
+    told = subprocess.run([sys.executable, "-c", TRAFFIC, str(port)], capture_output=True, text=True, timeout=120)
+    assert told.returncode == 0, told.stderr
+    cars = [[float(v) for v in line.split()[1:]] for line in told.stdout.splitlines() if line.startswith("car")]
+    assert len(cars) == 2
+    for start, (x, y, speed) in zip((20.0, 50.0), cars, strict=True):
+        assert x > start + 5.0
+        assert abs(y - 1.75) < 0.3
+        assert 3.0 < speed < 12.0

@@ -89,13 +89,17 @@ class Session:
         """Take a step; its frame."""
         return self.ask("a tick", self.world.tick)
 
+    def map_name(self) -> str:
+        """The name of the map that is loaded, without its path."""
+        return Path(self.ask("its map", self.world.get_map).name).name
+
     def road_map(self, name: str) -> RoadMap:
         """The map of this name, loaded if another one is; read from the server's own OpenDRIVE.
 
         Raises:
             ScenarioError: the server has no such map, or it cannot be read.
         """
-        if Path(self.ask("its map", self.world.get_map).name).name != name:
+        if self.map_name() != name:
             self._load(name)
         if name not in self._maps:
             text = self.ask("its map", self.world.get_map).to_opendrive()
@@ -170,7 +174,7 @@ class Session:
 
     def _check_version(self) -> None:
         own = importlib.metadata.version("carla")
-        theirs = self.ask("its version", self.client.get_server_version)
+        theirs = self.version = self.ask("its version", self.client.get_server_version)
         if theirs.split("-")[0].split(".")[:3] != own.split("-")[0].split(".")[:3]:
             raise SimulatorError(
                 f"the CARLA server at {self.where} is version {theirs}, its client here is {own}; install the "

@@ -18,9 +18,10 @@ from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.actors import Crowd, carla_transform, spawn_driven, vehicle_state
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.collisions import Collisions
-from roadproof.simulators.carla.inject import painted
+from roadproof.simulators.carla.inject import Scene, painted
 from roadproof.simulators.carla.session import Session, carla
-from roadproof.simulators.carla.views import image_from_world, levels, scene
+from roadproof.simulators.carla.views import image_from_world, levels
+from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import carla_weather
 from roadproof.simulators.protocol import PatternImage
 from roadproof.simulators.town.agents import NOBODY, Agents
@@ -50,6 +51,7 @@ class _Drive:
     full_pictures: bool
     state: VehicleState
     image_from_canvas: Homography = field(default_factory=lambda: np.eye(3))
+    images: dict[str, carla.Image] = field(default_factory=dict[str, carla.Image])
     steps: int = 0
     arclength_m: float = 0.0
 
@@ -144,6 +146,33 @@ class CarlaSimulator:
         crowd = self._running().crowd
         return NOBODY if crowd is None else crowd.traffic.pedestrians
 
+    @property
+    def where(self) -> str:
+        """HOST:PORT of the server."""
+        return f"{self._host}:{self._port}"
+
+    @property
+    def session(self) -> Session:
+        """The connection.
+
+        Raises:
+            SimulatorError: there is none.
+        """
+        if self._session is None:
+            raise SimulatorError("the simulator is closed; use it in a with-block")
+        return self._session
+
+    def scene(self) -> Scene:
+        """What the cameras saw last, before paint.
+
+        Raises:
+            SimulatorError: there was no reset with a pattern, so that there is but one camera.
+        """
+        drive = self._running()
+        if drive.pattern is None:
+            raise SimulatorError("depth and kinds are seen in drives with a pattern only; reset with one")
+        return seen_by(self._camera, drive.images, drive.scenario.canvas.z_m)
+
     def road_map(self, name: str) -> RoadMap:
         """The map a scenario names, loaded on the server.
 
@@ -151,7 +180,7 @@ class CarlaSimulator:
             SimulatorError: the server does not answer.
             ScenarioError: it has no such map.
         """
-        return self._connected().road_map(name)
+        return self.session.road_map(name)
 
     def __enter__(self) -> CarlaSimulator:
         self._session = Session(
@@ -185,7 +214,7 @@ class CarlaSimulator:
                 fit.
             ScenarioError: the scenario does not fit the server's map.
         """
-        session = self._connected()
+        session = self.session
         weather = Weather(weather)
         _check_pattern(pattern)
         roads = session.road_map(scenario.map_name)
@@ -217,7 +246,7 @@ class CarlaSimulator:
         Raises:
             SimulatorError: there was no reset, or the server does not answer in time.
         """
-        session, drive = self._connected(), self._running()
+        session, drive = self.session, self._running()
         if drive.crowd is not None:
             drive.crowd.traffic.step(self._dt_s, drive.state)
         self._order(session, drive.ego, control.clipped(), drive.crowd)
@@ -232,11 +261,6 @@ class CarlaSimulator:
             SimulatorError: there was no reset.
         """
         return self._running().image_from_canvas
-
-    def _connected(self) -> Session:
-        if self._session is None:
-            raise SimulatorError("the simulator is closed; use it in a with-block")
-        return self._session
 
     def _running(self) -> _Drive:
         if self._drive is None:
@@ -268,8 +292,8 @@ class CarlaSimulator:
         return session.tick()
 
     def _observe(self, drive: _Drive, frame: int) -> Observation:
-        session = self._connected()
-        images = {kind: camera.picture(frame) for kind, camera in drive.cameras.items()}
+        session = self.session
+        images = drive.images = {kind: camera.picture(frame) for kind, camera in drive.cameras.items()}
         snapshot = session.world.get_snapshot()
         if snapshot.frame != frame:
             raise SimulatorError(
@@ -277,11 +301,12 @@ class CarlaSimulator:
                 "other client ticks it"
             )
         state = drive.state = vehicle_state(snapshot.find(drive.ego.id))
-        canvas = drive.scenario.canvas
-        drive.image_from_canvas = image_from_world(self._camera, images["rgb"]) @ canvas.world_from_canvas
+        drive.image_from_canvas = (
+            image_from_world(self._camera, images["rgb"]) @ drive.scenario.canvas.world_from_canvas
+        )
         picture = levels(images["rgb"])
         if drive.pattern is not None:
-            picture = painted(scene(self._camera, images, canvas.z_m), drive.image_from_canvas, drive.pattern)
+            picture = painted(self.scene(), drive.image_from_canvas, drive.pattern)
         time_s = drive.steps * self._dt_s
         place = drive.route.locate(state.x_m, state.y_m, drive.arclength_m if drive.steps else None)
         drive.arclength_m = place.arclength_m

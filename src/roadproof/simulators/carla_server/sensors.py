@@ -12,10 +12,9 @@ from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
 from roadproof.simulators.carla_server import wire
 from roadproof.simulators.carla_server.actors import Actor, attached
-from roadproof.simulators.carla_server.world import Collision, Town, World
+from roadproof.simulators.carla_server.world import Collision, World
+from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.labels import FAR_M, Label
-from roadproof.simulators.town.renderer import Actor as Drawn
-from roadproof.simulators.town.roadmap import Surface
 
 MAX_SIDE_PX = 4096
 MAX_ROLL_DEG = 0.1
@@ -68,13 +67,13 @@ def picture_message(world: World, sensor: Actor) -> bytes:
     width, height, fov = _optics(sensor)
     camera = CameraModel(width_px=width, height_px=height, fov_deg=fov, up_m=0.0, pitch_deg=pitch)
     eye = VehicleState(x, -y, z, -math.radians(yaw), 0.0)
-    drawn = _drawn(world, world.town, sensor.parent)
+    cars, people = (_agents(world, kind, sensor.parent) for kind in ("vehicle", "walker"))
     if sensor.name == "sensor.camera.rgb":
-        world.town.renderer.set_actors(drawn)
+        world.town.renderer.set_agents(cars, people)
         rgb = world.town.renderer.view(camera, eye, world.frame)
     else:
         scene = world.town.labels()
-        scene.set_actors(drawn)
+        scene.set_agents(cars, people)
         seen = scene.look(camera, eye)
         rgb = depth_levels(seen.depth_m) if sensor.name == "sensor.camera.depth" else label_levels(seen.labels)
     return wire.image(wire.header(wire.IMAGE, world.frame, world.time_s, pose), _bgra(rgb), fov)
@@ -120,26 +119,18 @@ def world_message(world: World, clock_s: float, *, changed: bool = False) -> byt
     )
 
 
-def _drawn(world: World, town: Town, without: int) -> list[Drawn]:
-    """Everyone as the renderer draws them, but for the one who carries the camera."""
-    drawn: list[Drawn] = []
-    for actor in world.actors.values():
-        if actor.kind == "sensor" or actor.id == without:
-            continue
-        state, person = actor.state, actor.kind == "walker"
-        raised = person and town.roads.surface_at(np.array([(state.x_m, state.y_m)]))[0] == Surface.SIDEWALK
-        drawn.append(
-            Drawn(
-                person=person,
-                look=actor.look,
-                x_m=state.x_m,
-                y_m=state.y_m,
-                yaw_rad=state.yaw_rad,
-                raised=bool(raised),
-                walked_m=actor.walked_m,
-            )
-        )
-    return drawn
+def _agents(world: World, kind: str, without: int) -> Agents:
+    """All actors of a kind as the town draws them, but for the one who carries the camera."""
+    chosen = [actor for actor in world.actors.values() if actor.kind == kind and actor.id != without]
+    states = [actor.state for actor in chosen]
+    return Agents(
+        x_m=np.array([state.x_m for state in states], float),
+        y_m=np.array([state.y_m for state in states], float),
+        yaw_rad=np.array([state.yaw_rad for state in states], float),
+        speed_mps=np.array([state.speed_mps for state in states], float),
+        travelled_m=np.array([actor.walked_m for actor in chosen], float),
+        look=np.array([actor.look for actor in chosen], np.int64),
+    )
 
 
 def _bgra(rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 4"]:

@@ -100,6 +100,7 @@ class World:
         self.town: Town | None = None
         self._next_actor, self._next_stream = 100, 2
         self._physics: dict[int, Physics] = {}
+        self._crowd: dict[int, int] = {}
 
     @property
     def dt_s(self) -> float:
@@ -269,8 +270,11 @@ class World:
         physics = self._physics.get(vehicle.id)
         if physics is None:
             physics = self._physics[vehicle.id] = Physics(self.town.scenery.solids, vehicle.state, others)
+        elif self._crowd.get(vehicle.id) != len(others):
+            physics.replace_cars(others)
         else:
-            physics.move_cars(others)
+            physics.move_cars(np.array([(pose.x_m, pose.y_m, pose.yaw_rad) for pose in others]).reshape(-1, 3))
+        self._crowd[vehicle.id] = len(others)
         throttle, steer, brake, hand, reverse = vehicle.control[:5]
         push = -float(throttle) if reverse else float(throttle)
         physics.step(Control(float(steer), push, 1.0 if hand else float(brake)), self.dt_s)

@@ -7,7 +7,6 @@ pixel give the depth in closed form; what no triangle covers is the ground (z = 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -19,6 +18,8 @@ from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
 from roadproof.simulators.town import textures
+from roadproof.simulators.town.agent_nodes import PERSON_LOOKS, STEPS_M, STRIDE_OF_STEP, STRIDES
+from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.air import dome
 from roadproof.simulators.town.engine import (
     VERTEX,
@@ -34,10 +35,10 @@ from roadproof.simulators.town.engine import (
 from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
 from roadproof.simulators.town.models import PAINTS, Body, car, person
-from roadproof.simulators.town.renderer import CULL_M, PERSON_LOOKS, STRIDES, Actor, whole
+from roadproof.simulators.town.renderer import CULL_M, whole
 from roadproof.simulators.town.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.town.scenery import TREES, Scenery
-from roadproof.simulators.town.streets import build_streets
+from roadproof.simulators.town.streets import KERB_M, build_streets
 
 # Six bits of the number in each channel, in the middle of four levels: rounding does not reach the next number.
 BITS = 6
@@ -45,6 +46,7 @@ MAX_FACES = 2 ** (3 * BITS) - 1
 FAR_M = 1000.0
 PLAN_PIXEL_M, MAX_PLAN_PX = 0.1, 8192
 GROUND_M, GROUND_PIECE_M = 120.0, 30.0
+PLACE = ("x_m", "y_m", "yaw_rad")
 
 
 class Label(IntEnum):
@@ -98,7 +100,7 @@ class LabelScene:
     """The town as numbered faces, beside its picture in the `Renderer`."""
 
     def __init__(self, roads: RoadMap, scenery: Scenery) -> None:
-        self._plan = _Plan(roads)
+        self._roads, self._plan = roads, _Plan(roads)
         self._pipe = make_pipe()
         self._root = core.NodePath("labels")
         self._screens: dict[CameraModel, Screen] = {}
@@ -122,7 +124,7 @@ class LabelScene:
         self._ground = self._root.attach_new_node(_numbered(_around(), 0))
         dress(self._ground, Layer.GROUND)
         self._still = self._count
-        self._actors: list[_Moving] = []
+        self._moving: list[_Moving] = []
 
     def close(self) -> None:
         """Give everything back."""
@@ -131,38 +133,45 @@ class LabelScene:
         self._screens.clear()
         self._root.remove_node()
 
-    def set_actors(self, actors: Sequence[Actor]) -> None:
-        """Replace all cars and people; afterwards `move_actors` moves as many."""
-        for moving in self._actors:
+    def set_agents(self, cars: Agents, people: Agents) -> None:
+        """Replace all cars and people; afterwards `move_agents` moves as many."""
+        for moving in self._moving:
             moving.path.remove_node()
-        self._actors.clear()
+        self._moving.clear()
         self._cut(self._still)
-        for actor in actors:
-            meshes = _shapes(actor)
-            first, most = self._count, max(len(mesh.triangles) for mesh in meshes)
-            shapes = [(_numbered(mesh, first), _planes(mesh)) for mesh in meshes]
-            self._number(np.zeros((most, 4)), Label.PEDESTRIAN if actor.person else Label.VEHICLE)
-            path = self._root.attach_new_node(core.PandaNode("actor"))
-            dress(path, Layer.SOLID)
-            self._actors.append(_Moving(path, shapes, first))
-        self.move_actors(actors)
+        for agents, label in ((cars, Label.VEHICLE), (people, Label.PEDESTRIAN)):
+            for look in agents.look.tolist():
+                meshes = _shapes(look, label)
+                shapes = [(_numbered(mesh, self._count), _planes(mesh)) for mesh in meshes]
+                path = self._root.attach_new_node(core.PandaNode("agent"))
+                dress(path, Layer.SOLID)
+                self._moving.append(_Moving(path, shapes, self._count))
+                self._number(np.zeros((max(len(mesh.triangles) for mesh in meshes), 4)), label)
+        self.move_agents(cars, people)
 
-    def move_actors(self, actors: Sequence[Actor]) -> None:
-        """Put the cars and people of `set_actors` where they are now."""
-        planes = self._all_planes()
-        for moving, actor in zip(self._actors, actors, strict=True):
-            shape = actor.stride if actor.person else 0
-            node, local = moving.shapes[shape]
-            if shape != moving.shown:
-                moving.path.node().remove_all_children()
-                moving.path.node().add_child(node)
-                moving.shown = shape
-            moving.path.set_pos_hpr(actor.x_m, actor.y_m, actor.z_m, math.degrees(actor.yaw_rad), 0.0, 0.0)
-            c, s = math.cos(actor.yaw_rad), math.sin(actor.yaw_rad)
-            normals = local[:, :3] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-            offsets = local[:, 3] + normals @ (actor.x_m, actor.y_m, actor.z_m)
-            planes[moving.first : moving.first + len(local)] = np.column_stack([normals, offsets])
-        self._planes = [planes]
+    def move_agents(self, cars: Agents, people: Agents) -> None:
+        """Put the cars and people of `set_agents` where they are now."""
+        raised = self._roads.surface_at(np.stack([people.x_m, people.y_m], axis=1)) == Surface.SIDEWALK
+        heights = np.concatenate([np.zeros(len(cars)), np.where(raised, KERB_M, 0.0)])
+        steps = (people.travelled_m / STEPS_M * 6).astype(np.int64) % 6
+        strides = [0] * len(cars) + [STRIDE_OF_STEP[step] for step in steps.tolist()]
+        places = np.stack([np.concatenate([getattr(a, name) for a in (cars, people)]) for name in PLACE], axis=1)
+        for moving, stride, (x, y, yaw), z in zip(
+            self._moving, strides, places.tolist(), heights.tolist(), strict=True
+        ):
+            self._move(moving, stride, (x, y, z), yaw)
+
+    def _move(self, moving: _Moving, stride: int, place: tuple[float, float, float], yaw_rad: float) -> None:
+        node, local = moving.shapes[stride]
+        if stride != moving.shown:
+            moving.path.node().remove_all_children()
+            moving.path.node().add_child(node)
+            moving.shown = stride
+        moving.path.set_pos_hpr(*place, math.degrees(yaw_rad), 0.0, 0.0)
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        normals = local[:, :3] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        offsets = local[:, 3] + normals @ place
+        self._all_planes()[moving.first : moving.first + len(local)] = np.column_stack([normals, offsets])
 
     def look(self, camera: CameraModel, state: VehicleState) -> LabelledPicture:
         """What the camera of a vehicle sees."""
@@ -252,11 +261,11 @@ def _around() -> Mesh:
     return builder.build()
 
 
-def _shapes(actor: Actor) -> list[Mesh]:
-    """The shapes an actor takes as it goes."""
-    if actor.person:
-        return [person(actor.look % PERSON_LOOKS, stride) for stride in STRIDES]
-    look = actor.look % (len(Body) * len(PAINTS))
+def _shapes(look: int, label: Label) -> list[Mesh]:
+    """The shapes an agent takes as it goes."""
+    if label is Label.PEDESTRIAN:
+        return [person(look % PERSON_LOOKS, stride) for stride in STRIDES]
+    look %= len(Body) * len(PAINTS)
     return [car(Body(look % len(Body)), PAINTS[look // len(Body)])]
 
 

@@ -10,6 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from roadproof.datatypes import Control, VehicleState
 from roadproof.simulators.town.body import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
 from roadproof.simulators.town.engine import Node, Path, bullet, core
@@ -27,6 +30,7 @@ SUBSTEP_S = 0.01
 SETTLE_STEPS = 60
 CAR_HALF_M = (2.25, 0.93)
 TOUCH_M = 0.02
+TOUCHABLE_M = 40.0
 BLOCK_M = 30.0
 
 
@@ -56,7 +60,8 @@ class Physics:
         self._parts: dict[str, list[Contact]] = {}
         self._surround(start.x_m, start.y_m)
         self._cars: list[Path] = []
-        self.move_cars(cars)
+        self._stands = np.zeros((0, 2))
+        self.replace_cars(cars)
         self._chassis, self._path, self._vehicle = self._make_car(start)
         self._steer_rad = 0.0
         self._settle(start)
@@ -71,19 +76,30 @@ class Physics:
         self._drive(control)
         self._advance(count)
 
-    def move_cars(self, poses: Sequence[Pose]) -> None:
-        """Put the other cars where they are now; there may be more or fewer than before."""
-        for path in self._cars[len(poses) :]:
+    def replace_cars(self, cars: Sequence[Pose]) -> None:
+        """Put others in the place of the other cars; afterwards `move_cars` moves as many."""
+        for path in self._cars:
             self._world.remove(path.node())
             path.remove_node()
-        del self._cars[len(poses) :]
-        for i in range(len(self._cars), len(poses)):
+        self._cars.clear()
+        for i, pose in enumerate(cars):
             node = self._box(f"car-{i}", CAR_HALF_M, HEIGHT_M)
             node.set_kinematic(True)
             self._kinds[node.get_name()] = Contact("vehicle", f"car {i}")
             self._cars.append(self._place(node))
-        for path, pose in zip(self._cars, poses, strict=True):
-            self._stand(path, pose, HEIGHT_M)
+            self._stand(self._cars[-1], pose, HEIGHT_M)
+        self._stands = np.array([(pose.x_m, pose.y_m) for pose in cars]).reshape(-1, 2)
+
+    def move_cars(self, places: Float[np.ndarray, "n 3"]) -> None:
+        """Put the other cars where they are now: x, y, yaw. What is far off and stays so is not moved: nobody sees."""
+        position = self._path.get_pos()
+        here, reach = (position.x, position.y), TOUCHABLE_M * TOUCHABLE_M
+        near = ((places[:, :2] - here) ** 2).sum(axis=1) < reach
+        near |= ((self._stands - here) ** 2).sum(axis=1) < reach
+        self._stands[near] = places[near, :2]
+        for i in np.flatnonzero(near).tolist():
+            x, y, yaw = places[i].tolist()
+            self._cars[i].set_pos_hpr(x, y, HEIGHT_M / 2, math.degrees(yaw), 0.0, 0.0)
 
     def state(self) -> VehicleState:
         """Pose and forward speed."""
