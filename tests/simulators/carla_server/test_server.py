@@ -342,7 +342,8 @@ manager.set_random_device_seed(7)
 command, blueprint = carla.command, world.get_blueprint_library().find("vehicle.tesla.model3")
 places = [carla.Transform(carla.Location(x, 1.75, 0.3)) for x in (20.0, 50.0)]
 pilot = command.SetAutopilot(command.FutureActor, True, port)
-ids = [a.actor_id for a in client.apply_batch_sync([command.SpawnActor(blueprint, p).then(pilot) for p in places], True)]
+commands = [command.SpawnActor(blueprint, place).then(pilot) for place in places]
+ids = [answer.actor_id for answer in client.apply_batch_sync(commands, True)]
 for _ in range(60):
     world.tick()
 for car in world.get_actors(ids):
