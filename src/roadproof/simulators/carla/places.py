@@ -53,7 +53,7 @@ def scenario_between(
         start=VehicleState(start.x_m, start.y_m, route.at(0.0)[2], start.yaw_rad, 0.0),
         goal_m=(goal.x_m, goal.y_m),
         canvas=_canvas(roads, route, canvas_at_m),
-        time_limit_s=math.ceil(route.length_m / CRUISE_MPS + SLACK_S),
+        time_limit_s=float(math.ceil(route.length_m / CRUISE_MPS + SLACK_S)),
     )
 
 
