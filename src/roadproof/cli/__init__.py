@@ -15,6 +15,7 @@ from roadproof import __version__
 from roadproof.cli.attack import attack
 from roadproof.cli.check_controller import check_controller
 from roadproof.cli.controllers import controllers
+from roadproof.cli.demo import demo
 from roadproof.cli.drive import drive
 from roadproof.cli.evaluate import evaluate
 from roadproof.cli.record import record
@@ -29,7 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-for verb in (record, attack, evaluate, report, drive, scenarios, controllers, check_controller, train):
+for verb in (demo, record, attack, evaluate, report, drive, scenarios, controllers, check_controller, train):
     app.command()(verb)
 
 
