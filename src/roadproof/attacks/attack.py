@@ -36,7 +36,7 @@ def attack(
     gradient: Gradient = "exact",
     random_patterns: int = 0,
     checkpoint: Path | None = None,
-    on_step: Callable[[int, float], None] = lambda _iteration, _best: None,
+    on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
     """Find the pattern that shifts a controller's steering most on recorded drives.
 
