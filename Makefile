@@ -12,7 +12,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  sys.exit(0 if sys.version_info >= (3, 11) else f"roadproof needs Python 3.11 or newer, this is {v}: set PYTHON=...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[onnx,town,video]' --group dev
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[blackbox,onnx,ray,study,town,video]' --group dev
 	touch $(STAMP)
 
 # Recorded drives are attacked; without any, the built-in town is driven.

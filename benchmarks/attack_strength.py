@@ -2,7 +2,7 @@
 
     python benchmarks/attack_strength.py RECORDINGS --controller SPEC --json OUT [--figures 5] [--seeds 0,1,2]
 
-All figures are surrogate figures: mean steering shift a frame on composited frames, not driven.
+All figures are surrogate figures: mean steering shift a frame on all composited frames in float32, not driven.
 """
 
 import argparse
@@ -10,19 +10,36 @@ import json
 import platform
 import statistics
 import time
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
 import roadproof
-from roadproof.attacks import Schedule, Surrogate, attack
-from roadproof.attacks.gradopt import random_search
+from roadproof.attacks import Schedule, Surrogate
+from roadproof.attacks.gradopt import gradopt, random_search
 from roadproof.controllers import load_controller
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
 from roadproof.recordings import load_recordings
 from roadproof.search_space import SearchSpace
 
 GROUPS = (RIGHT_GROUP, LEFT_GROUP)
+SCHEDULES = {"heats": Schedule.in_heats, "published": Schedule.stretched}
+
+
+def timed(function: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
+    """What a function answers, and its seconds: by the clock, and of processor time over all threads."""
+    clock, processor = time.perf_counter(), time.process_time()
+    answer = function()
+    spent = {"seconds": time.perf_counter() - clock, "cpu_seconds": time.process_time() - processor}
+    return answer, {name: round(value, 1) for name, value in spent.items()}
+
+
+def spread(values: list[float]) -> dict[str, float]:
+    """Mean, least and most."""
+    return {"mean": statistics.mean(values), "min": min(values), "max": max(values)}
 
 
 def main() -> None:
@@ -32,34 +49,35 @@ def main() -> None:
     parser.add_argument("--controller", required=True)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--figures", type=int, default=5)
-    parser.add_argument("--iterations", type=int, default=250)
+    parser.add_argument("--schedule", choices=list(SCHEDULES), default="heats")
     parser.add_argument("--restarts", type=int, default=4)
-    parser.add_argument("--draws", type=int, default=16, help="random points a start is the best of; 1 as published")
+    parser.add_argument("--dtype", default="float32", help="of the controller while searching")
     parser.add_argument("--seeds", default="0,1,2")
-    parser.add_argument("--random-patterns", type=int, default=500)
+    parser.add_argument("--random-patterns", type=int, default=500, help="of the random search, 0 for none")
     args = parser.parse_args()
     recordings = load_recordings(args.recordings)
-    controller = load_controller(args.controller)
-    space = SearchSpace(figures=args.figures)
+    judge = Surrogate(recordings, load_controller(args.controller), GROUPS)
+    searched = Surrogate(recordings, load_controller(args.controller, dtype=args.dtype), GROUPS)
+    space, schedule = SearchSpace(figures=args.figures), SCHEDULES[args.schedule]()
+    names = [str(group) for group in GROUPS]
     runs = []
     for seed in (int(word) for word in args.seeds.split(",")):
-        schedule = Schedule.stretched(args.iterations)
-        found = attack(
-            recordings, controller, space, schedule=schedule, restarts=args.restarts, draws=args.draws, seed=seed
-        )
-        start = time.perf_counter()
-        surrogate = Surrogate(recordings, controller, GROUPS)
-        _, by_chance = random_search(surrogate, space, patterns=args.random_patterns, seed=seed)
-        runs.append(
-            {
-                "seed": seed,
-                "gradopt": found.by_group,
-                "random_search": {str(g): float(v) for g, v in zip(GROUPS, by_chance, strict=True)},
-                "gradopt_seconds": round(found.cost.seconds, 1),
-                "random_seconds": round(time.perf_counter() - start, 1),
-            }
-        )
-        print(json.dumps(runs[-1]), flush=True)
+        search = lambda s=seed: gradopt(searched, space, schedule=schedule, restarts=args.restarts, seed=s)  # noqa: E731
+        found, cost = timed(search)
+        restarts = judge.values(space, found.best_unit)
+        run = {
+            "seed": seed,
+            "gradopt": dict(zip(names, restarts.amax(1).tolist(), strict=True)),
+            "gradopt_restarts": dict(zip(names, restarts.tolist(), strict=True)),
+            "gradopt_cost": cost,
+        }
+        if args.random_patterns:
+            chance = lambda s=seed: random_search(judge, space, patterns=args.random_patterns, seed=s)  # noqa: E731
+            (_, best), cost = timed(chance)
+            run |= {"random_search": dict(zip(names, best.tolist(), strict=True)), "random_search_cost": cost}
+        runs.append(run)
+        print(json.dumps(run), flush=True)
+    methods = ("gradopt", "random_search") if args.random_patterns else ("gradopt",)
     result = {
         "benchmark": "attack_strength",
         "kind": "surrogate: mean steering shift a frame on composited frames",
@@ -68,15 +86,12 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "processor": platform.processor() or platform.machine(),
         "figures": args.figures,
-        "iterations": args.iterations,
+        "dtype": args.dtype,
+        "schedule": asdict(schedule),
         "restarts": args.restarts,
-        "draws": args.draws,
         "random_patterns": args.random_patterns,
         "runs": runs,
-        "median": {
-            method: {str(group): statistics.median(run[method][str(group)] for run in runs) for group in GROUPS}
-            for method in ("gradopt", "random_search")
-        },
+        "spread": {m: {name: spread([run[m][name] for run in runs]) for name in names} for m in methods},
     }
     args.json.write_text(json.dumps(result, indent=1) + "\n")
 

@@ -46,6 +46,18 @@ def test_pixel_maps_travel_with_their_drive(tmp_path):
     assert torch.equal(loaded.visible, maps.visible)
 
 
+def test_a_thinned_drive_ends_with_the_same_frame_and_keeps_what_belongs_to_each():
+    maps = PixelMaps(torch.rand(8, 88, 200, 3), torch.zeros(8, 88, 200, 3), torch.ones(8, 88, 200), PLAIN.response)
+    drive = replace(recording(Push.CLEAN, frames=8), maps=maps)
+    few = drive.thinned(3)
+    assert few.frame_number.tolist() == [11, 14, 17]
+    for field in PER_FRAME:
+        np.testing.assert_array_equal(getattr(few, field), getattr(drive, field)[[1, 4, 7]])
+    assert torch.equal(few.maps.gain, maps.gain[[1, 4, 7]])
+    assert drive.thinned(100).frame_number.tolist() == [17]
+    assert recording(Push.CLEAN).thinned(2).maps is None
+
+
 def test_the_manifest_says_formats_units_and_drives(saved):
     manifest = json.loads((saved / "recordings.json").read_text())
     assert (manifest["format"], manifest["version"]) == ("roadproof-recordings", 1)

@@ -14,7 +14,7 @@ import json
 import shutil
 import tempfile
 import zipfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
@@ -99,6 +99,15 @@ class Recording:
                 check_image_from_canvas(homography)
             except GeometryError as error:
                 raise RecordingError(f"drive {self.name}, frame {number}: {error}") from None
+
+    def thinned(self, every: int) -> Recording:
+        """Every n-th frame, counted back from the last one, which shows the canvas largest."""
+        frames = slice((len(self.frames) - 1) % every, None, every)
+        maps = self.maps and PixelMaps(
+            self.maps.gain[frames], self.maps.offset[frames], self.maps.visible[frames], self.maps.response
+        )
+        kept = {name: getattr(self, name)[frames] for name in ("frames", *_PER_FRAME)}
+        return replace(self, maps=maps, **kept)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

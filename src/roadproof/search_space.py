@@ -18,7 +18,7 @@ from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.patterns import Pattern, boxes_from_published
 
-Family = Literal["published", "published-canvas-centre", "free"]
+Family = Literal["published", "published-canvas-centre", "published-bo", "free"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 
 
@@ -35,6 +35,17 @@ _PUBLISHED = (
     _Parameter("position_px", 0.0, 380.0, 0.0),
     _Parameter("width_px", 0.0, 100.0, 20.0),
     _Parameter("inset_px", 0.0, 70.0, 0.0),
+)
+_PUBLISHED_BO = (
+    _Parameter("rotation_deg", 0.0, 180.0, 0.0),
+    _Parameter("position_px", 0.0, 400.0, 0.0),
+    _Parameter("width_px", 0.0, 100.0, 0.0),
+    _Parameter("inset_px", 0.0, 70.0, 0.0),
+)
+_PUBLISHED_BO_ALONE = (
+    *_PUBLISHED_BO[:2],
+    _Parameter("width_px", 0.0, 80.0, 0.0),
+    _Parameter("inset_px", 0.0, 60.0, 0.0),
 )
 _FREE = (
     _Parameter("x_px", 0.0, float(CANVAS_SIZE_PX), 0.0),
@@ -54,6 +65,7 @@ class SearchSpace:
         figures: K, how many figures.
         family: "published", the paper's rectangles centred along the road, rotated about themselves as in the
             released code (4 parameters); "published-canvas-centre", rotated about the canvas' centre as in the text;
+            "published-bo", the same rectangles in the bounds of the authors' Bayesian optimisation, which depend on K;
             "free", any centre on the canvas (5 parameters).
         shape: what every figure is; the published families are rectangles.
         colour: whether the paint's colour is searched (3 parameters more); otherwise all figures are black.
@@ -84,6 +96,8 @@ class SearchSpace:
 
     @property
     def _shape_parameters(self) -> tuple[_Parameter, ...]:
+        if self.family == "published-bo":
+            return _PUBLISHED_BO_ALONE if self.figures == 1 else _PUBLISHED_BO
         return _FREE if self.family == "free" else _PUBLISHED
 
     @property

@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
-from roadproof.attacks import AttackResult, Schedule, Surrogate, attack
+from roadproof.attacks import AttackResult, Heat, Schedule, Surrogate, attack
 from roadproof.attacks.gradopt import gradopt, random_search
 from roadproof.attacks.published import PublishedSurrogate
 from roadproof.compositing import composite, view_canvas
@@ -19,6 +19,7 @@ from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
 
 QUICK = Schedule.stretched(20)
+HEATED = dataclasses.replace(QUICK, heats=(Heat(starts=4, iterations=2, every=2),))
 
 
 def pull_to_the_right(scale=1e-3):
@@ -56,7 +57,7 @@ def test_the_known_optimum_of_a_linear_controller_is_found():
     groups = parse_groups("all", recordings)
     surrogate = Surrogate(recordings, controller, groups)
     optimum = float(surrogate.values(space, optimum_at[None, None, None])[0, 0])
-    found = attack(recordings, controller, space, groups=groups, restarts=8, schedule=Schedule(iterations=250), seed=1)
+    found = attack(recordings, controller, space, groups=groups, seed=1)
     assert optimum > 0
     assert found.surrogate_shift / optimum >= 0.95
 
@@ -105,13 +106,32 @@ def test_each_drop_of_the_rate_starts_from_the_best_so_far():
     torch.testing.assert_close(search.history[6], search.history[:6].amax(0), rtol=1e-4, atol=1e-5)
 
 
-def test_drawn_starts_are_the_best_of_their_draws():
+def test_the_best_of_a_heat_go_on():
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP, LEFT_GROUP))
-    space, one_step = SearchSpace(figures=2), Schedule(iterations=1)
-    drawn = gradopt(surrogate, space, schedule=one_step, restarts=2, draws=5, seed=3).history[0]
-    points = space.random((2, 10), torch.Generator().manual_seed(3))
-    best = surrogate.values(space, points).view(2, 2, 5).amax(-1)
-    torch.testing.assert_close(drawn, best, rtol=1e-4, atol=1e-5)
+    space, heat = SearchSpace(figures=2), Schedule(iterations=3, drops=())
+    alone = gradopt(surrogate, space, schedule=heat, restarts=6, seed=3)
+    schedule = Schedule(iterations=1, heats=(Heat(starts=6, iterations=3, every=1),))
+    chosen = gradopt(surrogate, space, schedule=schedule, restarts=2, seed=3).history[0]
+    torch.testing.assert_close(chosen, alone.best.topk(2).values, rtol=1e-4, atol=1e-5)
+
+
+def test_heats_run_on_few_frames_and_their_cost_is_counted():
+    surrogate = Surrogate(recording_set(frames=4), pull_to_the_right(), (RIGHT_GROUP,))
+    assert surrogate.thinned(3).lengths == [[2, 2]]
+    before, steps = surrogate.frames_evaluated, []
+    schedule = Schedule(iterations=2, heats=(Heat(starts=3, iterations=5, every=2),))
+    on_step = lambda step, _best: steps.append(step)  # noqa: E731
+    gradopt(surrogate, SearchSpace(figures=1), schedule=schedule, restarts=1, seed=0, on_step=on_step)
+    clean, heat, search = 4, 3 * 5 * 4, 2 * 8
+    assert surrogate.frames_evaluated - before == clean + heat + search
+    assert steps == list(range(1, schedule.steps + 1))
+
+
+def test_heats_find_more_than_random_starts_of_equal_cost():
+    surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP, LEFT_GROUP))
+    heats = Schedule(iterations=10, heats=(Heat(starts=12, iterations=5, every=2),))
+    search = lambda schedule: gradopt(surrogate, SearchSpace(figures=3), schedule=schedule, restarts=2, seed=0)  # noqa: E731
+    assert (search(heats).best.mean(1) > search(Schedule(iterations=25)).best.mean(1)).all()
 
 
 class InterruptionError(Exception):
@@ -124,14 +144,14 @@ def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path):
             recording_set(),
             pull_to_the_right(),
             SearchSpace(figures=2),
-            schedule=QUICK,
+            schedule=HEATED,
             restarts=2,
             checkpoint=checkpoint,
             on_step=on_step,
         )
 
     def interrupt(step, _best):
-        if step == 11:
+        if step == 13:
             raise InterruptionError
 
     steps = []
@@ -139,8 +159,8 @@ def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path):
         run(tmp_path / "search.safetensors", interrupt)
     resumed = run(tmp_path / "search.safetensors", lambda step, _best: steps.append(step))
     # The step that was interrupted may be repeated, no other.
-    assert steps[0] in (11, 12)
-    assert steps[-1] == 20
+    assert steps[0] in (13, 14)
+    assert steps[-1] == 22
     np.testing.assert_array_equal(resumed.history, run(None).history)
 
 
@@ -194,7 +214,7 @@ def test_gradients_beat_random_search_of_equal_cost():
 
 def test_a_result_is_the_same_when_loaded(tmp_path):
     result = attack(
-        recording_set(), pull_to_the_right(), SearchSpace(figures=2), schedule=QUICK, restarts=2, random_patterns=4
+        recording_set(), pull_to_the_right(), SearchSpace(figures=2), schedule=HEATED, restarts=2, random_patterns=4
     )
     result.save(tmp_path)
     loaded = AttackResult.load(tmp_path)
@@ -219,12 +239,20 @@ def test_schedules_that_make_no_sense_are_refused(kwargs):
         Schedule(**kwargs)
 
 
-def test_restarts_must_be_at_least_one():
+def test_restarts_must_be_at_least_one_and_heats_must_leave_as_many():
+    run = lambda restarts: attack(  # noqa: E731
+        recording_set(), pull_to_the_right(), SearchSpace(figures=1), schedule=HEATED, restarts=restarts
+    )
     with pytest.raises(RoadproofError, match="restarts is 0"):
-        attack(recording_set(), pull_to_the_right(), SearchSpace(figures=1), restarts=0)
+        run(0)
+    with pytest.raises(RoadproofError, match="fewer than 5 restarts"):
+        run(5)
+    with pytest.raises(RoadproofError, match="number below 1"):
+        Heat(starts=4, iterations=2, every=0)
 
 
-def test_the_schedule_is_the_papers():
+def test_the_published_schedule_is_the_papers():
     schedule = Schedule()
     assert [round(schedule.rate(i), 6) for i in (0, 99, 100, 199, 200, 249)] == [0.1, 0.1, 0.01, 0.01, 0.001, 0.001]
-    assert Schedule.stretched(250) == schedule
+    assert Schedule.stretched(250) == schedule == Schedule.stretched()
+    assert not schedule.heats

@@ -101,7 +101,9 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, monkey
     ids=" ".join,
 )
 def test_every_kind_of_search_runs(here, tmp_path, options):
-    outcome = CliRunner().invoke(app, command("--out", str(tmp_path), "--iterations", "2", *options))
+    outcome = CliRunner().invoke(
+        app, command("--out", str(tmp_path), "--iterations", "2", "--schedule", "published", *options)
+    )
     assert outcome.exit_code == 0, outcome.output
 
 

@@ -3,6 +3,7 @@
 from roadproof.attacks.attack import GRADIENTS as GRADIENTS
 from roadproof.attacks.attack import attack as attack
 from roadproof.attacks.checks import Check as Check
+from roadproof.attacks.gradopt import Heat as Heat
 from roadproof.attacks.gradopt import Schedule as Schedule
 from roadproof.attacks.result import AttackResult as AttackResult
 from roadproof.attacks.result import Cost as Cost

@@ -31,7 +31,6 @@ def attack(
     groups: Sequence[Group] = (RIGHT_GROUP, LEFT_GROUP),
     schedule: Schedule | None = None,
     restarts: int = 4,
-    draws: int = 16,
     seed: int = 0,
     device: torch.device | str = "cpu",
     gradient: Gradient = "exact",
@@ -46,10 +45,9 @@ def attack(
         controller: on `device`.
         space: the patterns allowed.
         groups: drives attacked together; the paper's two sides by default, of which the stronger is kept.
-        schedule: the paper's by default.
-        restarts: starts of every group.
-        draws: random points drawn for each start, which is the best of them; 1 as published.
-        seed: of the starts.
+        schedule: `Schedule.in_heats()` by default; `Schedule()` is the paper's.
+        restarts: of every group.
+        seed: of the random starts.
         device: where to search.
         gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
         random_patterns: random patterns a group that the self-check compares with; 0 for none.
@@ -60,7 +58,7 @@ def attack(
         ControllerError: the controller takes other frames, or answers NaN.
         RecordingError: a group names drives that the set lacks.
     """
-    schedule = schedule or Schedule()
+    schedule = schedule or Schedule.in_heats()
     kind = PublishedSurrogate if gradient == "published" else Surrogate
     surrogate = kind(recordings, controller, groups, device=device)
     start = time.perf_counter()
@@ -69,7 +67,6 @@ def attack(
         space,
         schedule=schedule,
         restarts=restarts,
-        draws=draws,
         seed=seed,
         checkpoint=checkpoint,
         on_step=on_step,
@@ -90,6 +87,5 @@ def attack(
         space=space,
         schedule=schedule,
         restarts=restarts,
-        draws=draws,
         seed=seed,
     )

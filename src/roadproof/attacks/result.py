@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.attacks.checks import Check
-from roadproof.attacks.gradopt import Schedule
+from roadproof.attacks.gradopt import Heat, Schedule
 from roadproof.coverage import Shape
 from roadproof.errors import RoadproofError
 from roadproof.files import read_json, write_atomically
@@ -46,15 +46,14 @@ class AttackResult:
         group: the group it was found for, e.g. "clean+right".
         surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
         by_group: the best mean shift of every group.
-        history: mean shift at every iteration, (iterations, groups, restarts).
+        history: mean shift at every iteration after the heats, (iterations, groups, restarts).
         stopped: why the search ended.
         cost: what it took.
         checks: what the attack found when it distrusted itself.
         space: where it looked.
         schedule: its steps.
-        restarts: starts of every group.
-        draws: random points drawn for each start.
-        seed: of the starts.
+        restarts: of every group.
+        seed: of the random starts.
     """
 
     pattern: Pattern
@@ -68,7 +67,6 @@ class AttackResult:
     space: SearchSpace
     schedule: Schedule
     restarts: int
-    draws: int
     seed: int
 
     def save(self, folder: Path) -> None:
@@ -88,7 +86,6 @@ class AttackResult:
             "space": asdict(self.space),
             "schedule": asdict(self.schedule),
             "restarts": self.restarts,
-            "draws": self.draws,
             "seed": self.seed,
             "history": np.round(self.history.astype(float), 6).tolist(),
         }
@@ -108,15 +105,20 @@ class AttackResult:
                 cost=Cost(**fields["cost"]),
                 checks=tuple(Check(**check) for check in fields["checks"]),
                 space=_space(fields["space"]),
-                schedule=Schedule(**fields["schedule"] | {"drops": tuple(fields["schedule"]["drops"])}),
+                schedule=_schedule(fields["schedule"]),
                 history=np.array(fields["history"], dtype=np.float64),
                 **{
                     name: fields[name]
-                    for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "draws", "seed")
+                    for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed")
                 },
             )
         except (KeyError, TypeError, ValueError) as error:
             raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None
+
+
+def _schedule(stored: dict[str, Any]) -> Schedule:
+    heats = tuple(Heat(**heat) for heat in stored.get("heats", ()))
+    return Schedule(**stored | {"drops": tuple(stored["drops"]), "heats": heats})
 
 
 def _space(stored: dict[str, Any]) -> SearchSpace:

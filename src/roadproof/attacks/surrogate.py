@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -57,6 +58,7 @@ class Surrogate:
                 f"the recordings have {width}×{height}; use a controller for this input, or record for this controller"
             )
         self.groups = tuple(groups)
+        self.recordings = recordings
         self.controller = controller
         self.frames_evaluated = 0
         self._kept: tuple[int, Compositor] | None = None
@@ -77,6 +79,11 @@ class Surrogate:
     def device(self) -> torch.device:
         """Where frames are composited."""
         return self.views[0].frames.device
+
+    def thinned(self, every: int) -> Surrogate:
+        """The same on every n-th frame of each drive."""
+        few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
+        return type(self)(few, self.controller, self.groups, device=self.device)
 
     def divergences(self, patterns: Sequence[Pattern]) -> Float[Tensor, "g r"]:
         """δ per frame of R patterns for each group, differentiable in the patterns.

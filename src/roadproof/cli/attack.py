@@ -17,7 +17,9 @@ def attack(
     controller: Annotated[
         str,
         typer.Option(
-            help="A .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or module:factory.", show_default=False
+            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE "
+            "or module:factory.",
+            show_default=False,
         ),
     ],
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
@@ -33,9 +35,13 @@ def attack(
     groups: Annotated[
         str, typer.Option(help="Drives attacked together: clean+right,clean+left, or all.")
     ] = "clean+right,clean+left",
-    iterations: Annotated[int, typer.Option(help="Steps of every restart.")] = 250,
-    restarts: Annotated[int, typer.Option(help="Starts of every group.")] = 4,
-    draws: Annotated[int, typer.Option(help="Random points a start is the best of; 1 as published.")] = 16,
+    schedule: Annotated[
+        str, typer.Option(help="heats: many starts on few frames, the best go on; published: random starts.")
+    ] = "heats",
+    iterations: Annotated[
+        int | None, typer.Option(help="Steps of every restart; 100 after heats, 250 as published.", show_default=False)
+    ] = None,
+    restarts: Annotated[int, typer.Option(help="Patterns of every group that are searched to the end.")] = 4,
     gradient: Annotated[str, typer.Option(help="exact, or published: the authors' way, to compare with.")] = "exact",
     patience: Annotated[
         int | None, typer.Option(help="Stop after so many late steps without gain.", show_default=False)
@@ -69,21 +75,23 @@ def attack(
         albedo=albedo,
         max_painted_share=max_painted_share,
     )
-    schedule = Schedule.stretched(iterations, patience=patience)
+    make = {"heats": Schedule.in_heats, "published": Schedule.stretched}[
+        choice(schedule, "schedule", ("heats", "published"))
+    ]
+    steps = make(patience=patience) if iterations is None else make(iterations, patience=patience)
     check_writable(out)
     drives = load_recordings(recordings)
     attacked = load_controller(controller, device=device, dtype=dtype)
     chosen = parse_groups(groups, drives)
     checkpoint = out / "search.safetensors"
-    with progress("Searching", iterations) as on_step:
+    with progress("Searching", steps.steps) as on_step:
         result = run(
             drives,
             attacked,
             space,
             groups=chosen,
-            schedule=schedule,
+            schedule=steps,
             restarts=restarts,
-            draws=draws,
             seed=seed,
             device=device,
             gradient=choice(gradient, "gradient", GRADIENTS),

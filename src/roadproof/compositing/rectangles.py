@@ -1,16 +1,15 @@
 """Painting rectangles, with the gradient worked out by hand.
 
-The same values as `composite.blend` over `coverage`, computed in pieces that stay in the cache and recomputed in the
-backward pass instead of stored. A step of an attack then costs little more than the controller's own forward and
-backward pass, without a compiler.
+The same values as `composite.blend` over `coverage`, but masks and their gradients are computed only where a figure is:
+the canvas' pixels are kept in short runs with a bounding box each, and a run whose box a figure does not touch costs
+nothing but that test. A step of an attack then costs little more than the controller's own forward and backward pass.
 
-With S̃(t) = t (1 − |t|/2) on [−1, 1] and S̃′(t) = 1 − |t| (zero where t was clamped),
+With S̃(t) = t (1 − |t|/2) on [−1, 1] and its slope S̃′(t) = 1 − |t| (zero where t was clamped), the four edges of a
+figure, at distances d = ±u + w/2, ±v + l/2 from a pixel, and σ across them,
 
-    C_u = S̃(t₁) + S̃(t₂),   t₁ = (w/2 − u)/σ_u,   t₂ = (w/2 + u)/σ_u,   M = C_u C_v
-
-    ∂C_u/∂u  = (S̃′(t₂) − S̃′(t₁))/σ_u
-    ∂C_u/∂w  = (S̃′(t₂) + S̃′(t₁))/(2 σ_u)
-    ∂C_u/∂σ² = −(S̃′(t₁) t₁ + S̃′(t₂) t₂)/(2 σ_u²)
+    C_u = S̃(t₁) + S̃(t₂),   t = d/σ_u,   M = C_u C_v
+    ∂M/∂d  = C_v S̃′(t)/σ_u
+    ∂M/∂σ² = −C_v ∑ S̃′(t) t / (2 σ_u²)
 
 and for the visibilities V_k = M_k T_k, with D_k = ∂L/∂V_k and what is seen through figure k, S_{k+1} = D_k M_k +
 (1 − M_k) S_k, S_0 = 0, each adjoint is ∂L/∂M_k = T_k (D_k − S_k): compositing again, from the bottom up.
@@ -25,6 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.compositing.runs import RUN, Runs
 from roadproof.compositing.view import CanvasView
 from roadproof.coverage import MIN_VARIANCE, axis_rows
 
@@ -38,94 +38,104 @@ class PaintedRectangles(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, boxes: Tensor, seen: Tensor, view: CanvasView) -> Tensor:  # noqa: ANN401
         """Paint, piece by piece."""
+        rows = _edge_rows(boxes)
         painted = torch.empty(len(boxes), *view.clean.shape, device=boxes.device, dtype=boxes.dtype)
-        for piece in _pieces(boxes, view):
-            masks = _Masks(boxes, view.footprints.features[:, piece]).masks
+        within = torch.empty(len(boxes), *view.runs.clean.shape, device=boxes.device, dtype=torch.bool)
+        ctx.edges = []
+        for pixels, runs in _pieces(boxes, view.runs):
+            edges = _Edges(rows, runs)
+            masks = edges.masks()
             through = _shown_through(masks)
-            visibility = masks.mul_(through[:, 1:])
-            colour = (visibility.mT @ seen).mul_(view.gain[piece])
-            share = 1 - through[:, 0, :, None]
-            painted[:, piece] = colour.add_(view.clean[piece]).addcmul_(share, view.bias[piece])
-        ctx.save_for_backward(boxes, seen, painted)
-        ctx.view = view
-        return painted.clamp(0.0, 1.0)
+            colour = seen.mT @ masks.mul_(through[:, 1:])
+            raw = torch.addcmul(runs.clean, colour, runs.gain).addcmul_(1 - through[:, :1], runs.bias)
+            clamped = raw.clamp(0.0, 1.0)
+            torch.eq(raw, clamped, out=within[..., pixels])
+            part = painted[:, pixels]
+            part.copy_(clamped.mT[:, : part.shape[1]])
+            ctx.edges.append(edges)
+        ctx.save_for_backward(boxes, seen, within)
+        ctx.runs = view.runs
+        return painted
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # noqa: ANN401
-        """Recompute each piece and collect the gradients of boxes and seen colours."""
-        boxes, seen, painted = ctx.saved_tensors
-        view: CanvasView = ctx.view
-        grad_rows = torch.zeros(4, *boxes.shape[:2], 6, device=boxes.device, dtype=boxes.dtype)
-        grad_halves = torch.zeros(2, *boxes.shape[:2], device=boxes.device, dtype=boxes.dtype)
+        """Lay the figures over each other again and collect the gradients of boxes and seen colours."""
+        boxes, seen, within = ctx.saved_tensors
+        grad_painted = torch.nn.functional.pad(grad_outputs[0].mT, (0, within.shape[2] - grad_outputs[0].shape[1]))
+        grad_rows = torch.zeros(*boxes.shape[:2], 6, 6, device=boxes.device, dtype=boxes.dtype)
         grad_seen = torch.zeros_like(seen)
-        seen_and_one = torch.cat([seen, torch.ones_like(seen[..., :1])], -1)
-        for piece in _pieces(boxes, view):
-            features = view.footprints.features[:, piece]
-            parts = _Masks(boxes, features)
-            raw = painted[:, piece]
-            grad = torch.where((raw >= 0) & (raw <= 1), grad_outputs[0][:, piece], 0.0)
-            grad_colour = grad * view.gain[piece]
-            grad_share = (grad * view.bias[piece]).sum(-1, keepdim=True)
-            grad_visibility = seen_and_one @ torch.cat([grad_colour, grad_share], -1).mT
-            through = _shown_through(parts.masks)
-            grad_seen += (parts.masks * through[:, 1:]) @ grad_colour
-            grad_masks = _masks_adjoint(grad_visibility, parts.masks, through)
-            for axis, (own, other) in enumerate(((parts.u, parts.v), (parts.v, parts.u))):
-                grad_at, grad_half, grad_variance = own.adjoint(grad_masks * other.share)
-                grad_rows[axis] += grad_at @ features.T
-                grad_rows[axis + 2] += grad_variance @ features.T
-                grad_halves[axis] += grad_half.sum(-1)
+        for (pixels, runs), edges in zip(_pieces(boxes, ctx.runs), ctx.edges, strict=True):
+            masks = edges.masks()
+            through = _shown_through(masks)
+            grad = torch.where(within[..., pixels], grad_painted[..., pixels], 0.0)
+            grad_colour = grad * runs.gain
+            grad_seen += (masks * through[:, 1:]) @ grad_colour.mT
+            grad_visibility = (seen @ grad_colour).add_(grad.mul_(runs.bias).sum(1, keepdim=True))
+            grad_rows += edges.adjoint(_masks_adjoint(grad_visibility, masks, through))
         with torch.enable_grad():
             leaf = boxes.detach().requires_grad_()
-            rows = axis_rows(leaf).movedim(-2, 0)
-            halves = leaf[..., 2:4].movedim(-1, 0) / 2
-        grads = cast("tuple[Tensor]", torch.autograd.grad((rows, halves), leaf, (grad_rows, grad_halves)))
-        return grads[0], grad_seen, None
+            rows = _edge_rows(leaf)
+        (grad_boxes,) = cast("tuple[Tensor]", torch.autograd.grad(rows, leaf, grad_rows))
+        return grad_boxes, grad_seen, None
 
 
-def _pieces(boxes: Tensor, view: CanvasView) -> Iterator[slice]:
-    """Runs of pixels small enough for the cache; on a GPU all at once, up to its memory's comfort."""
+def _pieces(boxes: Tensor, runs: Runs) -> Iterator[tuple[slice, Runs]]:
+    """Runs few enough for the cache; on a GPU all at once, up to its memory's comfort."""
     figures = boxes.shape[0] * boxes.shape[1]
-    size = max((_PIECE if boxes.device.type == "cpu" else _PIECE << 8) // figures, 1024)
-    for start in range(0, len(view.clean), size):
-        yield slice(start, start + size)
+    size = max((_PIECE if boxes.device.type == "cpu" else _PIECE << 8) // figures // RUN, 128)
+    for start in range(0, len(runs), size):
+        yield slice(start * RUN, (start + size) * RUN), runs.part(slice(start, start + size))
 
 
-class _Axis:
-    """One side of the boxes: where each footprint is between its two edges."""
-
-    def __init__(self, at: Tensor, variance: Tensor, half: Tensor) -> None:
-        self.sharpness = variance.clamp_min_(MIN_VARIANCE).rsqrt_()
-        scaled_at, scaled_half = at * self.sharpness, half * self.sharpness
-        self.from_high = (scaled_half - scaled_at).clamp_(-1.0, 1.0)
-        self.from_low = scaled_half.add_(scaled_at).clamp_(-1.0, 1.0)
-        self.share = _tent(self.from_high).add_(_tent(self.from_low))
-
-    def adjoint(self, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From ∂L/∂share to ∂L/∂at, ∂L/∂half and ∂L/∂variance."""
-        high, low = 1 - self.from_high.abs(), 1 - self.from_low.abs()
-        scaled = grad * self.sharpness
-        stretch = (high * self.from_high).addcmul_(low, self.from_low).mul_(scaled).mul_(self.sharpness)
-        return (low - high).mul_(scaled), high.add_(low).mul_(scaled), stretch.mul_(-0.5)
+def _edge_rows(boxes: Float[Tensor, "b k 5"]) -> Float[Tensor, "b k 6 6"]:
+    """The rows that give w/2 − u, l/2 − v, w/2 + u, l/2 + v, σ²(e_u), σ²(e_v) from the features of a footprint."""
+    axes, variances = axis_rows(boxes).split(2, -2)
+    half = torch.nn.functional.pad(boxes[..., 2:4, None] / 2, (2, 3))
+    return torch.cat([half - axes, half + axes, variances], -2)
 
 
-def _tent(t: Tensor) -> Tensor:
-    return torch.addcmul(t, t, t.abs(), value=-0.5)
+class _Edges:
+    """Where figures begin and end: the runs of pixels that a figure's edge may cross, and how far it is from each.
 
+    Convention:
+        E pixels, figure after figure. Distances come as (2, 2, E): first or second edge, across or along the figure.
+    """
 
-class _Masks:
-    """Coverage of each rectangle, (B, K, n), and the two factors it is made of."""
+    def __init__(self, rows: Float[Tensor, "b k 6 6"], runs: Runs) -> None:
+        self.shape = rows.shape
+        self.inside, crossed = runs.relation(rows.flatten(0, 1))
+        figure, run = crossed.nonzero(as_tuple=True)
+        self.place = figure * len(runs) + run
+        self.counts = cast("list[int]", (crossed.sum(-1) * RUN).tolist())
+        self.features = runs.features.index_select(1, run).flatten(1)
+        parts = zip(rows.flatten(0, 1), self.features.split(self.counts, 1), strict=True)
+        values = torch.cat([row @ part for row, part in parts], 1)
+        self.sharpness = values[4:].clamp_min_(MIN_VARIANCE).rsqrt_()
+        self.t = values[:4].view(2, 2, -1).mul_(self.sharpness).clamp_(-1.0, 1.0)
+        share = torch.addcmul(self.t, self.t, self.t.abs(), value=-0.5)
+        self.share = share[0].add_(share[1])
 
-    def __init__(self, boxes: Tensor, features: Float[Tensor, "6 n"]) -> None:
-        rows = axis_rows(boxes).movedim(-2, 0)
-        at_u, at_v, variance_u, variance_v = (rows.reshape(-1, 6) @ features).view(*rows.shape[:-1], -1)
-        self.u = _Axis(at_u, variance_u, boxes[..., 2:3] / 2)
-        self.v = _Axis(at_v, variance_v, boxes[..., 3:4] / 2)
-        self.masks = self.u.share * self.v.share
+    def masks(self) -> Float[Tensor, "b k p"]:
+        """Coverage of each pixel by each figure."""
+        masks = self.inside.to(self.t.dtype).flatten()[:, None].expand(-1, RUN).contiguous()
+        masks.index_copy_(0, self.place, (self.share[0] * self.share[1]).view(-1, RUN))
+        return masks.view(*self.shape[:2], -1)
+
+    def adjoint(self, grad_masks: Float[Tensor, "b k p"]) -> Float[Tensor, "b k 6 6"]:
+        """From ∂L/∂M to the gradient of `_edge_rows`."""
+        grad = grad_masks.view(-1, RUN).index_select(0, self.place).flatten()
+        scaled = self.share.flip(0).mul_(self.sharpness).mul_(grad)
+        values = self.t.new_empty(6, len(grad))
+        distance, variance = values[:4].view(2, 2, -1), values[4:]
+        torch.mul(1 - self.t.abs(), scaled, out=distance)
+        torch.mul(distance[0], self.t[0], out=variance).addcmul_(distance[1], self.t[1])
+        variance.mul_(self.sharpness).mul_(-0.5)
+        parts = zip(values.split(self.counts, 1), self.features.split(self.counts, 1), strict=True)
+        return torch.stack([part @ features.T for part, features in parts]).view(self.shape)
 
 
 def _shown_through(masks: Tensor) -> Tensor:
-    """T_{−1}, T_0 … T_{K−1}: the bare road, then what each figure shows through, (B, K + 1, n)."""
+    """T_{−1}, T_0 … T_{K−1}: the bare road, then what each figure shows through, (B, K + 1, p)."""
     batch, figures, pixels = masks.shape
     through = masks.new_empty(batch, figures + 1, pixels)
     through[:, figures] = 1.0
@@ -135,10 +145,9 @@ def _shown_through(masks: Tensor) -> Tensor:
 
 
 def _masks_adjoint(grad_visibility: Tensor, masks: Tensor, through: Tensor) -> Tensor:
-    grad_masks = torch.empty_like(masks)
+    """From ∂L/∂V to ∂L/∂M, in place."""
     beneath = torch.zeros_like(masks[:, 0])
     for k in range(masks.shape[1]):
-        gain = grad_visibility[:, k] - beneath
-        torch.mul(gain, through[:, k + 1], out=grad_masks[:, k])
+        gain = grad_visibility[:, k].sub_(beneath)
         beneath.addcmul_(gain, masks[:, k])
-    return grad_masks
+    return grad_visibility.mul_(through[:, 1:])

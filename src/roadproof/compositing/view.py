@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from roadproof.compositing.runs import Runs
 from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
@@ -27,6 +28,7 @@ class CanvasView:
         gain: A = s·gain, (P, 3), with s the share of the pixel that lies on the canvas.
         bias: B = s·(offset − clean), (P, 3).
         response: painted → seen, before gain and bias.
+        runs: the same pixels in runs, as rectangles are painted.
     """
 
     frames: Float[Tensor, "f h w 3"]
@@ -36,6 +38,7 @@ class CanvasView:
     gain: Float[Tensor, "p 3"]
     bias: Float[Tensor, "p 3"]
     response: Response
+    runs: Runs
 
     @property
     def clean_frames(self) -> Float[Tensor, "f 3 h w"]:
@@ -82,7 +85,9 @@ def view_canvas(
         own = torch.as_tensor(index)
         gain, offset, share = maps.gain.flatten(0, 2)[own], maps.offset.flatten(0, 2)[own], maps.visible.flatten()[own]
     gain, offset, share = (part.to(device=device, dtype=dtype) for part in (gain, offset, share[:, None]))
-    return CanvasView(levels, place, footprints, clean, share * gain, share * (offset - clean), colour.response)
+    gain, bias = share * gain, share * (offset - clean)
+    runs = Runs.of(footprints, clean, gain, bias)
+    return CanvasView(levels, place, footprints, clean, gain, bias, colour.response, runs)
 
 
 def canvas_pixels(

@@ -128,6 +128,14 @@ class TownSimulator:
         assert self._town is not None
         return self._town.roads
 
+    def road_map(self, name: str) -> RoadMap:
+        """The map a scenario names; it needs no drive.
+
+        Raises:
+            ScenarioError: there is no such map, or it cannot be read.
+        """
+        return load_map(name)
+
     @property
     def route(self) -> Route:
         """The route of the current drive.

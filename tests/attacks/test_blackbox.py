@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from roadproof.attacks import proposals
+from roadproof.attacks.blackbox import METHODS, blackbox_search
+from roadproof.errors import RoadproofError
+from roadproof.search_space import SearchSpace
+
+BO = SearchSpace(figures=1, family="published-bo", colour=False)
+TARGET = torch.tensor([0.3, 0.8, 0.6, 0.2])
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Fewer starts for the acquisition of the published search: its settings have a test of their own."""
+    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"n_random": 1000, "n_smart": 4})
+
+
+def bowl(unit):
+    return -(unit - TARGET).square().sum((-1, -2))
+
+
+def search(method, *, calls=40, **options):
+    options = {"random_calls": 12, "space": BO} | options
+    return blackbox_search(bowl, options.pop("space"), method=method, calls=calls, **options)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_stays_in_the_cube_and_is_the_same_again(method, quick):
+    calls = 16 if method in ("published-bo", "gp") else 40
+    first, again = (search(method, calls=calls, seed=3) for _ in range(2))
+    assert len(first) == calls
+    assert torch.equal(first.unit, again.unit)
+    assert bool(((first.unit >= 0) & (first.unit <= 1)).all())
+    assert torch.equal(first.value, bowl(first.unit.float()).double())
+    assert not torch.equal(first.unit, search(method, calls=calls, seed=4).unit)
+
+
+@pytest.mark.parametrize(("method", "calls"), [("gp", 30), ("tpe", 120), ("cma-es", 120)])
+def test_what_learns_beats_what_draws(method, calls):
+    learnt = np.median([float(search(method, calls=calls, seed=seed).value.max()) for seed in range(3)])
+    drawn = np.median([float(search("random", calls=calls, seed=seed).value.max()) for seed in range(3)])
+    assert learnt > drawn
+
+
+def test_published_bo_draws_first_and_is_guided_then(quick):
+    trials = search("published-bo", calls=20, random_calls=14, seed=42)
+    drawn = np.random.RandomState(42).uniform(size=(14, 4))
+    assert np.allclose(trials.unit[:14].flatten(1), drawn)
+    # Six guided points of a smooth bowl come nearer than any of fourteen random ones.
+    assert trials.best >= 14
+
+
+def test_published_bo_has_its_settings(monkeypatch):
+    """FACTS of the released code: EI with ξ = 0, isotropic Matérn-5/2 from 1.0, 25 restarts, 1e5 and 250 starts."""
+    from bayes_opt import acquisition
+
+    seen = {}
+
+    def suggest(self, gp, target_space, n_random, n_smart, random_state):
+        seen.update(gp=gp, space=target_space, n_random=n_random, n_smart=n_smart, xi=self.xi)
+        return target_space.bounds.mean(1)
+
+    monkeypatch.setattr(acquisition.ExpectedImprovement, "suggest", suggest)
+    space = SearchSpace(figures=2, family="published-bo")
+    propose = proposals.published_bo(proposals.natural_ranges(space), 2, 42)
+    tried = np.linspace(0.1, 0.9, 42).reshape(3, 14)
+    point = propose(tried, np.array([1.0, 3.0, 2.0]), 1)
+    assert np.allclose(point, 0.5)
+    assert seen["xi"] == 0.0
+    assert (seen["n_random"], seen["n_smart"]) == (100_000, 250)
+    assert seen["gp"].get_params()["kernel"].get_params()["nu"] == 2.5
+    assert seen["gp"].kernel.length_scale == 1.0
+    assert (seen["gp"].alpha, seen["gp"].normalize_y, seen["gp"].n_restarts_optimizer) == (1e-6, True, 25)
+    assert seen["space"].bounds[:, 1].tolist() == [180.0, 400.0, 100.0, 70.0, 250.0, 250.0, 250.0] * 2
+    assert np.allclose(seen["space"].params, tried * seen["space"].bounds[:, 1])
+    assert proposals.natural_ranges(BO).tolist() == [180.0, 400.0, 80.0, 60.0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_search_killed_in_the_middle_goes_on_as_it_would_have(method, quick, tmp_path):
+    calls, random_calls = (16, 9) if method in ("published-bo", "gp") else (37, 12)
+
+    class KilledError(Exception):
+        pass
+
+    def kill(done, _best):
+        if done == 11:
+            raise KilledError
+
+    straight = search(method, calls=calls, random_calls=random_calls)
+    file = tmp_path / "search.safetensors"
+    with pytest.raises(KilledError):
+        search(method, calls=calls, random_calls=random_calls, checkpoint=file, on_step=kill)
+    done = []
+    resumed = search(
+        method, calls=calls, random_calls=random_calls, checkpoint=file, on_step=lambda n, _: done.append(n)
+    )
+    assert done[0] == 12
+    assert torch.equal(resumed.unit, straight.unit)
+    assert torch.equal(resumed.value, straight.value)
+    assert bool((resumed.seconds.diff() >= 0).all())
+
+
+def test_batches_are_measured_together():
+    sizes = []
+
+    def objective(unit):
+        sizes.append(len(unit))
+        return bowl(unit)
+
+    for method in ("random", "tpe", "cma-es"):
+        sizes.clear()
+        trials = blackbox_search(objective, BO, method=method, calls=11, at_once=4)
+        assert sizes == [4, 4, 3]
+        assert len(trials.unit.unique(dim=0)) == 11
+
+
+def test_best_so_far_never_falls():
+    trials = search("random")
+    assert trials.best_so_far[-1] == trials.value.max() == trials.value[trials.best]
+    assert bool((trials.best_so_far.diff() >= 0).all())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"calls": 0}, "calls is 0"),
+        ({"at_once": 0}, "at_once is 0"),
+        ({"at_once": 2}, "one point at a time"),
+        ({"random_calls": 0}, "random_calls is 0"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_named(options, message):
+    with pytest.raises(RoadproofError, match=message):
+        search("published-bo", **options)
+
+
+def test_a_value_that_is_not_a_number_is_an_error():
+    with pytest.raises(RoadproofError, match="NaN or infinite at call 1"):
+        blackbox_search(lambda unit: torch.full((len(unit),), torch.nan), BO, method="random", calls=3)
