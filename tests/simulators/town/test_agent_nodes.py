@@ -19,11 +19,11 @@ SKYWARD = CameraModel(width_px=300, height_px=200, fov_deg=120.0, up_m=1.0, pitc
 def test_whoever_has_a_part_in_the_picture_is_in_view(camera: CameraModel) -> None:
     rng = np.random.default_rng(0)
     state = VehicleState(12.0, -7.0, 0.0, 2.1, 5.0)
-    middles = rng.uniform(-60, 60, (4000, 2)) + (state.x_m, state.y_m)
+    middles = rng.uniform(-15, 15, (8000, 2)) + np.array([state.x_m, state.y_m])
     # Points of bodies up to 2.4 m from their middle and 1.8 m high, seen through the exact projection.
-    reach, angle = rng.uniform(0, 2.4, 4000), rng.uniform(0, 2 * math.pi, 4000)
+    reach, angle = rng.uniform(0, 2.4, 8000), rng.uniform(0, 2 * math.pi, 8000)
     parts = middles + (reach * [np.cos(angle), np.sin(angle)]).T
-    points = np.column_stack([parts, rng.uniform(0, 1.8, 4000), np.ones(4000)])
+    points = np.column_stack([parts, rng.uniform(0, 1.8, 8000), np.ones(8000)])
     x, y, depth = camera.image_from_world(state) @ points.T
     inside = (depth > 0.01) & (x > 0) & (x < camera.width_px * depth) & (y > 0) & (y < camera.height_px * depth)
     assert inside.sum() > 50

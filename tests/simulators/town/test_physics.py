@@ -80,16 +80,6 @@ def test_a_wall_stops_it_and_is_named():
     assert physics.state().x_m < 17.5
 
 
-def test_a_car_that_comes_from_afar_is_hit_and_one_that_left_is_not():
-    far, near = (90.0, 0.0, 0.0), (3.0, 0.0, 0.0)
-    physics = Physics([], at_origin(), [Pose(*far), Pose(*near)])
-    for places, touched in (([near, far], ["car 0"]), ([far, near], ["car 1"]), ([far, far], [])):
-        physics.move_cars(np.array(places))
-        physics.step(Control(0.0, brake=1.0), 0.05)
-        assert [contact.name for contact in physics.contacts()] == touched
-    physics.close()
-
-
 def test_a_kerb_or_the_ground_is_not_a_contact():
     physics = Physics([], at_origin(8.0))
     for _ in range(40):
