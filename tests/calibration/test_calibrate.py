@@ -46,13 +46,12 @@ def two_paint(town, drives, folder):
     return calibrate(town, drives, folder=folder)
 
 
-def test_two_paints_find_the_canvas_within_two_pixels_for_nine_calls(two_paint):
+def test_two_paints_find_the_canvas_within_half_a_pixel_for_nine_calls(two_paint):
     report = two_paint.report
     assert report.calls == 9
     assert report.method == "two-paint"
     for drive in report.drives:
-        # The town draws the outline to the nearest of its own pixels, each two wide in the camera picture.
-        assert drive.stated_px.mean < 2.0
+        assert drive.stated_px.mean < 0.5
         assert drive.residual_px.mean < 1.0
 
 
@@ -95,12 +94,12 @@ def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(tow
 def test_poses_alone_are_exact_in_the_town_and_take_no_calls_of_their_own(town, drives, two_paint, folder):
     driven = len(list(folder.iterdir()))
     found = calibrate(town, drives, Method.POSE, folder=folder)
-    assert len(list(folder.iterdir())) == driven, "white and black are those of the two-paint calibration"
+    assert len(list(folder.iterdir())) == driven, "light and dark are those of the two-paint calibration"
     assert max(drive.stated_px.p95 for drive in found.report.drives) < 0.01
 
 
 def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, drives, two_paint, folder):
-    (folder / "clean-white.npz").write_bytes(b"cut")
+    (folder / "clean-light.npz").write_bytes(b"cut")
     shown = []
     steps = []
     step = town.step
@@ -158,7 +157,7 @@ def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, drives, m
 
 
 def test_a_canvas_that_never_shows_is_refused(town, drives, monkeypatch):
-    """As if something stood before all of it: white and black look alike."""
+    """As if something stood before all of it: light and dark look alike."""
     monkeypatch.setattr(
         "roadproof.calibration.replays.rollout",
         lambda sim, who, scenario, **how: rollout(sim, who, scenario, **how | {"pattern": None}),
