@@ -63,14 +63,6 @@ def test_light_that_changes_over_the_canvas_does_not_move_it(scene):
     assert error_px(fit_outline(prior, lit, CIL_CAMERA, view).image_from_canvas, truth) < 0.6
 
 
-def test_without_squares_the_outline_alone_is_used(scene):
-    truth, visible, view = scene
-    outline = (visible > 0).astype(np.float64)
-    prior = moved(truth, np.tile(OFF, (len(truth), 1)), CIL_CAMERA)
-    fit = fit_outline(prior, outline, CIL_CAMERA, view, squares=1)
-    assert error_px(fit.image_from_canvas, truth) < 0.3 * error_px(prior, truth)
-
-
 def test_what_stands_in_the_way_is_not_taken_for_the_edge_of_the_canvas(scene):
     truth, visible, view = scene
     hidden = visible.copy()

@@ -88,7 +88,6 @@ def fit_outline(
     camera: CameraModel,
     view: CropResize,
     *,
-    squares: int = SQUARES,
     doubt: PoseDoubt | None = None,
 ) -> OutlineFit:
     """Move homographies until canvas and squares lie where they are seen.
@@ -98,16 +97,15 @@ def fit_outline(
         contrast: D, light less dark frames at the controller's input, mean over channels, 1 being white less black.
         camera: the pinhole.
         view: how the input is made from its picture.
-        squares: along each side of the canvas in the dark frames; 1 for none, all black.
         doubt: how far the pose may be off.
     """
     common, own = (PoseDoubt() if doubt is None else doubt).precisions
     moves = np.zeros((len(prior), 6))
     for blur, steps in zip(_BLURS_PX, _STEPS, strict=True):
-        problem = _Outline(prior, contrast, camera, view, squares, blur, moves)
+        problem = _Outline(prior, contrast, camera, view, blur, moves)
         for _ in range(steps):
             moves = problem.step(moves, common, own)
-    finest = _Outline(prior, contrast, camera, view, squares, 0, moves)
+    finest = _Outline(prior, contrast, camera, view, 0, moves)
     return OutlineFit(moved(prior, moves, camera), finest.outline_px(moves))
 
 
@@ -116,16 +114,14 @@ def outline_errors_px(
     contrast: Float[np.ndarray, "f h w"],
     camera: CameraModel,
     view: CropResize,
-    *,
-    squares: int = SQUARES,
 ) -> Float[np.ndarray, " f"]:
     """Mean distance of predicted from measured edges, camera px, a frame; NaN where none is in view."""
     unmoved = np.zeros((len(contrast), 6))
-    return _Outline(image_from_canvas, contrast, camera, view, squares, 0, unmoved).outline_px(unmoved)
+    return _Outline(image_from_canvas, contrast, camera, view, 0, unmoved).outline_px(unmoved)
 
 
 def predicted_contrast(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, *, squares: int = SQUARES
+    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
 ) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, "f h w"]]:
     """Share of the canvas in every pixel's footprint, and that less what the squares take: p."""
     canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
@@ -136,7 +132,6 @@ def predicted_contrast(
         np.repeat(canvas_from_input, count, 0),
         np.tile(pixel, (frames, 1)),
         FOOTPRINT_VARIANCE[view.resampling],
-        squares,
     )
     shape = (frames, view.height_px, view.width_px)
     return share.reshape(shape), paint.reshape(shape)
@@ -177,13 +172,12 @@ class _Outline:
         contrast: Float[np.ndarray, "f h w"],
         camera: CameraModel,
         view: CropResize,
-        squares: int,
         blur_px: int,
         moves: Float[np.ndarray, "f 6"],
     ) -> None:
-        self._prior, self._camera, self._view, self._squares = prior, camera, view, squares
+        self._prior, self._camera, self._view = prior, camera, view
         self._variance = FOOTPRINT_VARIANCE[view.resampling] + blur_px**2
-        _, expected = predicted_contrast(moved(prior, moves, camera), view, squares=squares)
+        _, expected = predicted_contrast(moved(prior, moves, camera), view)
         blurred, whole = _blurred(_over_gain(contrast, expected), blur_px)
         self._frame, row, column = np.nonzero(whole & _near_edge(blurred))
         self._pixel = np.stack([column, row, np.ones_like(row)], -1).astype(np.float64)
@@ -225,11 +219,11 @@ class _Outline:
         self, canvas_from_input: Float[np.ndarray, "f 3 3"], pixel: Float[np.ndarray, "p 3"]
     ) -> Float[np.ndarray, " p"]:
         """Share of each footprint that lies on the canvas (`coverage`, for one rectangle that is not turned)."""
-        return _canvas_shares(canvas_from_input[self._frame], pixel, self._variance, self._squares)[1]
+        return _canvas_shares(canvas_from_input[self._frame], pixel, self._variance)[1]
 
 
 def _canvas_shares(
-    canvas_from_input: Float[np.ndarray, "p 3 3"], pixel: Float[np.ndarray, "p 3"], variance: float, squares: int
+    canvas_from_input: Float[np.ndarray, "p 3 3"], pixel: Float[np.ndarray, "p 3"], variance: float
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Share of each footprint on the canvas, and p.
 
@@ -241,12 +235,12 @@ def _canvas_shares(
     at = mapped[:, :2] / depth
     jacobian = (canvas_from_input[:, :2, :2] - at[:, :, None] * canvas_from_input[:, 2:, :2]) / depth[..., None]
     reach = np.sqrt(variance * np.square(jacobian).sum(-1) + 1e-9)
-    edges = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, squares + 1)
+    edges = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, SQUARES + 1)
     steps = [_tent((at - edge) / reach) for edge in edges]
     share = (steps[0] - steps[-1]).prod(-1)
-    sides = [(-1.0) ** k * (steps[k] - steps[k + 1]) for k in range(squares)]
+    sides = [(-1.0) ** k * (steps[k] - steps[k + 1]) for k in range(SQUARES)]
     wave = np.sum(sides, 0).prod(-1)
-    grey = 0.5 * (share + wave) if squares > 1 else np.zeros_like(share)
+    grey = 0.5 * (share + wave)
     return np.where(ahead, share, 0.0), np.where(ahead, share - GREY * grey, 0.0)
 
 
@@ -311,5 +305,5 @@ def _arrow_step(
     # Of frame f: c costs ½ cᵀ(O − O (N+O)⁻¹ O) c − cᵀ O (N+O)⁻¹ target.
     curvature = common + (own - own @ inverse @ own).sum(0)
     pull = np.einsum("ij,fjk,fk->i", own, inverse, target)
-    shared: Float[np.ndarray, " 6"] = np.linalg.solve(curvature, pull)
+    shared = np.asarray(np.linalg.solve(curvature, pull), np.float64)
     return np.einsum("fij,fj->fi", inverse, target + own @ shared)
