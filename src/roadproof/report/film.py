@@ -30,6 +30,7 @@ VIEW = (640, 480)
 CAPTION_PX = 96
 STRIP_COLUMNS = 6
 STRIP_SIZE = (400, 300)
+STRIP_HORIZON_M = 14.0
 EVENT_SHOWN_S = 3.0
 INK, PAPER, FAINT, CLEAN, PAINTED = (30, 33, 38), (250, 249, 246), (110, 114, 120), (36, 92, 168), (184, 58, 26)
 
@@ -87,7 +88,7 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     bare = _pictures(simulator, evaluation.scenario, clean, None)
     driven = _pictures(simulator, evaluation.scenario, painted, paint)
     beside = lateral_m(path_of(clean), path_of(painted))
-    seen = passage(path_of(clean), evaluation.scenario.canvas)
+    seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
     last = min(len(clean), len(painted)) - 1
     first, end = min(seen.start, last), min(seen.stop - 1, last)
     steps: list[int] = sorted({round(first + (end - first) * k / (STRIP_COLUMNS - 1)) for k in range(STRIP_COLUMNS)})
@@ -172,7 +173,7 @@ class _Pages:
             pen.rectangle((left, VIEW[1], left + VIEW[0], VIEW[1] + 5), fill=colour)
             pen.text((left + 20, VIEW[1] + 18), title, colour, self._fonts[0])
             beside = (
-                f"{abs(self._beside[k]):.2f} m {'left' if self._beside[k] > 0 else 'right'} of it" if column else ""
+                f"{abs(self._beside[k]):.2f} m to the {'left' if self._beside[k] > 0 else 'right'}" if column else ""
             )
             words = f"{3.6 * episode.speed_mps[k]:.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
             pen.text((left + 20, VIEW[1] + 56), words, INK, self._fonts[1])
@@ -193,7 +194,7 @@ def _encode(av: Any, path: Path, pages: _Pages, rate: Fraction) -> None:  # noqa
     """H.264, coarser until the film is small enough."""
     for quality in (26, 30, 34, 38):
         with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-            options = {"crf": str(quality), "threads": "1", "preset": "medium"}
+            options = {"crf": str(quality), "threads": "1", "preset": "veryfast"}
             stream = container.add_stream("libx264", rate=rate, options=options)
             stream.width, stream.height, stream.pix_fmt = 2 * VIEW[0], VIEW[1] + CAPTION_PX, "yuv420p"
             for step in range(len(pages)):
