@@ -65,7 +65,7 @@ def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
         "perturbed less than asked",
         "1.40 m left",
         "45: too few points",
-        "0.21 (0.43)",
+        "0.20 (0.40)",
     ):
         assert words in text
     assert "#e5cc1a" in text, "the paint's own colour"
