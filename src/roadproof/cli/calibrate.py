@@ -22,6 +22,7 @@ def calibrate(
             "homographies from the poses; published: coloured points and 22 colours."
         ),
     ] = "two-paint",
+    simulator: Annotated[str, typer.Option(help="Where the drives were recorded: town.")] = "town",
 ) -> None:
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209
@@ -34,6 +35,7 @@ def calibrate(
     from roadproof.errors import CalibrationError, RecordingError
     from roadproof.files import check_writable
     from roadproof.recordings import load_recordings, save_recordings
+    from roadproof.simulators.loading import open_simulator
 
     how = choice(method, "method", METHODS)
     runs = [folder] if (folder / "record").is_dir() else sorted(path.parent for path in folder.glob("*/record"))
@@ -42,11 +44,8 @@ def calibrate(
     recorded = {path: load_drives(path / "record") for path in runs}
     check_writable(folder)
 
-    # Panda3D is an extra.
-    from roadproof.simulators.town.simulator import TownSimulator
-
     for path, drives in recorded.items():
-        settings, report = drives.settings, path / "calibration" / "report.json"
+        report = path / "calibration" / "report.json"
         if (path / "recordings").exists():
             load_recordings(path / "recordings")
             done = load_report(report)
@@ -57,11 +56,11 @@ def calibrate(
             _summarise(done, path)
             continue
         with (
-            TownSimulator(camera=settings.camera, input=settings.view, dt_s=settings.dt_s) as town,
+            open_simulator(simulator) as world,
             progress(f"Calibrating {path.name}", replays_needed(drives, how), "replays") as show,
         ):
             result = run(
-                town, drives, how, folder=path / "calibration", on_call=lambda done, show=show: show(done, 0.0)
+                world, drives, how, folder=path / "calibration", on_call=lambda done, show=show: show(done, 0.0)
             )
         result.report.save(report)
         save_recordings(result.recordings, path / "recordings")

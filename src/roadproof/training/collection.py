@@ -23,9 +23,9 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage
 from roadproof.simulators.town.maps import load_map
 from roadproof.simulators.town.simulator import TownSimulator
-from roadproof.training.drives import Displacement, Knocks, random_scenario
 from roadproof.training.expert import Expert
 from roadproof.training.shards import Shard
+from roadproof.training.ways import Displacement, Knocks, random_scenario
 from roadproof.training.workers import Seat, spread
 
 STEP_S = 0.1

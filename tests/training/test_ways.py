@@ -10,7 +10,7 @@ from roadproof.datatypes import Command, Control
 from roadproof.errors import ScenarioError
 from roadproof.simulators.town.maps import load_map, scenario_route
 from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.training.drives import LENGTHS_M, Displacement, Knocks, random_scenario
+from roadproof.training.ways import LENGTHS_M, Displacement, Knocks, random_scenario
 
 
 @pytest.mark.parametrize("map_name", ["town", "second"])

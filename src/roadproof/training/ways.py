@@ -1,4 +1,4 @@
-"""Drives to learn from: random ways through a map, and the knocks that make recovery worth recording.
+"""What drives to learn from are made of: random ways through a map, and the knocks that make recovery worth recording.
 
 Convention:
     Offsets and headings are positive to the left, `steer` to the right, as everywhere.
