@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from roadproof.controllers import load_controller as load_controller
     from roadproof.coverage import Shape as Shape
     from roadproof.errors import RoadproofError as RoadproofError
+    from roadproof.evaluation import Evaluation as Evaluation
+    from roadproof.evaluation import evaluate as evaluate
     from roadproof.geometry import CameraModel as CameraModel
     from roadproof.geometry import CanvasPlacement as CanvasPlacement
     from roadproof.geometry import CropResize as CropResize
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from roadproof.recordings import RecordingSet as RecordingSet
     from roadproof.recordings import load_recordings as load_recordings
     from roadproof.recordings import save_recordings as save_recordings
+    from roadproof.report.page import write_report as write_report
     from roadproof.search_space import SearchSpace as SearchSpace
 
 __version__ = "0.1.0"
@@ -48,11 +51,13 @@ _ROOMS = {
     "controllers": ("Controller", "check_controller", "load_controller"),
     "coverage": ("Shape",),
     "errors": ("RoadproofError",),
+    "evaluation": ("Evaluation", "evaluate"),
     "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
     "objectives": ("Group",),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
     "photometry": ("ColourTransform", "fit_colour"),
     "recordings": ("Push", "Recording", "RecordingSet", "load_recordings", "save_recordings"),
+    "report.page": ("write_report",),
     "search_space": ("SearchSpace",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
