@@ -169,14 +169,14 @@ class _Pages:
         pen = ImageDraw.Draw(page)
         for column, (episode, pictures, title, colour) in enumerate(self._sides):
             left, k = column * VIEW[0], min(step, len(pictures) - 1)
-            page.paste(_opened(pictures[k]), (left, 0))
-            pen.rectangle((left, VIEW[1], left + VIEW[0], VIEW[1] + 5), fill=colour)
-            pen.text((left + 20, VIEW[1] + 18), title, colour, self._fonts[0])
+            page.paste(_opened(pictures[k]), (left, CAPTION_PX))
+            pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=colour)
+            pen.text((left + 20, 12), title, colour, self._fonts[0])
             beside = (
                 f"{abs(self._beside[k]):.2f} m to the {'left' if self._beside[k] > 0 else 'right'}" if column else ""
             )
             words = f"{3.6 * episode.speed_mps[k]:.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
-            pen.text((left + 20, VIEW[1] + 56), words, INK, self._fonts[1])
+            pen.text((left + 20, 50), words, INK, self._fonts[1])
             self._tell(pen, episode, float(episode.time_s[k]), left + VIEW[0] - 20)
         pen.line((VIEW[0], 0, VIEW[0], page.height), PAPER, 3)
         return page
@@ -187,7 +187,7 @@ class _Pages:
         words = str(fresh[-1].kind).replace("-", " ") if fresh else ""
         if now_s >= episode.time_s[-1]:
             words = words or str(episode.ending)
-        pen.text((right, VIEW[1] + 20), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")
+        pen.text((right, 14), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")
 
 
 def _encode(av: Any, path: Path, pages: _Pages, rate: Fraction) -> None:  # noqa: ANN401
