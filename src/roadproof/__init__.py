@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from roadproof.recordings import RecordingSet as RecordingSet
     from roadproof.recordings import load_recordings as load_recordings
     from roadproof.recordings import save_recordings as save_recordings
-    from roadproof.report.page import write_report as write_report
     from roadproof.search_space import SearchSpace as SearchSpace
 
 __version__ = "0.1.0"
@@ -57,7 +56,6 @@ _ROOMS = {
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
     "photometry": ("ColourTransform", "fit_colour"),
     "recordings": ("Push", "Recording", "RecordingSet", "load_recordings", "save_recordings"),
-    "report.page": ("write_report",),
     "search_space": ("SearchSpace",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
