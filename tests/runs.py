@@ -1,25 +1,31 @@
 """Run folders for tests, made by the real stages on drives whose paths are known."""
 
-import dataclasses
 import json
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
-from roadproof.attacks import AttackResult, Schedule
+from roadproof.attacks import AttackResult, Candidate, Schedule
 from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
+from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
 from roadproof.coverage import Shape
 from roadproof.datatypes import Event, EventKind, Weather
+from roadproof.drives import Drive, Trajectories, Window
+from roadproof.drives.drives import Settings, write_drive, write_settings
 from roadproof.evaluation import Evaluation
 from roadproof.evaluation.result import judge
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
+from roadproof.recordings import Push, save_recordings
 from roadproof.report.film import Strip
 from roadproof.rollout import Ending, Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.maps import load_map, scenario_route
+from scenes import recording_set
 
 PATTERN = Pattern(
     (Shape.RECTANGLE, Shape.RECTANGLE),
@@ -103,6 +109,7 @@ def write_attack(folder):
         group="clean+left",
         surrogate_shift=0.31,
         by_group={"clean+right": 0.21, "clean+left": 0.31},
+        candidates=(Candidate(PATTERN, "clean+left", 0.31),),
         history=np.stack([np.stack([steps, 0.8 * steps], -1), np.stack([1.1 * steps, steps], -1)], 1),
         stopped="all iterations done",
         cost=Cost(controller_frames=4800, seconds=31.0),
@@ -111,7 +118,6 @@ def write_attack(folder):
         space=SearchSpace(figures=2),
         schedule=Schedule.stretched(20),
         restarts=2,
-        draws=16,
         seed=0,
     ).save(folder)  # fmt: skip
 
@@ -124,6 +130,18 @@ def write_strip(folder):
     Image.fromarray(pictures[0, 0]).resize((320, 144)).save(folder / "film.jpg")
 
 
+def write_film(folder):
+    """A film of one second and a bit."""
+    av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
+    pages = np.random.default_rng(0).integers(0, 255, (3, 9, 20, 3), np.uint8).repeat(8, 0).repeat(64, 1).repeat(64, 2)
+    with av.open(str(folder / "film.mp4"), "w", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 1280, 576, "yuv420p"
+        for page in pages:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(page, "rgb24")))
+        container.mux(stream.encode())
+
+
 CRASH = (
     Event(EventKind.WRONG_LANE, 5.0, "1.2 m beside its lane"),
     Event(EventKind.COLLISION_STATIC, 6.0, "tree 7"),
@@ -131,14 +149,59 @@ CRASH = (
 
 
 def write_run(folder, **options):
-    """A whole run but for recordings and film."""
+    """A whole run but for the film."""
     write_attack(folder / "attack")
     evaluation = write_evaluation(folder / "evaluation", **options)
     write_strip(folder / "evaluation")
-    clean = driven(evaluation.scenario)
-    for name in ("clean", "left", "right"):
-        dataclasses.replace(clean, seed=1).save(folder / "record" / name / "episode.npz")
+    write_record(folder / "record", evaluation.scenario)
+    save_recordings(recording_set(frames=3), folder / "recordings")
+    write_calibration(folder / "calibration")
     return evaluation
+
+
+def write_calibration(folder):
+    """One good calibration."""
+    drives = tuple(
+        DriveReport(
+            name=name, frames=4, dropped=((45, "too few points"),), residual_px=Spread(0.2, 0.4), stated_px=None
+        )
+        for name in ("clean", "right", "left")
+    )
+    CalibrationReport(method="two-paint", drives=drives, colour_residual=None, calls=10, seconds=4.0).save(
+        folder / "report.json"
+    )
+
+
+def write_record(folder, scenario):
+    """Three recorded drives, of which one had to be tried twice."""
+    settings = Settings(
+        scenario=scenario,
+        weather=WEATHERS[0],
+        trajectories=Trajectories(),
+        window=Window(),
+        seed=0,
+        driver="cil",
+        camera=CIL_CAMERA,
+        view=CIL_INPUT,
+        dt_s=DT_S,
+    )
+    write_settings(settings, folder)
+    steps = np.arange(40, 60, 5)
+    for name, right_m, calls in (("clean", 0.0, 1), ("right", 1.5, 2), ("left", -1.4, 1)):
+        write_drive(
+            Drive(
+                name=name,
+                push=Push(name),
+                episode=driven(scenario, -right_m),
+                frame_number=steps,
+                frames=np.zeros((4, 88, 200, 3), np.uint8),
+                steer=np.zeros(4),
+                right_m=np.full(4, right_m),
+                calls=calls,
+                note="perturbed less than asked" if calls > 1 else "",
+            ),
+            folder,
+        )
 
 
 def read_result(folder):

@@ -11,7 +11,7 @@ from browser import opened
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
-from runs import CRASH, read_result, write_attack, write_evaluation, write_run
+from runs import CRASH, read_result, write_attack, write_evaluation, write_film, write_run
 
 SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
 HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)>"&'{{7*7}}$\\frac{1}{2}$"""
@@ -62,6 +62,10 @@ def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
         "rainy noon",
         "20 cars and 20 people",
         "use more restarts",
+        "perturbed less than asked",
+        "1.40 m left",
+        "45: too few points",
+        "0.21 (0.43)",
     ):
         assert words in text
     assert "#e5cc1a" in text, "the paint's own colour"
@@ -74,6 +78,8 @@ def test_the_numbers_shown_are_those_of_the_evaluation(run):
         trial.deviation_m for trial in evaluation.trials
     ]
     assert content["surrogate"]["shift"] == 0.31
+    calls = {each["stage"]: each["simulator_calls"] for each in content["cost"]}
+    assert calls == {"record": 4, "calibrate": 6, "attack": 0, "evaluate": 12}
     assert not {"shift", "by_group"} & set(content["closed_loop"])
     text = Page((folder / "report.html").read_text()).text
     for row in evaluation.rows():
@@ -204,21 +210,38 @@ def test_text_has_the_contrast_that_wcag_asks_for(run):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, True)])
-def test_a_browser_shows_everything_and_has_nothing_to_complain_about(run, width, dark):
-    with opened(run[0] / "report.html", width=width, dark=dark) as (page, complaints):
+def test_a_browser_shows_everything_and_has_nothing_to_complain_about(tmp_path):
+    evaluation = write_run(tmp_path, events=CRASH)
+    write_film(tmp_path / "evaluation")
+    with opened(write_report(tmp_path)) as (page, complaints):
+        for width, theme in ((1280, "light"), (390, "dark")):
+            page.set_viewport_size({"width": width, "height": 900})
+            page.emulate_media(color_scheme=theme)
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing sticks out to the side"
+            assert page.evaluate("[...document.querySelectorAll('svg text')].every(t => t.getBBox().height >= 8)")
         pictures = page.evaluate("[...document.images].map(each => each.complete && each.naturalWidth > 0)")
-        assert len(pictures) == 14
+        assert len(pictures) == 1 + 2 * 6
         assert all(pictures)
+        charts = page.evaluate("[...document.querySelectorAll('svg')].map(each => each.getBoundingClientRect().height)")
+        assert len(charts) == 4
+        assert min(charts) > 150
         rows = page.evaluate("document.querySelectorAll('#closed-loop tbody tr').length")
-        assert rows == len(run[1].rows()) == 6
-        assert page.evaluate(
-            "[...document.querySelectorAll('svg')].every(each => each.getBoundingClientRect().height > 99)"
+        assert rows == len(evaluation.rows()) == 6
+        page.wait_for_function("document.querySelector('video').readyState >= 2", timeout=60_000)
+        page.evaluate("document.querySelector('video').currentTime = 0.8")
+        page.wait_for_function("!document.querySelector('video').seeking", timeout=60_000)
+        film = page.evaluate(
+            "(v => [v.error, v.videoWidth, v.duration, v.currentTime])(document.querySelector('video'))"
         )
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing sticks out to the side"
-        small = page.evaluate(
-            """[...document.querySelectorAll('svg text')]
-               .filter(each => each.getBoundingClientRect().height < 8).map(each => each.textContent)"""
-        )
-        assert small == [], "legible"
+        assert film == [None, 1280, pytest.approx(1.2, abs=0.1), pytest.approx(0.8)]
+        assert complaints == []
+
+
+@pytest.mark.slow
+def test_a_browser_does_not_run_hostile_names(tmp_path):
+    scenario = dataclasses.replace(find_scenario("left-03", builtin_scenarios()), name=HOSTILE)
+    write_run(tmp_path, scenario=scenario, controller=HOSTILE)
+    with opened(write_report(tmp_path)) as (page, complaints):
+        assert page.inner_text("h1") == HOSTILE
+        assert page.evaluate("document.scripts.length") == 0
         assert complaints == []

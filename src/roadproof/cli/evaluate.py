@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,10 +23,10 @@ def evaluate(
     controller: Annotated[
         str,
         typer.Option(
-            help="A .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE, module:factory, or expert.",
-            show_default=False,
+            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
+            "pilotnet:FILE, module:factory, or expert."
         ),
-    ],
+    ] = "cil",
     scenario: Annotated[str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")] = "left-03",
     scenarios: Annotated[
         Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
@@ -43,6 +44,7 @@ def evaluate(
     ] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
     processes: Annotated[int, typer.Option(help="Drives made at once.")] = 1,
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
     seed: Annotated[int, typer.Option(help="Of the first run with traffic; the others count on.")] = 0,
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
@@ -62,6 +64,7 @@ def evaluate(
     from roadproof.patterns import load_pattern, read_paint
     from roadproof.recordings import load_recordings
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.simulators.loading import open_simulator
 
     driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
     skies = [Weather(choice(name.strip(), "weathers", tuple(Weather))) for name in weathers.split(",")]
@@ -72,14 +75,10 @@ def evaluate(
     recorded = None if recordings is None else load_recordings(recordings)
     check_writable(out)
     who = driver_of(controller, device)
-
-    # Panda3D is an extra.
-    from roadproof.simulators.town.simulator import TownSimulator
-
-    with TownSimulator() as town:
+    with open_simulator(simulator) as world:
         with progress(f"Driving {driven.name}", 100, "%, {:.0f} drives") as show:
             evaluation = run(
-                TownSimulator if processes > 1 else town,
+                partial(open_simulator, simulator) if processes > 1 else world,
                 who,
                 driven,
                 paint if figures is None else figures,
@@ -97,15 +96,15 @@ def evaluate(
         if film:
             from roadproof.report.film import film_trial
 
-            film_trial(town, evaluation, paint, out)
+            film_trial(world, evaluation, paint, out)
         fidelity = None
         if recorded is not None and figures is not None and isinstance(who, Controller):
-            fidelity = _compared(town, who, evaluation, figures, recorded, out)
+            fidelity = _compared(world, who, evaluation, figures, recorded, out)
     _summarise(evaluation, fidelity, recorded, out)
 
 
 def _compared(
-    town: Simulator, who: Controller, evaluation: Evaluation, figures: Pattern, recorded: RecordingSet, out: Path
+    world: Simulator, who: Controller, evaluation: Evaluation, figures: Pattern, recorded: RecordingSet, out: Path
 ) -> Fidelity | None:
     """The surrogate's frames beside the simulator's, where the set was recorded on this clean drive."""
     from roadproof.evaluation import compare_with_rendered, is_drive_of, rendered_frames
@@ -115,7 +114,7 @@ def _compared(
     drive = next((each for each in recorded.recordings if each.push == "clean"), None)
     if drive is None or not is_drive_of(drive, clean):
         return None
-    rendered = rendered_frames(town, evaluation.scenario, clean, figures, drive.frame_number)
+    rendered = rendered_frames(world, evaluation.scenario, clean, figures, drive.frame_number)
     fidelity = compare_with_rendered(figures, recorded, who, rendered, drive=drive.name)
     fidelity.save(out / "fidelity.npz")
     return fidelity

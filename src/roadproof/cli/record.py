@@ -21,8 +21,10 @@ def record(
     driver: Annotated[
         str,
         typer.Option(
-            help="expert, or a controller: a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
-            "module:factory."
+            "--controller",
+            "--driver",
+            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
+            "file, cil:FILE, pilotnet:FILE or module:factory.",
         ),
     ] = "expert",
     weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
@@ -43,6 +45,7 @@ def record(
     horizon_m: Annotated[float, typer.Option(help="Keep frames from so far before the canvas.")] = 25.0,
     frames: Annotated[int, typer.Option(help="Keep at most so many a drive.")] = 24,
     seed: Annotated[int, typer.Option(help="Of the perturbations.")] = 0,
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
 ) -> None:
@@ -56,6 +59,7 @@ def record(
     from roadproof.errors import RecordingError
     from roadproof.files import check_writable
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.simulators.loading import open_simulator
 
     known = load_scenarios(scenarios or BUILTIN_FILE)
     chosen = [find_scenario(name, known) for name in dict.fromkeys(names)]
@@ -71,14 +75,11 @@ def record(
     check_writable(out)
     who = driver_of(driver, device)
 
-    # Panda3D is an extra.
-    from roadproof.simulators.town.simulator import TownSimulator
-
-    with TownSimulator() as town:
+    with open_simulator(simulator) as world:
         for scenario in chosen:
             with progress(f"Recording {scenario.name}", wanted.count, "drives") as show:
                 drives = run(
-                    town,
+                    world,
                     who,
                     scenario,
                     weather=sky,

@@ -200,7 +200,7 @@ def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
         )
     count = min(settings.window.frames, which.size)
     which = which[np.unique(np.linspace(0, which.size - 1, count).round().astype(int))]
-    return np.array(film.steps)[which], np.stack([film.frames[k] for k in which]), which
+    return np.array(film.steps)[which], np.stack([film.frames[int(k)] for k in which]), which
 
 
 def in_view(

@@ -14,7 +14,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -38,6 +38,8 @@ CLEAN = "clean"
 _LOOK_S = 0.5
 
 AnyDriver: TypeAlias = Controller | Driver[Any]
+Opening: TypeAlias = Callable[[], AbstractContextManager[Simulator]]
+"""Makes a simulator for a with-block, as `TownSimulator` does."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,7 +58,7 @@ class _Drive:
 class _Work:
     """What a process needs to make drives."""
 
-    simulator: Callable[[], Simulator] | Simulator
+    simulator: Opening | Simulator
     driver: AnyDriver
     scenario: Scenario
     paints: dict[str, PatternImage]
@@ -64,7 +66,7 @@ class _Work:
 
 
 def evaluate(
-    simulator: Callable[[], Simulator] | Simulator,
+    simulator: Opening | Simulator,
     driver: AnyDriver,
     scenario: Scenario,
     pattern: Pattern | PatternImage,

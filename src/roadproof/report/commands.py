@@ -29,8 +29,9 @@ def commands_of(run: Run) -> tuple[str, ...]:
 
 def _attack(attack: AttackResult) -> list[str]:
     options = ["--figures", str(attack.space.figures), "--family", attack.space.family]
-    options += ["--groups", ",".join(attack.by_group), "--iterations", str(attack.schedule.iterations)]
-    return [*options, "--restarts", str(attack.restarts), "--draws", str(attack.draws), "--seed", str(attack.seed)]
+    options += ["--groups", ",".join(attack.by_group), "--schedule", "heats" if attack.schedule.heats else "published"]
+    options += ["--iterations", str(attack.schedule.iterations)]
+    return [*options, "--restarts", str(attack.restarts), "--seed", str(attack.seed)]
 
 
 def _evaluate(evaluation: Evaluation) -> list[str]:

@@ -90,7 +90,7 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     seen = passage(path_of(clean), evaluation.scenario.canvas)
     last = min(len(clean), len(painted)) - 1
     first, end = min(seen.start, last), min(seen.stop - 1, last)
-    steps = sorted({round(first + (end - first) * k / (STRIP_COLUMNS - 1)) for k in range(STRIP_COLUMNS)})
+    steps: list[int] = sorted({round(first + (end - first) * k / (STRIP_COLUMNS - 1)) for k in range(STRIP_COLUMNS)})
     Strip(
         time_s=painted.time_s[steps],
         lateral_m=beside[steps],

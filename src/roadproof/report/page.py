@@ -17,6 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
 import roadproof
+from roadproof.calibration.report import Spread
 from roadproof.files import write_atomically
 from roadproof.metrics import counted
 from roadproof.patterns import Pattern, raster
@@ -98,14 +99,15 @@ def result_of(run: Run) -> Fields:
         surrogate |= {"shift": run.attack.surrogate_shift, "by_group": run.attack.by_group}
     if run.judged is not None and run.judged.fidelity is not None:
         surrogate |= {"agreement": asdict(run.judged.fidelity.agreement)}
-    return content | {"surrogate": surrogate or None, "calibration": run.calibration, "cost": _costs(run)}
+    calibration = None if run.calibration is None else asdict(run.calibration)
+    return content | {"surrogate": surrogate or None, "calibration": calibration, "cost": _costs(run)}
 
 
 def _name(run: Run) -> str:
     if run.judged is not None:
         return run.judged.evaluation.scenario.name
     if run.drives:
-        return next(iter(run.drives.values())).scenario
+        return run.drives.settings.scenario.name
     return run.folder.resolve().name
 
 
@@ -168,7 +170,7 @@ def _judged(judged: Judged | None) -> Fields | None:
         else [
             {
                 "time": f"{strip.time_s[k]:.1f} s",
-                "beside": f"{abs(strip.lateral_m[k]):.2f} m {'left' if strip.lateral_m[k] > 0 else 'right'}",
+                "beside": _aside(float(strip.lateral_m[k])),
                 "clean": _picture(strip.clean[k]),
                 "painted": _picture(strip.painted[k]),
             }
@@ -281,18 +283,19 @@ def _fidelity(judged: Judged | None) -> Fields | None:
 def _recorded(run: Run) -> Fields | None:
     if run.drives is None and run.recordings is None:
         return None
-    pushes = {} if run.recordings is None else {each.name: each for each in run.recordings.recordings}
-    names: list[str] = [*(run.drives or {}), *(name for name in pushes if name not in (run.drives or {}))]
+    drives = {} if run.drives is None else {each.name: each for each in run.drives.drives}
+    calibrated = {} if run.recordings is None else {each.name: each for each in run.recordings.recordings}
     rows: list[Fields] = []
-    for name in names:
-        episode, recording = (run.drives or {}).get(name), pushes.get(name)
+    for name in [*drives, *(name for name in calibrated if name not in drives)]:
+        drive, recording = drives.get(name), calibrated.get(name)
+        kept = recording or drive
         rows.append(
             {
                 "name": name,
-                "push": MISSING if recording is None else str(recording.push),
-                "frames": MISSING if recording is None else str(len(recording.frames)),
-                "seconds": MISSING if episode is None else f"{episode.time_s[-1]:.1f}",
-                "ending": MISSING if episode is None else str(episode.ending),
+                "push": MISSING if kept is None else str(kept.push),
+                "frames": MISSING if kept is None else str(len(kept.frames)),
+                "aside": MISSING if drive is None else _aside(-drive.deviation_m),
+                "note": "" if drive is None else drive.note,
             }
         )
     return {"rows": rows, "origin": "" if run.recordings is None else run.recordings.origin}
@@ -302,43 +305,42 @@ def _calibration(run: Run) -> Fields | None:
     if run.recordings is None:
         return None
     maps = sum(each.maps is not None for each in run.recordings.recordings)
-    response = type(run.recordings.colour.response).__name__.removesuffix("Response").lower() or "unknown"
-    facts = [
-        ("colour model", response),
-        ("drives with gain and offset of every pixel", f"{maps} of {len(run.recordings.recordings)}"),
-    ]
-    return {"facts": facts + [(key.replace("_", " "), _fact(value)) for key, value in _leaves(run.calibration or {})]}
+    facts = [("drives with gain and offset of every pixel", f"{maps} of {len(run.recordings.recordings)}")]
+    report = run.calibration
+    if report is None:
+        return {"facts": facts, "drives": []}
+    colour = MISSING if report.colour_residual is None else f"{report.colour_residual:.1f} of 255 levels"
+    facts = [("method", report.method), ("colours fit within", colour), *facts]
+    return {
+        "facts": facts,
+        "drives": [
+            {
+                "name": drive.name,
+                "frames": drive.frames,
+                "residual": _spread(drive.residual_px),
+                "stated": _spread(drive.stated_px),
+                "dropped": "; ".join(f"{number}: {reason}" for number, reason in drive.dropped) or "none",
+            }
+            for drive in report.drives
+        ],
+    }
 
 
-def _leaves(content: Fields, prefix: str = "") -> list[tuple[str, object]]:
-    """What a calibration says of itself, flattened; format and version are of no interest here."""
-    found: list[tuple[str, object]] = []
-    for key, value in content.items():
-        if key in ("format", "version", "units"):
-            continue
-        if isinstance(value, dict):
-            found += _leaves(value, f"{prefix}{key}: ")  # pyright: ignore[reportUnknownArgumentType]
-        else:
-            found.append((f"{prefix}{key}", value))
-    return found
-
-
-def _fact(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, list):
-        return ", ".join(map(_fact, value)) or "none"  # pyright: ignore[reportUnknownArgumentType]
-    return MISSING if value is None else str(value)
+def _spread(spread: Spread | None) -> str:
+    return MISSING if spread is None else f"{spread.mean:.2f} ({spread.p95:.2f})"
 
 
 def _costs(run: Run) -> list[Fields]:
     """Simulator calls and seconds of each stage; None where the stage did not note them."""
     costs: list[Fields] = []
     if run.drives is not None:
-        costs.append({"stage": "record", "simulator_calls": len(run.drives), "seconds": None, "frames": None})
+        costs.append({"stage": "record", "simulator_calls": run.drives.calls, "seconds": None, "frames": None})
     if run.calibration is not None:
-        calls, seconds = (run.calibration.get(key) for key in ("simulator_calls", "seconds"))
-        costs.append({"stage": "calibrate", "simulator_calls": calls, "seconds": seconds, "frames": None})
+        # Its own count includes recording.
+        calls = run.calibration.calls - (0 if run.drives is None else run.drives.calls)
+        costs.append(
+            {"stage": "calibrate", "simulator_calls": calls, "seconds": run.calibration.seconds, "frames": None}
+        )
     if run.attack is not None:
         cost = run.attack.cost
         costs.append(
@@ -355,6 +357,10 @@ def _costs(run: Run) -> list[Fields]:
             }
         )
     return costs
+
+
+def _aside(left_m: float) -> str:
+    return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "0"
 
 
 def _words(weather: str) -> str:

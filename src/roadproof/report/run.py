@@ -9,16 +9,16 @@ RUN/commands.txt               optional: the commands that made it, one a line
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 
 from roadproof.attacks import AttackResult
+from roadproof.calibration.report import CalibrationReport, load_report
 from roadproof.datatypes import Weather
+from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Trial
 from roadproof.evaluation.result import load_paint
@@ -63,7 +63,7 @@ class Run:
 
     Args:
         folder: the run.
-        drives: recorded drives by name.
+        drives: as recorded.
         recordings: the calibrated set.
         calibration: what the calibration says of itself.
         attack: the attack's result.
@@ -72,9 +72,9 @@ class Run:
     """
 
     folder: Path
-    drives: dict[str, Episode] | None
+    drives: Drives | None
     recordings: RecordingSet | None
-    calibration: dict[str, Any] | None
+    calibration: CalibrationReport | None
     attack: AttackResult | None
     judged: Judged | None
     commands: tuple[str, ...]
@@ -90,9 +90,9 @@ def read_run(folder: Path) -> Run:
         raise RoadproofError(f"no folder {folder}; expected a run with record, recordings, attack or evaluation in it")
     run = Run(
         folder=folder,
-        drives=_drives(folder / "record"),
+        drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
-        calibration=_calibration(folder / "recordings" / "calibration.json"),
+        calibration=load_report(report) if (report := folder / "calibration" / "report.json").exists() else None,
         attack=AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None,
         judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,
         commands=_commands(folder / "commands.txt"),
@@ -102,21 +102,6 @@ def read_run(folder: Path) -> Run:
             f"{folder} has neither record, recordings, attack nor evaluation in it; nothing to report yet"
         )
     return run
-
-
-def _drives(folder: Path) -> dict[str, Episode] | None:
-    files = sorted(folder.glob("*/episode.npz"), key=lambda path: (path.parent.name != "clean", path.parent.name))
-    return {path.parent.name: Episode.load(path) for path in files} or None
-
-
-def _calibration(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
-        return None
-    try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RoadproofError(f"{path} cannot be read ({error}); calibrate again") from None
-    return cast("dict[str, Any]", content) if isinstance(content, dict) else None
 
 
 def _commands(path: Path) -> tuple[str, ...]:

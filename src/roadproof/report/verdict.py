@@ -42,7 +42,7 @@ def verdict(run: Run) -> Verdict:
             f"On composited frames the pattern shifts steering by {attack.surrogate_shift:+.3f} a frame "
             f"({attack.group}); nobody has driven over it yet.",
         )
-    drives = len(run.drives or {}) or len(run.recordings.recordings if run.recordings else ())
+    drives = len(run.drives.drives if run.drives else run.recordings.recordings if run.recordings else ())
     return Verdict("recorded", "Not attacked yet", f"{drives} drives are recorded; no pattern was searched yet.")
 
 
