@@ -109,6 +109,13 @@ def test_a_replay_drives_the_same_way_over_a_painted_road(town, episode):
     assert any((one != two).any() for one, two in zip(bare, painted, strict=True))
 
 
+def test_a_drive_stops_where_it_is_told_to(town):
+    stopped = rollout(town, Straight(0.1), SHORT, until=lambda seen: seen.time_s >= 0.5 - 1e-9)
+    assert stopped.ending is Ending.STOPPED
+    assert len(stopped) == 11
+    assert rollout(town, Straight(0.1), SHORT, until=lambda _: True).steer.size == 0
+
+
 def test_a_replay_brakes_after_its_last_control(town, episode):
     longer = dataclasses.replace(SHORT, time_limit_s=3.0)
     again = rollout(town, replay(episode), longer)

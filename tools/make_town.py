@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scenariogeneration import xodr
 
-from roadproof.simulators.town.opendrive import Clothoid
+from roadproof.simulators.town.road_records import Clothoid
 
 ASSETS = Path(__file__).parents[1] / "src" / "roadproof" / "simulators" / "town" / "assets"
 SHOULDER_M, SIDEWALK_M, MARK_M = 0.4, 2.6, 0.15

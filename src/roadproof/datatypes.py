@@ -93,6 +93,8 @@ class EventKind(StrEnum):
     COLLISION_STATIC = "collision-static"
     COLLISION_VEHICLE = "collision-vehicle"
     COLLISION_PEDESTRIAN = "collision-pedestrian"
+    RED_LIGHT = "red-light"
+    STOP_SIGN = "stop-sign"
     WRONG_LANE = "wrong-lane"
     SIDEWALK = "sidewalk"
     OFF_ROAD = "off-road"

@@ -28,6 +28,10 @@ class EpisodeError(RoadproofError, ValueError):
     """A driven episode, or its file, is incomplete, damaged or inconsistent."""
 
 
+class CalibrationError(RoadproofError, RuntimeError):
+    """A calibration that cannot be trusted; the message says why and what to do."""
+
+
 class ControllerError(RoadproofError, ValueError):
     """A controller cannot be loaded or does not do what attacks need of it."""
 
@@ -46,3 +50,11 @@ class SimulatorError(RoadproofError, RuntimeError):
 
 class ScenarioError(RoadproofError, ValueError):
     """A scenario, its map or its route is not valid."""
+
+
+class TrainingError(RoadproofError, ValueError):
+    """Recorded drives or training settings that nothing can be learnt from."""
+
+
+class StudyError(RoadproofError, ValueError):
+    """A study's plan, or a folder with its results, is not valid."""

@@ -56,6 +56,7 @@ class Ending(StrEnum):
 
     GOAL_REACHED = "goal reached"
     TIME_LIMIT = "time limit"
+    STOPPED = "stopped"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -186,6 +187,7 @@ def rollout(
     seed: int = 0,
     full_pictures: bool = False,
     on_step: OnStep | None = None,
+    until: Callable[[Observation], bool] | None = None,
 ) -> Episode:
     """Drive a scenario until it ends.
 
@@ -200,6 +202,7 @@ def rollout(
         seed: of cars and people.
         full_pictures: also show the full camera picture to driver and `on_step`.
         on_step: told of each step; the simulator still is where the observation was made.
+        until: stops the drive at the first observation it says yes to.
 
     Raises:
         SimulatorError: the simulator is not open, an argument does not fit, or a control is not finite.
@@ -218,9 +221,9 @@ def rollout(
         seed=seed,
         full_pictures=full_pictures,
     )
-    policy = _acting(driver) if isinstance(driver, Controller) else driver(simulator)
+    policy = policy_of(driver, simulator)
     rows, controls, events = [_row(seen)], list[Control](), list(seen.events)
-    while not seen.done:
+    while not (stopped := until is not None and until(seen)) and not seen.done:
         control = policy(seen)
         if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # drivers are the user's
             raise ControllerError(f"the driver answered {control!r}, expected a roadproof.datatypes.Control")
@@ -233,6 +236,7 @@ def rollout(
     if on_step is not None:
         on_step(seen, None)
     late = seen.time_s >= scenario.time_limit_s - 0.5 * simulator.dt_s
+    ending = Ending.STOPPED if stopped else Ending.TIME_LIMIT if late else Ending.GOAL_REACHED
     *observed, command = np.array(rows, np.float64).T
     given = [np.array([getattr(control, name) for control in controls], np.float64) for name in _GIVEN]
     return Episode(
@@ -243,7 +247,7 @@ def rollout(
         pedestrians=pedestrians,
         seed=seed,
         dt_s=simulator.dt_s,
-        ending=Ending.TIME_LIMIT if late else Ending.GOAL_REACHED,
+        ending=ending,
         events=tuple(events),
         command=command.astype(np.int64),
         **dict(zip((*_SEEN[:-1], *_GIVEN), chain(observed, given), strict=True)),
@@ -269,8 +273,11 @@ def replay(episode: Episode) -> Driver[Simulator]:
     return begin
 
 
-def _acting(controller: Controller) -> Policy:
-    return lambda seen: controller.act(seen.frame, seen.state.speed_mps, int(seen.command))
+def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:
+    """What a driver does in a drive that has just begun."""
+    if not isinstance(driver, Controller):
+        return driver(simulator)
+    return lambda seen: driver.act(seen.frame, seen.state.speed_mps, int(seen.command))
 
 
 def _check_size(controller: Controller, simulator: Simulator) -> None:

@@ -111,7 +111,7 @@ def test_a_drive_leaves_film_episode_and_a_summary(workplace, tmp_path):
 
 
 def test_a_controller_of_ones_own_drives_over_the_paint_and_its_events_are_told(workplace, tmp_path):
-    own = ["--driver", "own_drivers:Left", "--pattern", "pattern.json", "--out", str(tmp_path)]
+    own = ["--controller", "own_drivers:Left", "--pattern", "pattern.json", "--out", str(tmp_path)]
     done = drive(workplace, "--scenario", "longer", *own)
     assert done.returncode == 0, done.stderr
     assert "painted road" in done.stdout
@@ -128,16 +128,16 @@ def test_a_controller_of_ones_own_drives_over_the_paint_and_its_events_are_told(
 MISTAKES = {
     "unknown scenario": (["--scenario", "left-3"], "no scenario is called 'left-3'; did you mean 'left-03'?"),
     "unknown weather": (["--weather", "rainy-non"], "did you mean rainy-noon?"),
-    "unknown driver": (["--driver", "exprt"], "--driver is 'exprt', expected expert or a controller"),
-    "missing weights": (["--driver", "none.safetensors"], "none.safetensors does not exist"),
+    "unknown driver": (["--controller", "exprt"], "--controller is 'exprt', expected expert or a controller"),
+    "missing weights": (["--controller", "none.safetensors"], "none.safetensors does not exist"),
     "missing list": (["--scenarios", "none.toml"], "none.toml cannot be read"),
     "missing pattern": (["--pattern", "none.json"], "cannot read none.json"),
     "missing picture": (["--pattern", "none.png"], "no pattern none.png"),
     "broken pattern": (["--pattern", "broken.json"], "broken.json is not valid JSON"),
     "no picture": (["--pattern", "text.png"], "text.png is no pattern (.json) and no picture"),
     "small picture": (["--pattern", "small.png"], "small.png has 100×100 pixels, expected the canvas' 400×400"),
-    "wrong frame size": (["--driver", "own_drivers:Small"], "takes frames of 200×66, the simulator gives 200×88"),
-    "unknown device": (["--driver", "own_drivers:Left", "--device", "tpu"], "tpu"),
+    "wrong frame size": (["--controller", "own_drivers:Small"], "takes frames of 200×66, the simulator gives 200×88"),
+    "unknown device": (["--controller", "own_drivers:Left", "--device", "tpu"], "tpu"),
 }
 
 
@@ -176,7 +176,7 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_what_is_broken_is_one_clear_line_and_leaves_nothing(workplace, tmp_path, name):
     before, driver, message = BROKEN[name]
-    done = drive(workplace, "--scenario", "short", "--driver", driver, "--out", str(tmp_path), before=before)
+    done = drive(workplace, "--scenario", "short", "--controller", driver, "--out", str(tmp_path), before=before)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1

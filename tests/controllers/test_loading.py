@@ -126,9 +126,16 @@ def test_an_error_inside_a_factory_is_not_hidden(tmp_path, monkeypatch):
         load_controller("my_broken_driver:make")
 
 
-@pytest.mark.parametrize("spec", ["", "nonsense", "net.h5", "pilotnet:", "a b:c", "https://x.org/net"])
+def test_an_unknown_name_is_told_what_comes_with_the_package():
+    with pytest.raises(ControllerError, match="no controller called 'nonsense' comes with roadproof"):
+        load_controller("nonsense")
+
+
+@pytest.mark.parametrize("spec", ["", "Nonsense", "net.h5", "pilotnet:", "a b:c", "https://x.org/net"])
 def test_an_unknown_spec_lists_what_exists(spec):
-    with pytest.raises(ControllerError, match=r"expected FILE\.safetensors, cil:FILE.*module:factory") as refusal:
+    with pytest.raises(
+        ControllerError, match=r"expected the name of a shipped one.*FILE\.safetensors, cil:FILE.*module:factory"
+    ) as refusal:
         load_controller(spec)
     assert "\n" not in str(refusal.value)
 

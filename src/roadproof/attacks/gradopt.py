@@ -127,7 +127,7 @@ def gradopt(
     restarts: int,
     seed: int,
     checkpoint: Path | None = None,
-    on_step: Callable[[int, float], None] = lambda _iteration, _best: None,
+    on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> Search:
     """Minimise −δ over a search space.
 

@@ -13,8 +13,16 @@ from rich.console import Console
 
 from roadproof import __version__
 from roadproof.cli.attack import attack
+from roadproof.cli.calibrate import calibrate
+from roadproof.cli.check_controller import check_controller
+from roadproof.cli.controllers import controllers
+from roadproof.cli.demo import demo
 from roadproof.cli.drive import drive
+from roadproof.cli.evaluate import evaluate
+from roadproof.cli.record import record
+from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
+from roadproof.cli.train import train
 from roadproof.errors import RoadproofError
 
 app = typer.Typer(
@@ -23,7 +31,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-for verb in (attack, drive, scenarios):
+VERBS = (demo, record, calibrate, attack, evaluate, report, drive, scenarios, controllers, check_controller, train)
+for verb in VERBS:
     app.command()(verb)
 
 

@@ -17,7 +17,9 @@ def attack(
     controller: Annotated[
         str,
         typer.Option(
-            help="A .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or module:factory.", show_default=False
+            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE "
+            "or module:factory.",
+            show_default=False,
         ),
     ],
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,

@@ -1,20 +1,19 @@
-"""`roadproof drive`: one scenario driven in the town; its film and its episode out."""
+"""`roadproof drive`: one scenario driven; its film and its episode out."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from roadproof.controllers import Controller
     from roadproof.datatypes import Control, Observation
     from roadproof.report.video import DriveVideo
-    from roadproof.rollout import Episode, OnStep, Policy
-    from roadproof.simulators.town.simulator import TownSimulator
+    from roadproof.rollout import Episode, OnStep
+    from roadproof.simulators.loading import MappedSimulator
 
 
 def drive(
@@ -25,8 +24,10 @@ def drive(
     driver: Annotated[
         str,
         typer.Option(
-            help="expert, or a controller: a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
-            "module:factory."
+            "--controller",
+            "--driver",
+            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
+            "file, cil:FILE, pilotnet:FILE or module:factory.",
         ),
     ] = "expert",
     weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
@@ -37,40 +38,42 @@ def drive(
     cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
     pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
     seed: Annotated[int, typer.Option(help="Of the other cars and the people.")] = 0,
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),
 ) -> None:
-    """Drive a scenario in the town and film it."""
+    """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice
+    from roadproof.cli.options import choice, driver_of
     from roadproof.datatypes import Weather
     from roadproof.files import check_writable
     from roadproof.patterns import read_paint
     from roadproof.rollout import rollout
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
-    from roadproof.simulators.town.maps import load_map, scenario_route
+    from roadproof.simulators.loading import open_simulator
+    from roadproof.simulators.town.maps import scenario_route
 
     driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
     sky = Weather(choice(weather, "weather", tuple(Weather)))
     paint = None if pattern is None else read_paint(pattern)
     check_writable(out)
-    who = _driver(driver, device)
-    roads = load_map(driven.map_name)
-    route = scenario_route(driven, roads)
+    who = driver_of(driver, device)
 
-    # Panda3D and PyAV are extras.
+    # PyAV is an extra.
     from roadproof.report.video import DriveVideo
-    from roadproof.simulators.town.simulator import TownSimulator
 
-    with (
-        TownSimulator() as town,
-        DriveVideo(
-            out / "drive.mp4", roads=roads, route=route, canvas=driven.canvas, pattern=paint, dt_s=town.dt_s
-        ) as film,
-        _watched(town, film, f"Driving {driven.name}", route.length_m) as on_step,
-    ):
+    with ExitStack() as stack:
+        world = stack.enter_context(open_simulator(simulator))
+        roads = world.road_map(driven.map_name)
+        route = scenario_route(driven, roads)
+        film = stack.enter_context(
+            DriveVideo(
+                out / "drive.mp4", roads=roads, route=route, canvas=driven.canvas, pattern=paint, dt_s=world.dt_s
+            )
+        )
+        on_step = stack.enter_context(_watched(world, film, f"Driving {driven.name}", route.length_m))
         episode = rollout(
-            town,
+            world,
             who,
             driven,
             weather=sky,
@@ -85,22 +88,8 @@ def drive(
     _summarise(episode, out)
 
 
-def _driver(spec: str, device: str) -> Controller | Callable[[TownSimulator], Policy]:
-    """The expert, or the controller of a spec."""
-    from roadproof.controllers import load_controller
-    from roadproof.controllers.loading import SPECS
-    from roadproof.errors import ControllerError
-    from roadproof.training.expert import expert
-
-    if spec == "expert":
-        return expert
-    if spec.isidentifier():
-        raise ControllerError(f"--driver is {spec!r}, expected expert or a controller: {SPECS}")
-    return load_controller(spec, device=device)
-
-
 @contextmanager
-def _watched(town: TownSimulator, film: DriveVideo, title: str, length_m: float) -> Generator[OnStep]:
+def _watched(world: MappedSimulator, film: DriveVideo, title: str, length_m: float) -> Generator[OnStep]:
     """Films every step and shows how far the car is."""
     import numpy as np
 
@@ -111,9 +100,9 @@ def _watched(town: TownSimulator, film: DriveVideo, title: str, length_m: float)
 
     def on_step(seen: Observation, control: Control | None) -> None:
         nonlocal at_m
-        others, people = (np.column_stack([agents.x_m, agents.y_m]) for agents in (town.cars, town.pedestrians))
+        others, people = (np.column_stack([agents.x_m, agents.y_m]) for agents in (world.cars, world.pedestrians))
         film.add(seen, Control(0.0) if control is None else control, cars=others, people=people)
-        at_m = town.route.locate(seen.state.x_m, seen.state.y_m, at_m).arclength_m
+        at_m = world.route.locate(seen.state.x_m, seen.state.y_m, at_m).arclength_m
         show(round(at_m), 3.6 * seen.state.speed_mps)
 
     with progress(title, round(length_m), "m, {:.0f} km/h") as show:

@@ -1,12 +1,17 @@
-"""Options that take one of a few words."""
+"""Options that several verbs share."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 from roadproof.errors import RoadproofError
+
+if TYPE_CHECKING:
+    from roadproof.controllers import Controller
+    from roadproof.rollout import Policy
+    from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
 
@@ -23,3 +28,21 @@ def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:
     near = difflib.get_close_matches(value, allowed, 1)
     hint = f"; did you mean {near[0]}?" if near else ""
     raise RoadproofError(f"--{option} is {value!r}, expected one of {', '.join(allowed)}{hint}")
+
+
+def driver_of(spec: str, device: str) -> Controller | Callable[[MappedSimulator], Policy]:
+    """The expert, or the controller of a spec.
+
+    Raises:
+        ControllerError: it is neither, or cannot be loaded.
+    """
+    from roadproof.controllers import load_controller, shipped_names
+    from roadproof.controllers.loading import SPECS
+    from roadproof.errors import ControllerError
+    from roadproof.training.expert import expert
+
+    if spec == "expert":
+        return expert
+    if spec.isidentifier() and spec not in shipped_names():
+        raise ControllerError(f"--controller is {spec!r}, expected expert or a controller: {SPECS}")
+    return load_controller(spec, device=device)

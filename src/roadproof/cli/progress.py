@@ -6,7 +6,15 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 
 @contextmanager
@@ -21,6 +29,30 @@ def progress(title: str, total: int, value: str = "best {:.3f}") -> Generator[Ca
     Yields:
         What to call with the steps done and that number.
     """
+    with _bars() as bar:
+        task = bar.add_task(title, total=total, value=value.format(0.0))
+        yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
+
+
+@contextmanager
+def stages() -> Generator[Callable[[str, int, int, str], None]]:
+    """A bar for each of several stages, and the function that moves them.
+
+    Yields:
+        What to call with a stage's name, the steps done, how many there are, and what to show beside the bar.
+    """
+    with _bars() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def show(title: str, done: int, total: int, value: str) -> None:
+            if title not in tasks:
+                tasks[title] = bar.add_task(title, total=total, value=value)
+            bar.update(tasks[title], completed=done, value=value)
+
+        yield show
+
+
+def _bars() -> Progress:
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -31,6 +63,4 @@ def progress(title: str, total: int, value: str = "best {:.3f}") -> Generator[Ca
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task(title, total=total, value=value.format(0.0))
-        yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
+    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)

@@ -34,7 +34,7 @@ class ControllerCard:
     """What a weights file does not say by itself.
 
     Args:
-        architecture: "cil" or "pilotnet", or None for an exported network.
+        architecture: "cil", "pilotnet" or "conditional-pilotnet", or None for an exported network.
         width: CIL's factor on channels and units.
         activation: PilotNet's, "elu" or "relu".
         target_speed_mps: speed held when a network that only steers drives.

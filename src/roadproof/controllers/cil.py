@@ -164,10 +164,7 @@ class CIL(nn.Module):
         frames, speed, code = one_frame_batch(self, frame, speed_mps, command)
         with torch.no_grad():
             steer, gas, brake = map(float, self._controls(self._image_feature(frames), speed, code)[0])
-        brake = 0.0 if brake < 0.1 or gas > brake else brake
-        if speed_mps > 10.0 and brake == 0.0:
-            gas = 0.0
-        return Control(steer=steer, throttle=gas, brake=brake).clipped()
+        return agent_control(steer, gas, brake, speed_mps)
 
     def folded(self) -> CIL:
         """A copy for inference with batch normalisation merged into the convolutions: same answers, fewer operations.
@@ -201,6 +198,14 @@ class CIL(nn.Module):
         # All branches, then the commanded one: they are half a percent of the work, and nothing waits for the device.
         every = torch.stack([branch(joined) for branch in self.branches], dim=1)
         return every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, 3))[:, 0]
+
+
+def agent_control(steer: float, gas: float, brake: float, speed_mps: float) -> Control:
+    """What the published agent makes of its network's answer: no braking below 0.1, gas or brake but not both."""
+    brake = 0.0 if brake < 0.1 or gas > brake else brake
+    if speed_mps > 10.0 and brake == 0.0:
+        gas = 0.0
+    return Control(steer=steer, throttle=gas, brake=brake).clipped()
 
 
 def branch_of(command: Int[Tensor, " b"]) -> Int[Tensor, " b"]:

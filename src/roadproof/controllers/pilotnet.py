@@ -53,11 +53,7 @@ class PilotNet(nn.Module):
         super().__init__()
         self.activation = activation
         with seeded(seed):
-            inputs = (3, *(channels for channels, _, _ in _CHANNELS_KERNEL_STRIDE))
-            self.conv = nn.ModuleList(
-                nn.Conv2d(c_in, c_out, k, s)
-                for (c_out, k, s), c_in in zip(_CHANNELS_KERNEL_STRIDE, inputs, strict=False)
-            )
+            self.conv = pilotnet_convolutions()
             self.fc = nn.ModuleList(nn.Linear(i, o) for i, o in pairwise(_UNITS))
             initialise_xavier(self, bias=0.0)
         self.bend = nn.ELU() if activation == "elu" else nn.ReLU()
@@ -70,6 +66,14 @@ class PilotNet(nn.Module):
         for layer in self.fc[:-1]:
             hidden = self.bend(layer(hidden))
         return self.fc[-1](hidden)[:, 0]
+
+
+def pilotnet_convolutions() -> nn.ModuleList:
+    """The five convolutions, without what bends between them: 66×200 prepared frames to 64×1×18 maps."""
+    inputs = (3, *(channels for channels, _, _ in _CHANNELS_KERNEL_STRIDE))
+    return nn.ModuleList(
+        nn.Conv2d(c_in, c_out, k, s) for (c_out, k, s), c_in in zip(_CHANNELS_KERNEL_STRIDE, inputs, strict=False)
+    )
 
 
 def pilotnet_controller(

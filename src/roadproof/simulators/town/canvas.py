@@ -206,7 +206,7 @@ class Raster:
         ):  # fmt: skip
             polygon = _cut(polygon, plane)
         pieces: list[Piece] = []
-        canvas_from_raster = np.linalg.inv(raster)
+        canvas_from_raster: Homography | None = None
         bounds = (math.inf, *self.first_rows, -math.inf)
         for copy, (below, above) in enumerate(itertools.pairwise(bounds)):
             part = polygon
@@ -215,6 +215,7 @@ class Raster:
             if math.isfinite(above):
                 part = _cut(part, (0.0, 1.0, -above, 0.0))
             if len(part) >= 3:
+                canvas_from_raster = np.linalg.inv(raster) if canvas_from_raster is None else canvas_from_raster
                 pixels = np.array([(round(x / w), round(y / w), 1.0) for x, y, w in part])
                 canvas = pixels @ canvas_from_raster.T
                 pieces.append(Piece(copy, canvas[:, :2] / canvas[:, 2:]))
@@ -236,6 +237,10 @@ def _cut(polygon: list[Corner], plane: tuple[float, float, float, float]) -> lis
     """The part of a convex polygon of homogeneous points on the positive side of a plane (Sutherland and Hodgman)."""
     a, b, c, d = plane
     side = [a * x + b * y + c * w + d for x, y, w in polygon]
+    if not polygon or min(side) >= 0:
+        return polygon
+    if max(side) < 0:
+        return []
     kept: list[Corner] = []
     for i, (here, s) in enumerate(zip(polygon, side, strict=True)):
         before, t = polygon[i - 1], side[i - 1]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from roadproof.datatypes import VehicleState
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
-from roadproof.simulators.town.canvas import COARSEST, PATCH_PX, Raster, RoadPatch, copies, reductions_for
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
+from roadproof.simulators.town.canvas import COARSEST, NEAREST_M, PATCH_PX, Raster, RoadPatch, copies, reductions_for
 from roadproof.simulators.town.engine import VERTEX, Path, Texture, fill_texture, make_node, make_texture, refill_node
 from roadproof.simulators.town.layers import Layer, dress
 
@@ -29,11 +30,15 @@ class CanvasNode:
         self._rasters: list[Raster] = []
         self._reductions: list[tuple[int, int]] = []
         self._textures: list[Texture] = []
+        self._world_from_canvas: Float[np.ndarray, "4 3"] = np.zeros((4, 3))
+        self._corners: list[tuple[float, float, float]] = []
+        self._shown = [False] * (COARSEST + 1)
         fan = np.array([[0, i, i + 1] for i in range(1, PIECE_CORNERS - 1)])
         self._fans = [make_node("canvas", np.zeros(PIECE_CORNERS, VERTEX), fan) for _ in range(COARSEST + 1)]
         self._paths = [self._root.attach_new_node(node) for node in self._fans]
         for path in self._paths:
             dress(path, Layer.CANVAS)
+            path.hide()
 
     def forget(self) -> None:
         """The light has changed: bake anew."""
@@ -44,6 +49,10 @@ class CanvasNode:
         if placement == self._placement:
             return
         self._placement, self._patch = placement, bake()
+        self._world_from_canvas = placement.world_from_canvas
+        low, high = -0.5, CANVAS_SIZE_PX - 0.5
+        outline = np.array([(low, low, 1.0), (high, low, 1.0), (high, high, 1.0), (low, high, 1.0)])
+        self._corners = [(x, y, z) for x, y, z, _ in (outline @ self._world_from_canvas.T).tolist()]
         crop, magnified = self._crops[0]
         across, down = crop.input_from_camera[0, 0] * magnified, crop.input_from_camera[1, 1] * magnified
         focal = self._camera.focal_px
@@ -68,21 +77,36 @@ class CanvasNode:
         """Shape the canvas for one view from one screen."""
         if self._placement is None:
             return
-        homography = homography_from_pose(self._camera, state, self._placement)
-        pieces = {piece.copy: piece for piece in self._rasters[which].pieces(homography)}
-        for k, (path, node) in enumerate(zip(self._paths, self._fans, strict=True)):
-            if k not in pieces:
-                path.hide()
-                continue
-            path.show()
-            outline = pieces[k].outline
-            # A fan of fixed size: the last corner is repeated.
-            corners = outline[np.minimum(np.arange(PIECE_CORNERS), len(outline) - 1)]
-            vertices = np.zeros(PIECE_CORNERS, VERTEX)
-            homogeneous = np.column_stack([corners, np.ones(PIECE_CORNERS)])
-            vertices["position"] = (homogeneous @ self._placement.world_from_canvas.T)[:, :3]
-            across, along = self._reductions[k]
-            texel = np.array([2**across, 2**along]) / PATCH_PX
-            vertices["uv"] = (corners + 0.5) / CANVAS_SIZE_PX * (1, -1) + (0, 1) + LINEAR_SHIFT * texel
-            vertices["colour"] = 255
-            refill_node(node, vertices)
+        outlines: dict[int, Float[np.ndarray, "n 2"]] = {}
+        if self._ahead_of(state):
+            homography = self._camera.image_from_world(state) @ self._world_from_canvas
+            outlines = {piece.copy: piece.outline for piece in self._rasters[which].pieces(homography)}
+        for k, (path, shown) in enumerate(zip(self._paths, self._shown, strict=True)):
+            if k in outlines:
+                refill_node(self._fans[k], self._vertices(k, outlines[k]))
+            if shown != (k in outlines):
+                self._shown[k] = not shown
+                (path.hide if shown else path.show)()
+
+    def _ahead_of(self, state: VehicleState) -> bool:
+        """Whether some corner is deep enough in front of the camera to be drawn."""
+        camera, (c, s) = self._camera, (math.cos(state.yaw_rad), math.sin(state.yaw_rad))
+        pitch = math.radians(camera.pitch_deg)
+        x, y = state.x_m + c * camera.forward_m, state.y_m + s * camera.forward_m
+        return any(
+            ((px - x) * c + (py - y) * s) * math.cos(pitch) + (pz - state.z_m - camera.up_m) * math.sin(pitch)
+            > NEAREST_M
+            for px, py, pz in self._corners
+        )
+
+    def _vertices(self, copy: int, outline: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """A fan of fixed size: the last corner is repeated."""
+        corners = outline[np.minimum(np.arange(PIECE_CORNERS), len(outline) - 1)]
+        vertices = np.zeros(PIECE_CORNERS, VERTEX)
+        homogeneous = np.column_stack([corners, np.ones(PIECE_CORNERS)])
+        vertices["position"] = (homogeneous @ self._world_from_canvas.T)[:, :3]
+        across, along = self._reductions[copy]
+        texel = np.array([2**across, 2**along]) / PATCH_PX
+        vertices["uv"] = (corners + 0.5) / CANVAS_SIZE_PX * (1, -1) + (0, 1) + LINEAR_SHIFT * texel
+        vertices["colour"] = 255
+        return vertices

@@ -207,10 +207,11 @@ class Screen:
         self._engine.render_frame()
         self._buffer.set_active(False)
         pixels = np.frombuffer(self._pixels.get_ram_image(), np.uint8)
-        # Named CMYK so that Pillow averages four plain channels; RGBA would be weighted by alpha.
-        plain = Image.frombuffer("CMYK", self._size, pixels, "raw", "CMYK", 0, 1)
-        bgra = np.asarray(plain.reduce(self._magnified))
-        return np.ascontiguousarray(bgra[::-1, :, 2::-1])
+        # Named RGBX so that Pillow averages four plain channels; RGBA would be weighted by alpha.
+        plain = Image.frombuffer("RGBX", self._size, pixels, "raw", "RGBX", 0, 1).reduce(self._magnified)
+        # The renderer's rows go from the bottom up and its first channel is blue.
+        rgb = np.frombuffer(plain.tobytes("raw", "BGR", 0, -1), np.uint8)
+        return rgb.reshape(plain.height, plain.width, 3).copy()
 
     def close(self) -> None:
         """Give the buffer and its memory back."""

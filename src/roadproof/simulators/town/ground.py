@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageChops, ImageDraw, ImageFilter
 
 from roadproof.simulators.town.lanes import Lane
@@ -222,6 +222,10 @@ class LitGround:
     def sunlit_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """1 in the sun, 0 in full shadow."""
         return self._at(self.sunlit, points_m)
+
+    def shaded_at(self, points_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+        """Whether the sun is hidden."""
+        return self.sunlit_at(points_m) < 0.5
 
     def open_sky_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Share of the sky that is seen."""

@@ -60,15 +60,15 @@ class Judge:
 
     def _departures(self, state: VehicleState) -> list[tuple[EventKind, str]]:
         """What is the matter with where the car is now."""
-        surfaces = self._roads.surface_at(np.array([*wheels(state), (state.x_m, state.y_m)]))
+        *below, middle = self._roads.surface_at(np.array([*wheels(state), (state.x_m, state.y_m)])).tolist()
         found: list[tuple[EventKind, str]] = []
-        if (surfaces[:4] == Surface.SIDEWALK).any():
+        if Surface.SIDEWALK in below:
             found.append((EventKind.SIDEWALK, "a wheel on the sidewalk"))
-        if (surfaces[:4] == Surface.OTHER).any():
+        if Surface.OTHER in below:
             found.append((EventKind.OFF_ROAD, "a wheel off the road"))
         place = self._roads.nearest_lane(state.x_m, state.y_m, state.yaw_rad)
         lane = self._roads.lanes[place.lane]
-        if surfaces[4] == Surface.DRIVING and lane.junction is None:
+        if middle == Surface.DRIVING and lane.junction is None:
             backwards = abs(place.heading_error_rad) > math.pi / 2
             if backwards or abs(place.lateral_m) > lane.width_m / 2 + 0.05:
                 found.append(

@@ -16,6 +16,18 @@ from jaxtyping import Float, Int
 Points = Float[np.ndarray, "n 3"]
 Rgb = tuple[float, float, float]
 WHITE: Rgb = (1.0, 1.0, 1.0)
+UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+FACE = np.array([[0, 1, 2], [0, 2, 3]])
+BOX_FACES = "xXyYzZ"
+BOX = np.array(
+    [
+        [(0, 1, 0), (0, 0, 0), (0, 0, 1), (0, 1, 1)], [(1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)],
+        [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)], [(1, 1, 0), (0, 1, 0), (0, 1, 1), (1, 1, 1)],
+        [(0, 1, 0), (1, 1, 0), (1, 0, 0), (0, 0, 0)], [(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)],
+    ],
+    float,
+)  # fmt: skip
+"""Corners of the faces of a box, 0 low and 1 high, counter-clockwise seen from outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,11 +96,20 @@ class MeshBuilder:
 
     def quad(self, corners: np.ndarray, uv: np.ndarray | None = None, albedo: np.ndarray | Rgb = WHITE) -> None:
         """A flat face of four corners, counter-clockwise from the lower left."""
-        corners = np.asarray(corners, float)
-        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-        length = np.linalg.norm(normal)
-        unit = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]]) if uv is None else uv
-        self.add(corners, normal / max(float(length), 1e-9), unit, albedo, np.array([[0, 1, 2], [0, 2, 3]]))
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = np.asarray(corners, float)[:3].tolist()
+        # By hand: numpy takes twenty times as long for three numbers, and a town has thousands of faces.
+        (ux, uy, uz), (vx, vy, vz) = (bx - ax, by - ay, bz - az), (cx - ax, cy - ay, cz - az)
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        length = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        self.add(corners, np.array([x / length, y / length, z / length]), UNIT if uv is None else uv, albedo, FACE)
+
+    def quads(self, corners: Float[np.ndarray, "f 4 3"], uv: np.ndarray, albedo: np.ndarray | Rgb) -> None:
+        """Flat faces; texture coordinates are (f, 4, 2), albedo is one for all or (f · 4, 3)."""
+        (ux, uy, uz), (vx, vy, vz) = ((corners[:, k] - corners[:, 0]).T for k in (1, 2))
+        normal = np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx], axis=-1)
+        normal /= np.maximum(np.sqrt((normal * normal).sum(axis=1, keepdims=True)), 1e-9)
+        triangles = (FACE + np.arange(len(corners))[:, None, None] * 4).reshape(-1, 3)
+        self.add(corners.reshape(-1, 3), normal.repeat(4, axis=0), uv.reshape(-1, 2), albedo, triangles)
 
     def tiles(self, corners: np.ndarray, across: float, up: float, albedo: np.ndarray | Rgb = WHITE) -> None:
         """A flat face with repeats of a texture, each repeat its own quad so that textures can share one picture.
@@ -99,19 +120,18 @@ class MeshBuilder:
             up: repeats along the left edge.
             albedo: one for all, or one per corner.
         """
-        shades = np.broadcast_to(np.asarray(albedo, float), (4, 3))
-        values = np.concatenate([np.asarray(corners, float), shades], axis=1)
-
-        def at(x: float, y: float) -> np.ndarray:
-            low = values[0] * (1 - x) + values[1] * x
-            return low * (1 - y) + (values[3] * (1 - x) + values[2] * x) * y
-
-        for i in range(math.ceil(across - 1e-6)):
-            for j in range(math.ceil(up - 1e-6)):
-                wide, high = min(1.0, across - i), min(1.0, up - j)
-                unit = np.array([(0, 0), (wide, 0), (wide, high), (0, high)])
-                part = np.array([at((i + u) / across, (j + v) / up) for u, v in unit])
-                self.quad(part[:, :3], unit, part[:, 3:])
+        if across == up == 1.0:
+            self.quad(corners, albedo=albedo)
+            return
+        values = np.empty((4, 6))
+        values[:, :3], values[:, 3:] = corners, albedo
+        columns, rows = (np.arange(math.ceil(n - 1e-6)) for n in (across, up))
+        i, j = columns.repeat(len(rows))[:, None], np.tile(rows, len(columns))[:, None]
+        u, v = UNIT[:, 0] * np.minimum(1.0, across - i), UNIT[:, 1] * np.minimum(1.0, up - j)
+        x, y = ((i + u) / across)[..., None], ((j + v) / up)[..., None]
+        low = values[0] * (1 - x) + values[1] * x
+        parts = low * (1 - y) + (values[3] * (1 - x) + values[2] * x) * y
+        self.quads(parts[..., :3], np.stack([u, v], axis=-1), parts[..., 3:].reshape(-1, 3))
 
     def box(
         self,
@@ -133,22 +153,16 @@ class MeshBuilder:
             tile_m: where given, the size of one repeat of the texture; whole repeats fit each side.
             faces: which: x, X, y, Y, z, Z for the low and high sides.
         """
-        (x0, y0, z0), (x1, y1, z1) = low, high
-        sides = {
-            "x": [(x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1)],
-            "X": [(x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)],
-            "y": [(x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1)],
-            "Y": [(x1, y1, z0), (x0, y1, z0), (x0, y1, z1), (x1, y1, z1)],
-            "z": [(x0, y1, z0), (x1, y1, z0), (x1, y0, z0), (x0, y0, z0)],
-            "Z": [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)],
-        }
-        for face in faces:
-            corners = np.array(sides[face], float)
-            across, up = 1.0, 1.0
-            if tile_m is not None:
-                across = max(1.0, round(float(np.linalg.norm(corners[1] - corners[0])) / tile_m[0], 0))
-                up = max(1.0, round(float(np.linalg.norm(corners[2] - corners[1])) / tile_m[1], 0))
-            self.tiles(pose.place(corners), across, up, albedo)
+        share = BOX[[BOX_FACES.index(face) for face in faces]]
+        corners = np.array(low) * (1.0 - share) + np.array(high) * share
+        placed = pose.place(corners.reshape(-1, 3)).reshape(-1, 4, 3)
+        if tile_m is None:
+            self.quads(placed, np.broadcast_to(UNIT, (len(placed), 4, 2)), albedo)
+            return
+        for local, face in zip(corners, placed, strict=True):
+            across = max(1.0, round(float(np.linalg.norm(local[1] - local[0])) / tile_m[0], 0))
+            up = max(1.0, round(float(np.linalg.norm(local[2] - local[1])) / tile_m[1], 0))
+            self.tiles(face, across, up, albedo)
 
     def tube(self, rings: list[tuple[float, float]], radius: float, pose: Pose, albedo: Rgb, sides: int = 8) -> None:
         """A round body along z: rings are (height, share of the radius)."""

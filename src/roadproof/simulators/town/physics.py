@@ -11,6 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float
+
 from roadproof.datatypes import Control, VehicleState
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
@@ -28,6 +31,7 @@ SUBSTEP_S = 0.01
 SETTLE_STEPS = 60
 CAR_HALF_M = (2.25, 0.93)
 TOUCH_M = 0.02
+TOUCHABLE_M = 40.0
 BLOCK_M = 30.0
 
 
@@ -71,6 +75,7 @@ class Physics:
             self._kinds[node.get_name()] = Contact("vehicle", f"car {i}")
             self._cars.append(self._place(node))
             self._stand(self._cars[-1], pose, HEIGHT_M)
+        self._stands = np.array([(pose.x_m, pose.y_m) for pose in cars]).reshape(-1, 2)
         self._chassis, self._path, self._vehicle = self._make_car(start)
         self._steer_rad = 0.0
         self._settle(start)
@@ -85,10 +90,16 @@ class Physics:
         self._drive(control)
         self._advance(count)
 
-    def move_cars(self, poses: Sequence[Pose]) -> None:
-        """Put the other cars where they are now."""
-        for path, pose in zip(self._cars, poses, strict=True):
-            self._stand(path, pose, HEIGHT_M)
+    def move_cars(self, places: Float[np.ndarray, "n 3"]) -> None:
+        """Put the other cars where they are now: x, y, yaw. What is far off and stays so is not moved: nobody sees."""
+        position = self._path.get_pos()
+        here, reach = (position.x, position.y), TOUCHABLE_M * TOUCHABLE_M
+        near = ((places[:, :2] - here) ** 2).sum(axis=1) < reach
+        near |= ((self._stands - here) ** 2).sum(axis=1) < reach
+        self._stands[near] = places[near, :2]
+        for i in np.flatnonzero(near).tolist():
+            x, y, yaw = places[i].tolist()
+            self._cars[i].set_pos_hpr(x, y, HEIGHT_M / 2, math.degrees(yaw), 0.0, 0.0)
 
     def state(self) -> VehicleState:
         """Pose and forward speed."""

@@ -80,7 +80,8 @@ class Route:
         if near_m is not None:
             low = max(0, int(np.searchsorted(self.arclengths_m, near_m - 15.0)) - 1)
             high = min(high, max(low + 1, int(np.searchsorted(self.arclengths_m, near_m + 15.0))))
-        start, step = self.points[low:high, :2], np.diff(self.points[low : high + 1, :2], axis=0)
+        start = self.points[low:high, :2]
+        step = self.points[low + 1 : high + 1, :2] - start
         reach = np.array([x_m, y_m]) - start
         length = self.arclengths_m[low + 1 : high + 1] - self.arclengths_m[low:high]
         along = np.clip((reach * step).sum(axis=1) / length, 0.0, length)

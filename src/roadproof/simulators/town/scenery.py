@@ -149,9 +149,9 @@ class _Edge:
     def pose(self, station_m: float, right_m: float) -> Pose:
         """A place beside the edge, turned along it."""
         s = min(max(station_m, 0.3), self.length_m - 0.3)
-        x, y = (np.interp([s - 0.3, s + 0.3], self.stations, self.points[:, k]) for k in (0, 1))
-        yaw = math.atan2(y[1] - y[0], x[1] - x[0])
-        return Pose(float(x.mean()), float(y.mean()), yaw).ahead(station_m - s, -right_m)
+        (x0, x1), (y0, y1) = (np.interp([s - 0.3, s + 0.3], self.stations, self.points[:, k]).tolist() for k in (0, 1))
+        yaw = math.atan2(y1 - y0, x1 - x0)
+        return Pose((x0 + x1) / 2, (y0 + y1) / 2, yaw).ahead(station_m - s, -right_m)
 
     def turn_per_m(self, station_m: float) -> float:
         """Curvature, positive to the left: the land on the right is then outside the bend."""

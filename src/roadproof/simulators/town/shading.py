@@ -1,4 +1,4 @@
-"""Vertex colours: albedo under the light of a weather."""
+"""Meshes under the light of a weather: vertex colours, and nodes that carry them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from roadproof.simulators.town.engine import VERTEX, Node, make_node
 from roadproof.simulators.town.meshes import Mesh
 from roadproof.simulators.town.weather import Sky
 
@@ -29,3 +30,12 @@ def rgba(colour: Float[np.ndarray, "n 3"], alpha: float = 1.0) -> UInt8[np.ndarr
     """Bytes of a colour in [0, 1]."""
     levels = np.column_stack([colour, np.full(len(colour), alpha)])
     return (np.clip(levels, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def mesh_node(mesh: Mesh, colours: UInt8[np.ndarray, "n 4"], ground_uv: Float[np.ndarray, "n 2"] | None = None) -> Node:
+    """A node of a mesh with its vertex colours and, on the ground, its place in the picture of the ground."""
+    vertices = np.zeros(len(mesh.points), VERTEX)
+    vertices["position"], vertices["uv"], vertices["colour"] = mesh.points, mesh.uv, colours
+    if ground_uv is not None:
+        vertices["ground_uv"] = ground_uv.round(5)
+    return make_node("mesh", vertices, mesh.triangles)

@@ -27,8 +27,8 @@ from roadproof.simulators.town.judge import Judge
 from roadproof.simulators.town.maps import load_map, scenario_route
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
-from roadproof.simulators.town.renderer import Actor, Renderer
-from roadproof.simulators.town.roadmap import RoadMap, Surface
+from roadproof.simulators.town.renderer import Renderer
+from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.routes import Route
 from roadproof.simulators.town.scenery import Scenery, build_scenery
 from roadproof.simulators.town.traffic import Traffic
@@ -128,6 +128,14 @@ class TownSimulator:
         assert self._town is not None
         return self._town.roads
 
+    def road_map(self, name: str) -> RoadMap:
+        """The map a scenario names; it needs no drive.
+
+        Raises:
+            ScenarioError: there is no such map, or it cannot be read.
+        """
+        return load_map(name)
+
     @property
     def route(self) -> Route:
         """The route of the current drive.
@@ -216,7 +224,7 @@ class TownSimulator:
         )
         town.renderer.set_weather(weather)
         town.renderer.set_canvas(scenario.canvas, pattern)
-        town.renderer.set_actors(_actors(self._drive, town.roads))
+        town.renderer.set_agents(self._drive.cars, self._drive.pedestrians)
         return self._observe(self._drive)
 
     def step(self, control: Control) -> Observation:
@@ -229,8 +237,8 @@ class TownSimulator:
         assert self._town is not None
         if drive.traffic is not None:
             drive.traffic.step(self._dt_s, drive.state)
-            drive.physics.move_cars(_poses(drive.cars))
-            self._town.renderer.move_actors(_actors(drive, self._town.roads))
+            drive.physics.move_cars(np.stack([drive.cars.x_m, drive.cars.y_m, drive.cars.yaw_rad], axis=1))
+            self._town.renderer.move_agents(drive.cars, drive.pedestrians)
         drive.physics.step(control.clipped(), self._dt_s)
         drive.state = drive.physics.state()
         drive.steps += 1
@@ -299,24 +307,3 @@ def _check_pattern(pattern: PatternImage | None) -> None:
 
 def _poses(cars: Agents) -> list[Pose]:
     return [Pose(float(x), float(y), float(yaw)) for x, y, yaw in zip(cars.x_m, cars.y_m, cars.yaw_rad, strict=True)]
-
-
-def _actors(drive: _Drive, roads: RoadMap) -> list[Actor]:
-    """Everyone on the move, as the renderer wants them."""
-    people = drive.pedestrians
-    raised = np.zeros(0, bool)
-    if len(people):
-        raised = roads.surface_at(np.column_stack([people.x_m, people.y_m])) == Surface.SIDEWALK
-    return [
-        Actor(
-            person=person,
-            look=int(agents.look[i]),
-            x_m=float(agents.x_m[i]),
-            y_m=float(agents.y_m[i]),
-            yaw_rad=float(agents.yaw_rad[i]),
-            raised=person and bool(raised[i]),
-            walked_m=float(agents.travelled_m[i]),
-        )
-        for agents, person in ((drive.cars, False), (people, True))
-        for i in range(len(agents))
-    ]

@@ -68,6 +68,7 @@ class TriangleIndex:
     """Which triangles hold a point; each triangle has a code, and the largest code wins."""
 
     corners: Float[np.ndarray, "t 3 2"]
+    edges: Float[np.ndarray, "t 3 2"]
     codes: Int[np.ndarray, " t"]
     grid: Grid
 
@@ -76,19 +77,22 @@ class TriangleIndex:
         cls, corners: Float[np.ndarray, "t 3 2"], codes: Int[np.ndarray, " t"], *, cell_m: float = 2.0
     ) -> TriangleIndex:
         """An index over triangles of either winding."""
-        return cls(corners, codes, Grid.over(corners.min(axis=1), corners.max(axis=1), cell_m=cell_m, margin_m=1e-6))
+        edges = np.roll(corners, -1, axis=1) - corners
+        grid = Grid.over(corners.min(axis=1), corners.max(axis=1), cell_m=cell_m, margin_m=1e-6)
+        return cls(corners, edges, codes, grid)
 
     def __call__(self, points_m: Points) -> Int[np.ndarray, " n"]:
         """The largest code among the triangles that hold each point; 0 where there is none."""
         codes = np.zeros(len(points_m), dtype=self.codes.dtype)
         point, triangle = self.grid.pairs(points_m)
-        held = _holds(self.corners[triangle], points_m[point])
+        held = _holds(self.corners[triangle], self.edges[triangle], points_m[point])
         np.maximum.at(codes, point[held], self.codes[triangle[held]])
         return codes
 
 
-def _holds(corners: Float[np.ndarray, "k 3 2"], points: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, " k"]:
-    edges = np.roll(corners, -1, axis=1) - corners
+def _holds(
+    corners: Float[np.ndarray, "k 3 2"], edges: Float[np.ndarray, "k 3 2"], points: Float[np.ndarray, "k 2"]
+) -> Bool[np.ndarray, " k"]:
     reach = points[:, None] - corners
     side = edges[..., 0] * reach[..., 1] - edges[..., 1] * reach[..., 0]
     return np.logical_or((side >= -1e-9).all(axis=1), (side <= 1e-9).all(axis=1))

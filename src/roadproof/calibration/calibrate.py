@@ -1,0 +1,196 @@
+"""The verb: recorded drives in, recordings ready for attacks out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.calibration.outline import fit_outline, outline_errors_px
+from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
+from roadproof.calibration.replays import Replays
+from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
+from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
+from roadproof.drives import Drive, Drives
+from roadproof.errors import CalibrationError
+from roadproof.geometry import Homography, homography_from_pose
+from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
+from roadproof.recordings import Recording, RecordingSet
+from roadproof.simulators.protocol import Simulator
+
+WORST_PX = 3.0
+LEAST_SHARE = 0.5
+
+
+class Method(StrEnum):
+    """How drives are calibrated.
+
+    two-paint: the canvas all white and all black, two replays a drive; homographies from its outline.
+    pose: the same colours; homographies from the camera model and the poses, unrefined.
+    published: 12 replays a drive over coloured points, 22 of the clean drive over painted colours.
+    """
+
+    TWO_PAINT = "two-paint"
+    POSE = "pose"
+    PUBLISHED = "published"
+
+
+METHODS = tuple(Method)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What came of a calibration."""
+
+    recordings: RecordingSet
+    report: CalibrationReport
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Geometry:
+    """Homographies of the frames of one drive that have one, and how well they fit."""
+
+    found: dict[int, Homography]
+    dropped: dict[int, str]
+    residuals_px: Float[np.ndarray, " n"]
+
+
+def replays_needed(drives: Drives, method: Method) -> int:
+    """Calls of the simulator on top of the recorded drives."""
+    count = len(drives.drives)
+    return RUNS * count + len(PAINTS) if method is Method.PUBLISHED else 2 * count
+
+
+def calibrate(
+    simulator: Simulator,
+    drives: Drives,
+    method: Method = Method.TWO_PAINT,
+    *,
+    folder: Path | None = None,
+    on_call: Callable[[int], object] = lambda _done: None,
+) -> Calibrated:
+    """Find out where the canvas is in every frame of recorded drives, and how paint looks there.
+
+    Args:
+        simulator: an open simulator, the one the drives were recorded in.
+        drives: what `drives.record` made.
+        method: how.
+        folder: keeps every replay; those it holds already are not driven again.
+        on_call: called with the number of replays so far.
+
+    Raises:
+        CalibrationError: a replay goes astray, or the calibration of a drive is bad; the message says why.
+        SimulatorError, ScenarioError: as `rollout` does.
+        OutputError: the folder cannot be written.
+    """
+    settings = drives.settings
+    if (simulator.camera, simulator.input, simulator.dt_s) != (settings.camera, settings.view, settings.dt_s):
+        raise CalibrationError(
+            "the simulator has another camera, crop or time step than when the drives were recorded; set it up as it "
+            "was then"
+        )
+    replays = Replays(simulator, drives, folder, on_call)
+    on_call(0)
+    began = time.perf_counter()
+    if method is Method.PUBLISHED:
+        geometry = [_from_points(replays, drive) for drive in drives.drives]
+        maps: list[PixelMaps | None] = [None] * len(geometry)
+        colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
+    else:
+        paints = [look_at_paints(replays, drive) for drive in drives.drives]
+        geometry = [
+            _from_paints(drives, drive, paint, refine=method is Method.TWO_PAINT)
+            for drive, paint in zip(drives.drives, paints, strict=True)
+        ]
+        maps = [at_frames(paint.maps, list(g.found)) for paint, g in zip(paints, geometry, strict=True)]
+        colour, residual = ColourTransform(AffineResponse.identity()), None
+    for drive, found in zip(drives.drives, geometry, strict=True):
+        _check(drive, found)
+    report = CalibrationReport(
+        method=str(method),
+        drives=tuple(_report(replays, drives, drive, g) for drive, g in zip(drives.drives, geometry, strict=True)),
+        colour_residual=residual,
+        calls=drives.calls + replays.calls,
+        seconds=time.perf_counter() - began,
+    )
+    recordings = RecordingSet(
+        camera=settings.camera,
+        view=settings.view,
+        colour=colour,
+        recordings=tuple(
+            _recording(drive, g, shading) for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
+        ),
+        origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
+    )
+    return Calibrated(recordings, report)
+
+
+def _from_points(replays: Replays, drive: Drive) -> _Geometry:
+    found, dropped, residuals = homographies_from_points(replays, drive)
+    return _Geometry(found, dropped, residuals)
+
+
+def _from_paints(drives: Drives, drive: Drive, paints: Paints, *, refine: bool) -> _Geometry:
+    settings = drives.settings
+    homographies = np.stack([homography_from_pose(settings.camera, s, settings.scenario.canvas) for s in drive.states])
+    if refine:
+        fit = fit_outline(homographies, paints.visible, settings.camera, settings.view)
+        homographies, errors = fit.image_from_canvas, fit.outline_px
+    else:
+        errors = outline_errors_px(homographies, paints.visible, settings.camera, settings.view)
+    found = {k: homographies[k] for k in range(len(homographies)) if k not in paints.dropped}
+    kept = errors[list(found)]
+    return _Geometry(found, paints.dropped, kept[np.isfinite(kept)])
+
+
+def _check(drive: Drive, geometry: _Geometry) -> None:
+    """Refuse what an attack should not be built on."""
+    count, left = len(drive.frames), len(geometry.found)
+    if left < LEAST_SHARE * count:
+        first = next(iter(geometry.dropped.values()))
+        raise CalibrationError(
+            f"drive {drive.name} has {left} of {count} frames left after calibration (first reason: {first}); record "
+            "nearer to the canvas (a smaller horizon), or choose another method or scenario"
+        )
+    error = float(np.mean(geometry.residuals_px)) if geometry.residuals_px.size else 0.0
+    if error > WORST_PX:
+        raise CalibrationError(
+            f"the homographies of drive {drive.name} miss what was seen by {error:.1f} px on average, expected at most "
+            f"{WORST_PX:g}; check camera model, poses and where the canvas lies"
+        )
+
+
+def _report(replays: Replays, drives: Drives, drive: Drive, geometry: _Geometry) -> DriveReport:
+    stated = replays.stated(drive)
+    kept = list(geometry.found)
+    homographies = np.stack(list(geometry.found.values()))
+    return DriveReport(
+        name=drive.name,
+        frames=len(kept),
+        dropped=tuple((int(drive.frame_number[k]), reason) for k, reason in geometry.dropped.items()),
+        residual_px=Spread.of(geometry.residuals_px),
+        stated_px=None
+        if stated is None
+        else Spread.of(stated_errors_px(homographies, stated[kept], drives.settings.camera)),
+    )
+
+
+def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None) -> Recording:
+    kept = list(geometry.found)
+    steps = drive.frame_number[kept]
+    return Recording(
+        name=drive.name,
+        push=drive.push,
+        frames=drive.frames[kept],
+        frame_number=steps,
+        image_from_canvas=np.stack(list(geometry.found.values())),
+        speed_mps=drive.episode.speed_mps[steps],
+        command=drive.episode.command[steps],
+        steer=drive.steer[kept],
+        maps=maps,
+    )

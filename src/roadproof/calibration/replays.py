@@ -1,0 +1,176 @@
+"""Recorded drives, driven again open loop over calibration targets; each replay is one call of the simulator."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from roadproof.datatypes import Control, Observation, VehicleState
+from roadproof.drives import Drive, Drives
+from roadproof.errors import CalibrationError
+from roadproof.files import write_atomically
+from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.rollout import replay, rollout
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+ASTRAY_M, ASTRAY_RAD = 0.02, 0.003
+
+
+class Replays:
+    """Runs replays, counts them, and keeps what was seen.
+
+    Args:
+        simulator: an open simulator, the one the drives were recorded in.
+        drives: what is driven again.
+        folder: keeps what each replay saw; what it holds is not driven again.
+        on_call: called with the number of replays so far.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        drives: Drives,
+        folder: Path | None = None,
+        on_call: Callable[[int], object] = lambda _done: None,
+    ) -> None:
+        self.calls = 0
+        self.seconds = 0.0
+        self._simulator, self._drives, self._folder, self._on_call = simulator, drives, folder, on_call
+        self._stated: dict[str, Float[np.ndarray, "f 3 3"]] = {}
+
+    def stated(self, drive: Drive) -> Float[np.ndarray, "f 3 3"] | None:
+        """The homographies the simulator itself states, for reports alone; None before the first replay of a drive."""
+        return self._stated.get(drive.name)
+
+    def frames(self, drive: Drive, name: str, paint: PatternImage) -> UInt8[np.ndarray, "f h w 3"]:
+        """The kept frames of a drive as they look with paint on the canvas.
+
+        Args:
+            drive: one of the drives.
+            name: of what is painted.
+            paint: on the canvas.
+
+        Raises:
+            CalibrationError: the replay goes another way than the drive.
+        """
+        return self.look(drive, name, paint, lambda seen: seen.frame)
+
+    def look(
+        self,
+        drive: Drive,
+        name: str,
+        paint: PatternImage,
+        see: Callable[[Observation], np.ndarray],
+        *,
+        full_pictures: bool = False,
+    ) -> np.ndarray:
+        """What `see` makes of each kept frame of a drive with paint on the canvas, stacked.
+
+        Args:
+            drive: one of the drives.
+            name: of what is painted and seen.
+            paint: on the canvas.
+            see: called with each of them.
+            full_pictures: whether it needs full camera pictures.
+
+        Raises:
+            CalibrationError: the replay goes another way than the drive.
+        """
+        path = None if self._folder is None else self._folder / f"{drive.name}-{name}.npz"
+        digest = _digest(self._drives, drive, paint)
+        kept = None if path is None else _read(path, digest)
+        if kept is None:
+            kept = self._drive_again(drive, paint, see, full_pictures) | {"of": np.array(digest)}
+            if path is not None:
+                _write(path, kept)
+        self.calls += 1
+        self.seconds += float(kept["seconds"])
+        self._stated[drive.name] = kept["stated"]
+        self._on_call(self.calls)
+        return kept["seen"]
+
+    def _drive_again(
+        self, drive: Drive, paint: PatternImage, see: Callable[[Observation], np.ndarray], full_pictures: bool
+    ) -> dict[str, np.ndarray]:
+        wanted = dict(zip(drive.frame_number.tolist(), drive.states, strict=True))
+        seen_there: list[np.ndarray] = []
+        stated: list[np.ndarray] = []
+        step, last = 0, int(drive.frame_number[-1])
+
+        def keep(seen: Observation, _: Control | None) -> None:
+            nonlocal step
+            if step in wanted:
+                _check_same_way(drive.name, step, seen.state, wanted[step])
+                seen_there.append(see(seen))
+                stated.append(self._simulator.image_from_canvas())
+            step += 1
+
+        settings, began = self._drives.settings, time.perf_counter()
+        rollout(
+            self._simulator,
+            replay(drive.episode),
+            settings.scenario,
+            weather=settings.weather,
+            pattern=paint,
+            full_pictures=full_pictures,
+            on_step=keep,
+            until=lambda _: step > last,
+        )
+        if len(seen_there) != len(wanted):
+            raise CalibrationError(
+                f"a replay of drive {drive.name} ended after {step} steps, before step {last}; record it again"
+            )
+        seconds = time.perf_counter() - began
+        return {"seen": np.stack(seen_there), "stated": np.stack(stated), "seconds": np.array(seconds)}
+
+
+def uniform(red: int, green: int, blue: int) -> PatternImage:
+    """A canvas painted all over."""
+    return np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), (red, green, blue, 255), np.uint8)
+
+
+def _check_same_way(name: str, step: int, state: VehicleState, wanted: VehicleState) -> None:
+    away = math.hypot(state.x_m - wanted.x_m, state.y_m - wanted.y_m)
+    turned = abs(math.remainder(state.yaw_rad - wanted.yaw_rad, math.tau))
+    if away > ASTRAY_M or turned > ASTRAY_RAD:
+        raise CalibrationError(
+            f"a replay of drive {name} is {away:.2f} m and {math.degrees(turned):.1f}° astray at step {step}; the "
+            "simulator does not repeat itself, or is not the one it was recorded in"
+        )
+
+
+def _digest(drives: Drives, drive: Drive, paint: PatternImage) -> str:
+    """Tells replays apart: the controls, the frames wanted, the paint, and where."""
+    digest = hashlib.sha256(repr((drives.settings, drive.name)).encode())
+    episode = drive.episode
+    for values in (episode.steer, episode.throttle, episode.brake, drive.frame_number, paint):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path, digest: str) -> dict[str, Any] | None:
+    """What a replay saw; None where there is none that can be used."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            if str(stored["of"]) != digest:
+                return None
+            return {name: np.asarray(stored[name]) for name in ("seen", "stated", "seconds")}
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError):
+        # Driving it again costs seconds and mends whatever it was.
+        return None
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    def write(part: Path) -> None:
+        with part.open("wb") as file:
+            np.savez_compressed(file, **content)
+
+    write_atomically(path, write)

@@ -1,0 +1,127 @@
+"""How good a calibration is, and what it cost."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.errors import CalibrationError
+from roadproof.files import read_json, write_atomically
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
+
+FORMAT = "roadproof-calibration"
+FORMAT_VERSION = 1
+_GRID = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Errors in px of the camera picture."""
+
+    mean: float
+    p95: float
+
+    @staticmethod
+    def of(errors: Float[np.ndarray, " n"]) -> Spread | None:
+        """Mean and 95th percentile; None of nothing."""
+        return Spread(float(errors.mean()), float(np.percentile(errors, 95))) if errors.size else None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DriveReport:
+    """What became of one drive.
+
+    Args:
+        name: of the drive.
+        frames: how many are left.
+        dropped: frame number and reason of each that was not.
+        residual_px: how far the homographies miss what they were fitted to: the detected points, or the outline of the
+            canvas; mean and 95th percentile, camera px.
+        stated_px: how far they miss the homographies that the simulator itself states, over a grid of canvas points in
+            view; camera px. None where no replay asked.
+    """
+
+    name: str
+    frames: int
+    dropped: tuple[tuple[int, str], ...]
+    residual_px: Spread | None
+    stated_px: Spread | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CalibrationReport:
+    """How good a calibration is, and what it cost.
+
+    Args:
+        method: how it was made.
+        drives: what became of each.
+        colour_residual: mean error of the fitted colours, 8-bit levels; None where they leave none (two paints and two
+            unknowns a pixel).
+        calls: drives the simulator made, recording included.
+        seconds: wall time of the replays and the fits, without recording.
+    """
+
+    method: str
+    drives: tuple[DriveReport, ...]
+    colour_residual: float | None
+    calls: int
+    seconds: float
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        content = {"format": FORMAT, "version": FORMAT_VERSION, **asdict(self)}
+        write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+
+
+def load_report(path: Path) -> CalibrationReport:
+    """Read what `CalibrationReport.save` wrote.
+
+    Raises:
+        CalibrationError: the file is missing or damaged.
+    """
+    content = read_json(path, FORMAT, FORMAT_VERSION, CalibrationError)
+
+    def spread(values: dict[str, float] | None) -> Spread | None:
+        return None if values is None else Spread(**values)
+
+    try:
+        return CalibrationReport(
+            method=str(content["method"]),
+            drives=tuple(
+                DriveReport(
+                    name=drive["name"],
+                    frames=drive["frames"],
+                    dropped=tuple((int(number), str(reason)) for number, reason in drive["dropped"]),
+                    residual_px=spread(drive["residual_px"]),
+                    stated_px=spread(drive["stated_px"]),
+                )
+                for drive in content["drives"]
+            ),
+            colour_residual=content["colour_residual"],
+            calls=content["calls"],
+            seconds=content["seconds"],
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(f"{path} is incomplete or damaged ({error}); calibrate again") from None
+
+
+def stated_errors_px(
+    image_from_canvas: Float[np.ndarray, "f 3 3"], stated: Float[np.ndarray, "g 3 3"], camera: CameraModel
+) -> Float[np.ndarray, " n"]:
+    """Distances between two views of a 9×9 grid of canvas points, corners included, where they are in the picture."""
+    side = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, _GRID)
+    grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    points = np.broadcast_to(grid, (len(stated), *grid.shape))
+    there = apply_homography(stated, points)
+    depth = (points @ np.swapaxes(stated[:, 2:, :2], 1, 2))[..., 0] + stated[:, 2, 2, None]
+    inside = (there > -0.5) & (there < np.array([camera.width_px, camera.height_px]) - 0.5)
+    seen = inside.all(-1) & (depth > 0)
+    return np.linalg.norm(apply_homography(image_from_canvas, points) - there, axis=-1)[seen]

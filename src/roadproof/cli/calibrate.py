@@ -1,0 +1,86 @@
+"""`roadproof calibrate`: recorded drives in, recordings ready for attacks out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from roadproof.calibration import CalibrationReport
+
+
+def calibrate(
+    folder: Annotated[
+        Path, typer.Argument(help="A run that `roadproof record` made, or a folder of such runs.", show_default=False)
+    ],
+    method: Annotated[
+        str,
+        typer.Option(
+            help="two-paint: canvas white and black, homographies from its outline; pose: the same colours, "
+            "homographies from the poses; published: coloured points and 22 colours."
+        ),
+    ] = "two-paint",
+    simulator: Annotated[str, typer.Option(help="Where the drives were recorded: town.")] = "town",
+) -> None:
+    """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
+    ended."""  # noqa: D205, D209
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.calibration import METHODS, load_report, replays_needed
+    from roadproof.calibration import calibrate as run
+    from roadproof.cli.options import choice
+    from roadproof.cli.progress import progress
+    from roadproof.drives import load_drives
+    from roadproof.errors import CalibrationError, RecordingError
+    from roadproof.files import check_writable
+    from roadproof.recordings import load_recordings, save_recordings
+    from roadproof.simulators.loading import open_simulator
+
+    how = choice(method, "method", METHODS)
+    runs = [folder] if (folder / "record").is_dir() else sorted(path.parent for path in folder.glob("*/record"))
+    if not runs:
+        raise RecordingError(f"{folder} holds no run with a folder named record; make one with `roadproof record`")
+    recorded = {path: load_drives(path / "record") for path in runs}
+    check_writable(folder)
+
+    for path, drives in recorded.items():
+        report = path / "calibration" / "report.json"
+        if (path / "recordings").exists():
+            load_recordings(path / "recordings")
+            done = load_report(report)
+            if done.method != how:
+                raise CalibrationError(
+                    f"{path / 'recordings'} was calibrated by {done.method}; remove it to calibrate again by {how}"
+                )
+            _summarise(done, path)
+            continue
+        with (
+            open_simulator(simulator) as world,
+            progress(f"Calibrating {path.name}", replays_needed(drives, how), "replays") as show,
+        ):
+            result = run(
+                world, drives, how, folder=path / "calibration", on_call=lambda done, show=show: show(done, 0.0)
+            )
+        result.report.save(report)
+        save_recordings(result.recordings, path / "recordings")
+        _summarise(result.report, path)
+
+
+def _summarise(report: CalibrationReport, run: Path) -> None:
+    from rich.console import Console
+
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    say(f"{run.name}, {report.method}: {report.calls} simulator calls, recording included, {report.seconds:.0f} s")
+    if report.colour_residual is not None:
+        say(f"  colours fit within {report.colour_residual:.1f} of 255 levels on average")
+    for drive in report.drives:
+        parts = [f"{drive.frames} frames"]
+        if drive.residual_px is not None:
+            parts.append(f"fits what was seen within {drive.residual_px.mean:.2f} px")
+        if drive.stated_px is not None:
+            parts.append(f"{drive.stated_px.mean:.2f} px from what the simulator states")
+        say(f"  {drive.name:8} {', '.join(parts)}")
+        for number, reason in drive.dropped:
+            say(f"    frame {number} dropped: {reason}")
+    say(f"Recordings in {run / 'recordings'}; next: roadproof attack {run / 'recordings'} --controller ...")

@@ -1,0 +1,88 @@
+"""`roadproof check-controller`: does a controller keep its promises, and does it drive?"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from roadproof.controllers import ControllerReport
+    from roadproof.training.scores import DrivingScore, Trial
+
+
+def check_controller(
+    spec: Annotated[
+        str,
+        typer.Argument(
+            help="A shipped controller (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
+            "pilotnet:FILE or module:factory."
+        ),
+    ],
+    scenarios: Annotated[
+        Path | None,
+        typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
+    ] = None,
+    weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
+    cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
+    pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
+    processes: Annotated[int, typer.Option(help="Simulators that drive at once; 0: one a core.")] = 0,
+    drive: Annotated[bool, typer.Option(help="Also drive the scenarios.")] = True,
+) -> None:
+    """Check what attacks rely on, then drive every scenario and count those without any event."""
+    from roadproof.cli.options import choice
+    from roadproof.cli.progress import progress
+    from roadproof.controllers import check_controller as check
+    from roadproof.controllers import load_controller
+    from roadproof.datatypes import Weather
+    from roadproof.scenarios import BUILTIN_FILE, load_scenarios
+
+    sky = Weather(choice(weather, "weather", tuple(Weather)))
+    driven = load_scenarios(scenarios or BUILTIN_FILE)
+    controller = load_controller(spec)
+    report = check(controller, size=controller.input_size or (88, 200))
+    _say_promises(report)
+    if not drive:
+        raise typer.Exit(0 if report.passed else 1)
+
+    # Panda3D is an extra.
+    from roadproof.training.scores import Trial, score_drives
+
+    trials = [Trial(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in driven]
+    scored: list[tuple[Trial, DrivingScore]] = []
+    with progress("Driving", len(trials), "{:.0f} clean") as show:
+        for done in score_drives(trials, spec, processes=processes or os.cpu_count() or 1):
+            scored.append(done)
+            show(len(scored), sum(score.clean for _, score in scored))
+    _say_scores(scored)
+    raise typer.Exit(0 if report.passed else 1)
+
+
+def _say_promises(report: ControllerReport) -> None:
+    from rich.console import Console
+
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    for check in report.checks:
+        verdict, advice = ("ok ", "") if check.passed else ("BAD", f"; {check.advice}")
+        say(f"{verdict} {check.name}: {check.found}{advice}")
+
+
+def _say_scores(scored: list[tuple[Trial, DrivingScore]]) -> None:
+    from rich.console import Console
+
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    scores = [score for _, score in scored]
+    clean, turns = sum(score.clean for score in scores), sum(score.turns for score in scores)
+    say(
+        f"{clean} of {len(scores)} scenarios clean; {sum(s.collisions for s in scores)} collisions; "
+        f"{sum(s.mean_lateral_m for s in scores) / len(scores):.2f} m off the lane's middle on average; "
+        f"steering changes by {sum(s.steer_change for s in scores) / len(scores):.4f} a step; "
+        f"{sum(s.turns_taken for s in scores)} of {turns} junctions left as commanded"
+    )
+    for trial, score in sorted(scored, key=lambda pair: pair[0].scenario.name):
+        if not score.clean:
+            what = ", ".join(f"{e.kind} at {e.time_s:.1f} s" for e in score.events) or "did not arrive"
+            x, y = score.failed_at_m or (0.0, 0.0)
+            say(f"  {trial.scenario.name}: {what}, near ({x:.0f}, {y:.0f})")

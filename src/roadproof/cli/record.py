@@ -1,0 +1,104 @@
+"""`roadproof record`: scenarios in, recorded drives past the bare canvas out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from roadproof.drives import Drives
+
+
+def record(
+    names: Annotated[
+        list[str], typer.Argument(help="Scenarios; `roadproof scenarios` lists them.", show_default=False)
+    ],
+    scenarios: Annotated[
+        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
+    ] = None,
+    driver: Annotated[
+        str,
+        typer.Option(
+            "--controller",
+            "--driver",
+            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
+            "file, cil:FILE, pilotnet:FILE or module:factory.",
+        ),
+    ] = "expert",
+    weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
+    trajectories: Annotated[int, typer.Option(help="T, how many drives: 1, 3, 5 or 7.")] = 3,
+    scheme: Annotated[
+        str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
+    ] = "group",
+    deviation_m: Annotated[
+        list[float] | None,
+        typer.Option(
+            help="How far drives are pushed aside; several are taken in turn.  [default: 1.5]", show_default=False
+        ),
+    ] = None,
+    noise_deg: Annotated[
+        tuple[int, int] | None,
+        typer.Option(help="Push by noise on the steering instead, least and most, as published.", show_default=False),
+    ] = None,
+    horizon_m: Annotated[float, typer.Option(help="Keep frames from so far before the canvas.")] = 25.0,
+    frames: Annotated[int, typer.Option(help="Keep at most so many a drive.")] = 24,
+    seed: Annotated[int, typer.Option(help="Of the perturbations.")] = 0,
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
+    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
+) -> None:
+    """Record drives past the canvas: clean, and pushed to the side. A second call goes on where the first ended."""
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.cli.options import choice, driver_of
+    from roadproof.cli.progress import progress
+    from roadproof.datatypes import Weather
+    from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
+    from roadproof.drives import record as run
+    from roadproof.errors import RecordingError
+    from roadproof.files import check_writable
+    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.simulators.loading import open_simulator
+
+    known = load_scenarios(scenarios or BUILTIN_FILE)
+    chosen = [find_scenario(name, known) for name in dict.fromkeys(names)]
+    sky = Weather(choice(weather, "weather", tuple(Weather)))
+    if noise_deg is not None and deviation_m:
+        raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to push drives aside")
+    wanted = Trajectories(
+        count=trajectories,
+        scheme=Scheme(choice(scheme, "scheme", tuple(Scheme))),
+        perturbation=Swerve(tuple(deviation_m or [1.5])) if noise_deg is None else SteeringNoise(*noise_deg),
+    )
+    window = Window(horizon_m=horizon_m, frames=frames)
+    check_writable(out)
+    who = driver_of(driver, device)
+
+    with open_simulator(simulator) as world:
+        for scenario in chosen:
+            with progress(f"Recording {scenario.name}", wanted.count, "drives") as show:
+                drives = run(
+                    world,
+                    who,
+                    scenario,
+                    weather=sky,
+                    trajectories=wanted,
+                    window=window,
+                    seed=seed,
+                    driver_name=driver,
+                    folder=out / scenario.name / "record",
+                    on_drive=lambda done, show=show: show(done, 0.0),
+                )
+            _summarise(drives, out / scenario.name)
+
+
+def _summarise(drives: Drives, run: Path) -> None:
+    from rich.console import Console
+
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    say(f"{drives.settings.scenario.name}, {drives.settings.weather}: {drives.calls} drives, kept in {run / 'record'}")
+    for drive in drives.drives:
+        steps = f"steps {drive.frame_number[0]} to {drive.frame_number[-1]}"
+        aside = f"up to {drive.deviation_m:+.2f} m to the right" if drive.deviation_m else "clean"
+        say(f"  {drive.name:8} {len(drive.frames)} frames, {steps}, {aside}{drive.note and '; ' + drive.note}")

@@ -1,0 +1,11 @@
+"""Recording a driver: the clean drive, and drives pushed aside, past the canvas."""
+
+from roadproof.drives.drives import Drive as Drive
+from roadproof.drives.drives import Drives as Drives
+from roadproof.drives.drives import load_drives as load_drives
+from roadproof.drives.record import record as record
+from roadproof.drives.trajectories import Scheme as Scheme
+from roadproof.drives.trajectories import SteeringNoise as SteeringNoise
+from roadproof.drives.trajectories import Swerve as Swerve
+from roadproof.drives.trajectories import Trajectories as Trajectories
+from roadproof.drives.trajectories import Window as Window

@@ -1,0 +1,268 @@
+"""Recorded drives before calibration, and their folder.
+
+    RECORD/record.json         what was asked for: scenario, weather, seed, trajectories, window, camera, input, driver
+    RECORD/DRIVE/episode.npz   the whole drive (`rollout.Episode`)
+    RECORD/DRIVE/drive.npz     of the kept frames: frame_number, frames, steer, right_m; and how the drive came about
+
+A drive's folder is there when the drive is finished. Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import zipfile
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from roadproof.datatypes import VehicleState, Weather
+from roadproof.drives.trajectories import Plan, Scheme, SteeringNoise, Swerve, Trajectories, Window
+from roadproof.errors import OutputError, RecordingError, RoadproofError
+from roadproof.files import read_json, write_atomically
+from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
+from roadproof.recordings import Push
+from roadproof.rollout import Episode
+from roadproof.scenarios import Scenario
+
+FORMAT = "roadproof-record"
+FORMAT_VERSION = 1
+_PER_FRAME = ("frame_number", "frames", "steer", "right_m")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Drive:
+    """One recorded drive and its frames that show the canvas.
+
+    Args:
+        name: names its folder.
+        push: how it was perturbed.
+        episode: the whole drive; its steer is what was done.
+        frame_number: step of each kept frame, rising.
+        frames: the controller's input there, (F, H, W, 3).
+        steer: what the driver answered to each of them.
+        right_m: offset from the clean drive at each of them, positive to the right.
+        calls: drives it took, those given up included.
+        note: what the user should know; empty where there is nothing.
+    """
+
+    name: str
+    push: Push
+    episode: Episode
+    frame_number: Int[np.ndarray, " f"]
+    frames: UInt8[np.ndarray, "f h w 3"]
+    steer: Float[np.ndarray, " f"]
+    right_m: Float[np.ndarray, " f"]
+    calls: int = 1
+    note: str = ""
+
+    @property
+    def deviation_m(self) -> float:
+        """Largest offset from the clean drive, positive to the right."""
+        return float(self.right_m[np.abs(self.right_m).argmax()])
+
+    @property
+    def states(self) -> tuple[VehicleState, ...]:
+        """Where the car was at each kept frame."""
+        names = VehicleState.__slots__
+        rows = np.stack([getattr(self.episode, name)[self.frame_number] for name in names], 1)
+        return tuple(VehicleState(*map(float, row)) for row in rows)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Settings:
+    """What was asked of a recording; two with the same settings are the same recording.
+
+    Args:
+        scenario: that was driven.
+        weather: of all drives.
+        trajectories: which drives.
+        window: which frames are kept.
+        seed: of the perturbations.
+        driver: who drove, in words.
+        camera: on the car.
+        view: how the controller's input is made from its picture.
+        dt_s: seconds a step.
+    """
+
+    scenario: Scenario
+    weather: Weather
+    trajectories: Trajectories
+    window: Window
+    seed: int
+    driver: str
+    camera: CameraModel
+    view: CropResize
+    dt_s: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Drives:
+    """The recorded drives of one scenario, not calibrated yet.
+
+    Args:
+        settings: what was asked for.
+        drives: the clean one first.
+
+    Raises:
+        RecordingError: there is no drive, or the first is not the clean one.
+    """
+
+    settings: Settings
+    drives: tuple[Drive, ...]
+
+    def __post_init__(self) -> None:
+        if not self.drives or self.drives[0].push is not Push.CLEAN:
+            raise RecordingError("the recording has no clean drive in the first place; record it again")
+
+    @property
+    def calls(self) -> int:
+        """Drives the simulator made."""
+        return sum(drive.calls for drive in self.drives)
+
+
+def write_settings(settings: Settings, folder: Path) -> None:
+    """Begin the folder of a recording.
+
+    Raises:
+        RecordingError: it holds a recording with other settings; the message names the first.
+        OutputError: it cannot be written.
+    """
+    path, content = folder / "record.json", _to_json(settings)
+    if path.exists():
+        before = read_json(path, FORMAT, FORMAT_VERSION, RecordingError)
+        for key, value in content.items():
+            if before.get(key) != value:
+                raise RecordingError(
+                    f"{folder} holds a recording with {key} {before.get(key)!r}, now it is {value!r}; "
+                    "choose another folder"
+                )
+        return
+    write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
+
+
+def write_drive(drive: Drive, folder: Path) -> None:
+    """Write one finished drive to `folder`/its name, all or nothing.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    part: Path | None = None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(dir=folder, prefix=f".{drive.name}."))
+        drive.episode.save(part / "episode.npz")
+        about = {"push": str(drive.push), "calls": drive.calls, "note": drive.note}
+        arrays: dict[str, Any] = {name: getattr(drive, name) for name in _PER_FRAME}
+        np.savez_compressed(part / "drive.npz", about=np.array(json.dumps(about)), **arrays)
+        part.chmod(0o755)
+        part.replace(folder / drive.name)
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {folder / drive.name}: {error.strerror or error}; choose a folder that can be written"
+        ) from None
+    finally:
+        if part is not None:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def read_drive(plan: Plan, folder: Path) -> Drive | None:
+    """A finished drive of a recording, or None where it is not finished.
+
+    Raises:
+        RecordingError: it is damaged.
+        EpisodeError: its episode is.
+    """
+    path = folder / plan.name / "drive.npz"
+    if not path.parent.is_dir():
+        return None
+    try:
+        # Opened here, since numpy leaves the file of a damaged archive open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays: dict[str, Any] = {name: np.asarray(stored[name]) for name in _PER_FRAME}
+            about = json.loads(str(stored["about"]))
+        drive = Drive(
+            name=plan.name,
+            push=Push(about["push"]),
+            episode=Episode.load(path.with_name("episode.npz")),
+            calls=int(about["calls"]),
+            note=str(about["note"]),
+            **arrays,
+        )
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        if isinstance(error, RoadproofError):
+            raise
+        raise RecordingError(f"{path} is damaged ({error}); remove {path.parent} and record it again") from None
+    steps = len(drive.episode)
+    counts = {len(values) for values in (drive.frame_number, drive.frames, drive.steer, drive.right_m)}
+    if counts != {len(drive.frames)} or not len(drive.frames) or int(drive.frame_number.max()) >= steps:
+        raise RecordingError(f"{path} does not fit its episode of {steps} steps; remove {path.parent}, record it again")
+    return drive
+
+
+def load_drives(folder: Path) -> Drives:
+    """Read a finished recording.
+
+    Raises:
+        RecordingError: the folder is missing, damaged, or not finished; the message says what to do.
+        EpisodeError: an episode in it is damaged.
+    """
+    if not (folder / "record.json").is_file():
+        raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
+    settings = _from_json(read_json(folder / "record.json", FORMAT, FORMAT_VERSION, RecordingError), folder)
+    plans = settings.trajectories.plans()
+    drives = [read_drive(plan, folder) for plan in plans]
+    missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]
+    if missing:
+        raise RecordingError(f"{folder} lacks the drive {missing[0]}; give the same `roadproof record` again to finish")
+    return Drives(settings=settings, drives=tuple(drive for drive in drives if drive is not None))
+
+
+def _to_json(settings: Settings) -> dict[str, Any]:
+    trajectories, how = settings.trajectories, settings.trajectories.perturbation
+    content = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        **asdict(settings),
+        "trajectories": {
+            "count": trajectories.count,
+            "scheme": str(trajectories.scheme),
+            **({"swerve_m": how.deviations_m} if isinstance(how, Swerve) else {"noise_deg": astuple(how)}),
+        },
+    }
+    return json.loads(json.dumps(content))  # tuples become lists, as they will be read
+
+
+def _from_json(content: dict[str, Any], folder: Path) -> Settings:
+    try:
+        scenario, chosen = content["scenario"], content["trajectories"]
+        return Settings(
+            scenario=Scenario(
+                **scenario
+                | {
+                    "start": VehicleState(**scenario["start"]),
+                    "canvas": CanvasPlacement(**scenario["canvas"]),
+                    "goal_m": (float(scenario["goal_m"][0]), float(scenario["goal_m"][1])),
+                }
+            ),
+            weather=Weather(content["weather"]),
+            trajectories=Trajectories(
+                count=chosen["count"],
+                scheme=Scheme(chosen["scheme"]),
+                perturbation=Swerve(tuple(map(float, chosen["swerve_m"])))
+                if "swerve_m" in chosen
+                else SteeringNoise(*map(int, chosen["noise_deg"])),
+            ),
+            window=Window(**content["window"]),
+            seed=int(content["seed"]),
+            driver=str(content["driver"]),
+            camera=CameraModel(**content["camera"]),
+            view=CropResize(**content["view"]),
+            dt_s=float(content["dt_s"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, RoadproofError) as error:
+        raise RecordingError(f"{folder / 'record.json'} is incomplete or damaged ({error}); record it again") from None

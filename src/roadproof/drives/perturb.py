@@ -1,0 +1,213 @@
+"""Drivers that go astray on purpose: along the clean path with an offset, or with noise on the steering.
+
+    symbol   meaning
+    s        arclength along the clean path, m
+    d        offset from it, m, positive to the right; d* is the wanted one
+    e        heading error, rad, positive to the left
+    κ        curvature, 1/m, positive to the left; κ₀ is the path's own
+    g        curvature of a unit of steer, 1/m
+
+With d' = −e and d'' = κ₀ − κ, the law κ − κ₀ = −d*'' + 2/ℓ (−e − d*') + (d − d*)/ℓ² makes d approach d* as a critically
+damped spring does, over a length ℓ. Clean steering carries κ₀, so that g matters for the correction alone; d metres
+outside of a bend its curvature is κ₀ / (1 + κ₀ d).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.datatypes import Control, Observation, VehicleState
+from roadproof.drives.trajectories import SteeringNoise
+from roadproof.errors import RecordingError
+from roadproof.recordings import Push
+from roadproof.rollout import Episode, Policy
+
+_GAIN_PRIOR = 0.3
+"""1/m: between a small car with a small steering angle (0.23) and CARLA's large ones (0.42)."""
+_GAIN_PRIOR_WEIGHT = 0.05
+_FINE_M = 0.25
+_NOISE_BEFORE_END_S, _NOISE_S = 1.5, 2.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CleanPath:
+    """A clean drive as a line on the ground.
+
+    Args:
+        arclength_m: of each of its points, rising.
+        x_m: of each point, as y_m and heading_rad.
+        steer: that was given there.
+        curvature_per_steer: g.
+    """
+
+    arclength_m: Float[np.ndarray, " n"]
+    x_m: Float[np.ndarray, " n"]
+    y_m: Float[np.ndarray, " n"]
+    heading_rad: Float[np.ndarray, " n"]
+    steer: Float[np.ndarray, " n"]
+    curvature_per_steer: float
+
+    @staticmethod
+    def of(episode: Episode) -> CleanPath:
+        """The path of an episode.
+
+        Raises:
+            RecordingError: the car did not move.
+        """
+        moved = np.hypot(np.diff(episode.x_m), np.diff(episode.y_m))
+        on = np.flatnonzero(moved > 1e-3)
+        if on.size < 2:
+            raise RecordingError(f"the car hardly moves in {episode.scenario}; check the driver")
+        heading = np.unwrap(episode.yaw_rad)
+        turned, steer = np.diff(heading)[on] / moved[on], episode.steer[on]
+        gain = (_GAIN_PRIOR_WEIGHT * _GAIN_PRIOR - steer @ turned) / (_GAIN_PRIOR_WEIGHT + steer @ steer)
+        arclength = np.concatenate([[0.0], np.cumsum(moved[on])[:-1]])
+        return CleanPath(arclength, episode.x_m[on], episode.y_m[on], heading[on], steer, max(float(gain), 0.05))
+
+    def locate(self, state: VehicleState, near_m: float | None) -> tuple[float, float]:
+        """Arclength s and offset d of a car.
+
+        Args:
+            state: the car.
+            near_m: s a moment ago, so that a path that crosses itself is not mistaken; None searches all of it.
+        """
+        distance = np.hypot(self.x_m - state.x_m, self.y_m - state.y_m)
+        if near_m is not None:
+            distance[np.abs(self.arclength_m - near_m) > 10.0] = np.inf
+        k = int(distance.argmin())
+        c, s = math.cos(self.heading_rad[k]), math.sin(self.heading_rad[k])
+        dx, dy = state.x_m - self.x_m[k], state.y_m - self.y_m[k]
+        return float(self.arclength_m[k] + c * dx + s * dy), s * dx - c * dy
+
+    def at(self, values: Float[np.ndarray, " n"], s: float) -> float:
+        """What has one value a point of the path, in between."""
+        return float(np.interp(s, self.arclength_m, values))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Offsets:
+    """The wanted offset d* along a path, in steps of `_FINE_M`, with its slope and bend."""
+
+    arclength_m: Float[np.ndarray, " n"]
+    offset_m: Float[np.ndarray, " n"]
+    slope: Float[np.ndarray, " n"]
+    bend: Float[np.ndarray, " n"]
+
+    @staticmethod
+    def of(arclength_m: Float[np.ndarray, " n"], offset_m: Float[np.ndarray, " n"]) -> Offsets:
+        """From offsets at evenly spaced arclengths."""
+        slope = np.gradient(offset_m, arclength_m)
+        return Offsets(arclength_m, offset_m, slope, np.gradient(slope, arclength_m))
+
+    def at(self, s: float) -> tuple[float, float, float]:
+        """d*, d*' and d*''."""
+        offset, slope, bend = (
+            float(np.interp(s, self.arclength_m, values)) for values in (self.offset_m, self.slope, self.bend)
+        )
+        return offset, slope, bend
+
+
+def offsets(
+    push: Push, size_m: float, from_m: float, to_m: float, length_m: float, rng: np.random.Generator
+) -> Offsets:
+    """An offset that grows from 0 while the canvas is in view, to one side or, at random, to both.
+
+    Args:
+        push: RIGHT, LEFT or RANDOM.
+        size_m: the largest offset.
+        from_m: arclength at which the canvas comes into view.
+        to_m: arclength at which it is out of view.
+        length_m: of the path.
+        rng: draws where it rises.
+    """
+    s = np.arange(0.0, length_m + _FINE_M, _FINE_M)
+    along = (s - from_m) / (to_m - from_m)
+    if push is Push.RANDOM:
+        knots = np.concatenate([[0.0], rng.uniform(-1.0, 1.0, 4)])
+        knots *= size_m / np.abs(knots).max()
+        at = np.clip(along * 4, 0.0, 4.0)
+        below = np.minimum(at.astype(int), 3)
+        rise = _smooth(at - below)
+        return Offsets.of(s, knots[below] + rise * (knots[below + 1] - knots[below]))
+    begins, ends = rng.uniform(0.0, 0.2), rng.uniform(0.6, 0.85)
+    side = 1.0 if push is Push.RIGHT else -1.0
+    return Offsets.of(s, side * size_m * _smooth(np.clip((along - begins) / (ends - begins), 0.0, 1.0)))
+
+
+def _smooth(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """From 0 to 1 with slope and bend 0 at both ends."""
+    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
+
+
+def swerving(policy: Policy, path: CleanPath, wanted: Offsets, answered: Callable[[float], object]) -> Policy:
+    """Drives along a path with an offset, at the speed of another policy.
+
+    Args:
+        policy: asked at every step; only its pedals are used.
+        path: the clean drive.
+        wanted: offsets from it.
+        answered: told what the policy would have steered.
+    """
+    at_m: float | None = None
+
+    def act(seen: Observation) -> Control:
+        nonlocal at_m
+        control, state = policy(seen).clipped(), seen.state
+        answered(control.steer)
+        at_m, d = path.locate(state, at_m)
+        e = math.remainder(state.yaw_rad - path.at(path.heading_rad, at_m), math.tau)
+        offset, slope, bend = wanted.at(at_m)
+        sight = max(4.0, 0.7 * state.speed_mps)
+        extra = -bend + 2.0 / sight * (-e - slope) + (d - offset) / sight**2
+        bare, gain = path.at(path.steer, at_m), path.curvature_per_steer
+        steer = bare / max(1.0 - gain * bare * d, 0.5) - extra / gain
+        return Control(steer, control.throttle, control.brake).clipped()
+
+    return act
+
+
+def noisy(
+    policy: Policy, clean: Episode, noise_deg: Float[np.ndarray, " n"], answered: Callable[[float], object]
+) -> Policy:
+    """Gives a clean drive's controls again with noise on the steering, while another policy is asked.
+
+    Args:
+        policy: asked at every step; nothing of it is carried out.
+        clean: whose controls are given.
+        noise_deg: added at every step, positive to the right; n° are n·π/180 of steer.
+        answered: told what the policy would have steered.
+    """
+    step = 0
+
+    def act(seen: Observation) -> Control:
+        nonlocal step
+        answered(policy(seen).clipped().steer)
+        k, step = min(step, clean.steer.size - 1), step + 1
+        steer = clean.steer[k] + math.radians(noise_deg[k])
+        return Control(float(steer), float(clean.throttle[k]), float(clean.brake[k])).clipped()
+
+    return act
+
+
+def steering_noise(
+    push: Push, noise: SteeringNoise, clean: Episode, last_step: int, rng: np.random.Generator
+) -> Float[np.ndarray, " n"]:
+    """One draw of whole degrees a step, positive to the right, 0 outside its time.
+
+    Args:
+        push: RIGHT, LEFT or RANDOM.
+        noise: how much.
+        clean: the drive it is added to.
+        last_step: at which the canvas is last in view.
+        rng: draws.
+    """
+    count = clean.steer.size
+    draws = rng.integers(noise.low_deg, noise.high_deg + 1, count).astype(np.float64)
+    sides = {Push.RIGHT: np.ones(count), Push.LEFT: -np.ones(count), Push.RANDOM: rng.choice((-1.0, 1.0), count)}
+    since_s = (np.arange(count) - last_step) * clean.dt_s + _NOISE_BEFORE_END_S
+    return np.where((since_s >= 0.0) & (since_s < _NOISE_S), sides[push] * draws, 0.0)

@@ -1,0 +1,243 @@
+"""The verb: drive a scenario clean and perturbed, and keep what shows the canvas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from roadproof.compositing.view import canvas_pixels
+from roadproof.controllers import Controller
+from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
+from roadproof.drives.drives import Drive, Drives, Settings, read_drive, write_drive, write_settings
+from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, swerving
+from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
+from roadproof.errors import GeometryError, RecordingError
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, homography_from_pose
+from roadproof.recordings import Push
+from roadproof.rollout import Driver, Episode, Policy, SimulatorT, policy_of, rollout
+from roadproof.scenarios import Scenario
+
+TRIES = 4
+SMALLER = 0.7
+AFTER_M = 2.0
+_ENDS_IT = (EventKind.COLLISION_STATIC, EventKind.COLLISION_VEHICLE, EventKind.COLLISION_PEDESTRIAN, EventKind.OFF_ROAD)
+
+
+def record(
+    simulator: SimulatorT,
+    driver: Controller | Driver[SimulatorT],
+    scenario: Scenario,
+    *,
+    weather: Weather = Weather.CLEAR_NOON,
+    trajectories: Trajectories | None = None,
+    window: Window | None = None,
+    seed: int = 0,
+    driver_name: str = "",
+    folder: Path | None = None,
+    on_drive: Callable[[int], object] = lambda _done: None,
+) -> Drives:
+    """Record a driver past a bare canvas: one clean drive, and drives pushed aside.
+
+    A perturbed drive ends behind the canvas. One that hits something or leaves the road before is driven again with a
+    smaller perturbation, and says so.
+
+    Args:
+        simulator: an open simulator.
+        driver: a controller, or whoever gets in after the reset.
+        scenario: where.
+        weather: of all drives.
+        trajectories: which drives; one clean and one pushed 1.5 m to each side by default.
+        window: which frames are kept.
+        seed: of the perturbations.
+        driver_name: who drives, in words, for the record.
+        folder: keeps every finished drive; those it holds already are not driven again.
+        on_drive: called with the number of finished drives.
+
+    Raises:
+        RecordingError: the canvas never comes into view, no drive passes it unharmed, or the folder holds a recording
+            with other settings.
+        SimulatorError, ScenarioError, ControllerError: as `rollout` does.
+        OutputError: the folder cannot be written.
+    """
+    settings = Settings(
+        scenario=scenario,
+        weather=Weather(weather),
+        trajectories=trajectories or Trajectories(),
+        window=window or Window(),
+        seed=seed,
+        driver=driver_name,
+        camera=simulator.camera,
+        view=simulator.input,
+        dt_s=simulator.dt_s,
+    )
+    if folder is not None:
+        write_settings(settings, folder)
+    drives: list[Drive] = []
+    for done, plan in enumerate(settings.trajectories.plans()):
+        on_drive(done)
+        drive = None if folder is None else read_drive(plan, folder)
+        if drive is None:
+            clean = drives[0] if drives else None
+            drive = (
+                _perturbed(simulator, driver, settings, plan, clean) if clean else _clean(simulator, driver, settings)
+            )
+            if folder is not None:
+                write_drive(drive, folder)
+        drives.append(drive)
+    on_drive(len(drives))
+    return Drives(settings=settings, drives=tuple(drives))
+
+
+Frame: TypeAlias = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(slots=True)
+class _Film:
+    """Keeps the frames of a drive near the canvas, to choose from."""
+
+    scenario: Scenario
+    window: Window
+    steps: list[int] = field(default_factory=list[int])
+    frames: list[Frame] = field(default_factory=list[Frame])
+    states: list[VehicleState] = field(default_factory=list[VehicleState])
+    step: int = 0
+
+    def __call__(self, seen: Observation, control: Control | None) -> None:
+        canvas, step = self.scenario.canvas, self.step
+        self.step += 1
+        away_m = np.hypot(seen.state.x_m - canvas.x_m, seen.state.y_m - canvas.y_m) - 0.5 * canvas.length_m
+        if control is not None and away_m <= self.window.horizon_m:
+            self.steps.append(step)
+            self.frames.append(seen.frame)
+            self.states.append(seen.state)
+
+
+def _clean(simulator: SimulatorT, driver: Controller | Driver[SimulatorT], settings: Settings) -> Drive:
+    film = _Film(settings.scenario, settings.window)
+    episode = rollout(simulator, driver, settings.scenario, weather=settings.weather, on_step=film)
+    chosen = _chosen(film, settings, "clean")
+    last_s = float(episode.time_s[chosen[0][-1]])
+    harm = [event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= last_s]
+    note = f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas" if harm else ""
+    return _drive(
+        Plan("clean", settings.trajectories.plans()[0].push, 0.0, 0), episode, chosen, episode.steer, note=note
+    )
+
+
+def _perturbed(
+    simulator: SimulatorT, driver: Controller | Driver[SimulatorT], settings: Settings, plan: Plan, clean: Drive
+) -> Drive:
+    path, harm = CleanPath.of(clean.episode), ""
+    for tried in range(TRIES):
+        share = SMALLER**tried
+        film = _Film(settings.scenario, settings.window)
+        episode, answered = _astray(simulator, driver, settings, plan, clean, share, film)
+        harm = next((str(event.kind) for event in episode.events if event.kind in _ENDS_IT), "")
+        if not harm:
+            chosen = _chosen(film, settings, plan.name)
+            right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in chosen[2]])
+            note = "" if tried == 0 else f"perturbed {share:.2f} times as much as asked, not to crash"
+            return _drive(plan, episode, chosen, answered, right_m, calls=tried + 1, note=note)
+    raise RecordingError(
+        f"drive {plan.name} of {settings.scenario.name} ends in {harm} before the canvas ends, {TRIES} times; "
+        "ask for smaller perturbations, or choose another scenario"
+    )
+
+
+def _astray(
+    simulator: SimulatorT,
+    driver: Controller | Driver[SimulatorT],
+    settings: Settings,
+    plan: Plan,
+    clean: Drive,
+    share: float,
+    film: _Film,
+) -> tuple[Episode, Float[np.ndarray, " n"]]:
+    """One perturbed drive to behind the canvas, and what the driver answered on the way."""
+    path, answers = CleanPath.of(clean.episode), list[float]()
+    first, last = (path.locate(clean.states[k], None)[0] for k in (0, -1))
+    rng = np.random.default_rng((settings.seed, plan.stream, list(Push).index(plan.push)))
+    at_m: float | None = None
+
+    def begin(world: SimulatorT) -> Policy:
+        policy, how = policy_of(driver, world), settings.trajectories.perturbation
+        if isinstance(how, SteeringNoise):
+            noise = steering_noise(plan.push, how, clean.episode, int(clean.frame_number[-1]), rng)
+            return noisy(policy, clean.episode, share * noise, answers.append)
+        length_m = float(path.arclength_m[-1])
+        wanted = offsets(plan.push, share * plan.deviation_m, first, last, length_m, rng)
+        return swerving(policy, path, wanted, answers.append)
+
+    def behind(seen: Observation) -> bool:
+        nonlocal at_m
+        at_m, _ = path.locate(seen.state, at_m)
+        return at_m > last + AFTER_M
+
+    episode = rollout(simulator, begin, settings.scenario, weather=settings.weather, on_step=film, until=behind)
+    return episode, np.array(answers)
+
+
+Chosen: TypeAlias = tuple[Int[np.ndarray, " f"], UInt8[np.ndarray, "f h w 3"], Int[np.ndarray, " f"]]
+
+
+def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
+    """Steps and frames to keep, and which of the filmed ones they are.
+
+    Raises:
+        RecordingError: the canvas is not in view.
+    """
+    shows = in_view(film.states, settings.scenario, settings.camera, settings.view, settings.window.least_px)
+    which = np.flatnonzero(shows)
+    if which.size == 0:
+        raise RecordingError(
+            f"drive {name} of {settings.scenario.name} never sees {settings.window.least_px} pixels of the canvas "
+            f"within {settings.window.horizon_m:g} m; check the driver, or where the canvas lies"
+        )
+    count = min(settings.window.frames, which.size)
+    which = which[np.unique(np.linspace(0, which.size - 1, count).round().astype(int))]
+    return np.array(film.steps)[which], np.stack([film.frames[int(k)] for k in which]), which
+
+
+def in_view(
+    states: list[VehicleState], scenario: Scenario, camera: CameraModel, view: CropResize, least_px: int
+) -> Bool[np.ndarray, " n"]:
+    """Whether the canvas fills so many pixels of the controller's input, going by the pose; occluders do not count."""
+    if not states:
+        return np.zeros(0, bool)
+    image_from_canvas = np.stack([homography_from_pose(camera, state, scenario.canvas) for state in states])
+    try:
+        index, centre, _ = canvas_pixels(image_from_canvas, view)
+    except GeometryError:
+        return np.zeros(len(states), bool)
+    inside = ((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(1)
+    frame = index[inside] // (view.width_px * view.height_px)
+    return np.bincount(frame, minlength=len(states)) >= least_px
+
+
+def _drive(
+    plan: Plan,
+    episode: Episode,
+    chosen: Chosen,
+    answered: Float[np.ndarray, " n"],
+    right_m: Float[np.ndarray, " f"] | None = None,
+    *,
+    calls: int = 1,
+    note: str = "",
+) -> Drive:
+    steps, frames, _ = chosen
+    return Drive(
+        name=plan.name,
+        push=plan.push,
+        episode=episode,
+        frame_number=steps,
+        frames=frames,
+        steer=answered[steps],
+        right_m=np.zeros(len(steps)) if right_m is None else right_m,
+        calls=calls,
+        note=note,
+    )

@@ -1,0 +1,144 @@
+"""Which drives are recorded, how the perturbed ones differ from the clean one, and which of their frames are kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import islice
+
+from roadproof.errors import RecordingError
+from roadproof.recordings import Push
+
+COUNTS = (1, 3, 5, 7)
+
+
+class Scheme(StrEnum):
+    """The paper's ways to choose perturbed drives."""
+
+    GROUP = "group"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True, slots=True)
+class Swerve:
+    """Leave the clean path to the side, by metres.
+
+    The car is steered along the clean path with a smooth offset that begins when the canvas comes into view and has its
+    full size over the canvas; a seed sets where it begins and ends to rise. How strong a pattern transfers depends on
+    this size more than on how many drives there are.
+
+    Args:
+        deviations_m: sizes; the pairs of a Group (or the drives of Random) take them in turn.
+
+    Raises:
+        RecordingError: there is none, or one is outside 0.1…5 m.
+    """
+
+    deviations_m: tuple[float, ...] = (1.5,)
+
+    def __post_init__(self) -> None:
+        if not self.deviations_m or not all(0.1 <= size <= 5.0 for size in self.deviations_m):
+            raise RecordingError(f"deviations are {self.deviations_m} m, expected one or more between 0.1 and 5")
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringNoise:
+    """The published perturbation: the clean drive's controls given again, with whole degrees added to the steering.
+
+    As in the released code, n° adds n·π/180 to a steer in [−1, 1], one draw a frame for 2.1 s, beginning 1.5 s before
+    the canvas is out of view. Nothing steers back; how far the car goes astray depends on its speed.
+
+    Args:
+        low_deg: least noise to a side.
+        high_deg: most.
+
+    Raises:
+        RecordingError: not 0 ≤ low ≤ high ≤ 57, or only zero.
+
+    References:
+        getNoiseTrajs.sh of the released code.
+    """
+
+    low_deg: int = 4
+    high_deg: int = 20
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.low_deg <= self.high_deg <= 57 or self.high_deg == 0:
+            raise RecordingError(
+                f"steering noise is {self.low_deg}…{self.high_deg}°, expected 0 ≤ low ≤ high ≤ 57, high > 0"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """One drive to be recorded.
+
+    Args:
+        name: of its folder.
+        push: to which side.
+        deviation_m: size of a swerve; 0 for a clean drive and for steering noise.
+        stream: numbers its random draws.
+    """
+
+    name: str
+    push: Push
+    deviation_m: float
+    stream: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Trajectories:
+    """How many drives, and how they are perturbed.
+
+    Args:
+        count: T of the paper: the clean drive and T − 1 perturbed ones.
+        scheme: "group": pairs of which one is pushed right, one left; "random": each to both sides at random.
+        perturbation: by metres, or by degrees as published.
+
+    Raises:
+        RecordingError: T is not 1, 3, 5 or 7.
+    """
+
+    count: int = 3
+    scheme: Scheme = Scheme.GROUP
+    perturbation: Swerve | SteeringNoise = field(default_factory=Swerve)
+
+    def __post_init__(self) -> None:
+        if self.count not in COUNTS:
+            raise RecordingError(f"T is {self.count} trajectories, expected one of {', '.join(map(str, COUNTS))}")
+
+    def plans(self) -> tuple[Plan, ...]:
+        """The drives, the clean one first."""
+        pushes = (Push.RANDOM,) if self.scheme is Scheme.RANDOM else (Push.RIGHT, Push.LEFT)
+        sizes = self.perturbation.deviations_m if isinstance(self.perturbation, Swerve) else (0.0,)
+        rounds = -(-(self.count - 1) // len(pushes))
+        perturbed = (
+            Plan(str(push) if k == 0 else f"{push}-{k + 1}", push, sizes[k % len(sizes)], k + 1)
+            for k in range(rounds)
+            for push in pushes
+        )
+        return (Plan(str(Push.CLEAN), Push.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Window:
+    """Which frames of a drive are kept.
+
+    Args:
+        horizon_m: at most so far before the canvas' near edge.
+        least_px: pixels of the controller's input that show the canvas, at least.
+        frames: at most so many a drive, evenly spread.
+
+    Raises:
+        RecordingError: one of them is not positive.
+    """
+
+    horizon_m: float = 25.0
+    least_px: int = 60
+    frames: int = 24
+
+    def __post_init__(self) -> None:
+        if not (self.horizon_m > 0 and self.least_px > 0 and self.frames > 0):
+            raise RecordingError(
+                f"the window is {self.horizon_m} m, {self.least_px} px, {self.frames} frames; expected all above 0"
+            )

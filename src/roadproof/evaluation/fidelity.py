@@ -1,0 +1,201 @@
+"""The surrogate against the simulator: composited frames of a drive beside rendered ones from the same places."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+
+from roadproof.attacks import show_pattern
+from roadproof.compositing import composite, view_canvas
+from roadproof.controllers import Controller
+from roadproof.datatypes import Control, Observation
+from roadproof.errors import EpisodeError, RecordingError
+from roadproof.files import write_atomically
+from roadproof.metrics import Agreement, agreement
+from roadproof.objectives import Direction, Group
+from roadproof.patterns import Pattern
+from roadproof.photometry import AffineResponse, ColourTransform
+from roadproof.recordings import Recording, RecordingSet
+from roadproof.rollout import Episode, replay, rollout
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+FORMAT = "roadproof-fidelity"
+FORMAT_VERSION = 1
+_ARRAYS = ("frame_number", "clean", "composited", "rendered", "clean_steer", "composited_steer", "rendered_steer")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Fidelity:
+    """One recorded drive three times: as it was, with a pattern composited in, and with the pattern really there.
+
+    Args:
+        drive: its name.
+        frame_number: steps of the frames in their drive.
+        clean: frames without paint.
+        composited: the surrogate's.
+        rendered: the simulator's.
+        clean_steer: the controller's answers to the frames without paint; positive = right.
+        composited_steer: to the surrogate's: what it predicts.
+        rendered_steer: to the simulator's.
+        agreement: how close composited and rendered are.
+    """
+
+    drive: str
+    frame_number: Int[np.ndarray, " f"]
+    clean: UInt8[np.ndarray, "f h w 3"]
+    composited: UInt8[np.ndarray, "f h w 3"]
+    rendered: UInt8[np.ndarray, "f h w 3"]
+    clean_steer: Float[np.ndarray, " f"]
+    composited_steer: Float[np.ndarray, " f"]
+    rendered_steer: Float[np.ndarray, " f"]
+    agreement: Agreement
+
+    def save(self, path: Path) -> None:
+        """Write one NumPy archive with a JSON header.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        header = {"format": FORMAT, "version": FORMAT_VERSION, "drive": self.drive, "agreement": asdict(self.agreement)}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+
+        def write(part: Path) -> None:
+            with part.open("wb") as file:
+                np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+
+        write_atomically(path, write)
+
+    @staticmethod
+    def load(path: Path) -> Fidelity:
+        """Read what `save` wrote.
+
+        Raises:
+            EpisodeError: the file is missing, damaged or of another format.
+        """
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                header = json.loads(str(stored["header"]))
+                arrays: dict[str, Any] = {name: np.asarray(stored[name]) for name in _ARRAYS}
+            if header["format"] != FORMAT or header["version"] != FORMAT_VERSION:
+                raise ValueError(f"format {header['format']!r}, version {header['version']!r}")
+            return Fidelity(drive=str(header["drive"]), agreement=Agreement(**header["agreement"]), **arrays)
+        except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile, EOFError) as error:
+            raise EpisodeError(f"{path} is missing or damaged ({error}); evaluate again") from None
+
+
+def compare_with_rendered(
+    pattern: Pattern,
+    recordings: RecordingSet,
+    controller: Controller,
+    rendered: UInt8[np.ndarray, "f h w 3"],
+    *,
+    drive: str = "clean",
+    device: torch.device | str = "cpu",
+) -> Fidelity:
+    """Composite a pattern into a recorded drive and compare with the same frames rendered over the real paint.
+
+    Any drive will do that was recorded and calibrated without paint: the clean one, a pushed one, or the attacked one
+    replayed over the bare road.
+
+    Args:
+        pattern: what was painted.
+        recordings: the calibrated set.
+        controller: on `device`.
+        rendered: the simulator's frames over the paint, one for each of the drive's (`rendered_frames`).
+        drive: which of the set.
+        device: where to composite.
+
+    Raises:
+        RecordingError: there is no such drive, or it has another number or size of frames.
+        EpisodeError: no frame shows paint.
+    """
+    recorded = _drive(recordings, drive)
+    if rendered.shape != recorded.frames.shape:
+        raise RecordingError(
+            f"drive {drive} has frames of shape {recorded.frames.shape}, the rendered ones {rendered.shape}; "
+            "render the same frames"
+        )
+    alone = replace(recordings, recordings=(recorded,))
+    shown = show_pattern(pattern, alone, controller, Group((recorded.push,), Direction.EITHER), device=device)[0]
+    with torch.no_grad():
+        frames = torch.as_tensor(rendered, device=device).permute(0, 3, 1, 2).float() / 255
+        speed = torch.as_tensor(recorded.speed_mps, device=device, dtype=torch.float32)
+        command = torch.as_tensor(recorded.command, device=device, dtype=torch.int64)
+        rendered_steer = controller.steer(frames, speed, command).float().cpu().numpy()
+    return Fidelity(
+        drive=drive,
+        frame_number=recorded.frame_number,
+        clean=recorded.frames,
+        composited=shown.painted,
+        rendered=rendered,
+        clean_steer=shown.clean_steer,
+        composited_steer=shown.painted_steer,
+        rendered_steer=rendered_steer,
+        agreement=agreement(
+            shown.painted,
+            rendered,
+            _covered(pattern, recordings, recorded),
+            clean_steer=shown.clean_steer,
+            composited_steer=shown.painted_steer,
+            rendered_steer=rendered_steer,
+        ),
+    )
+
+
+def rendered_frames(
+    simulator: Simulator,
+    scenario: Scenario,
+    episode: Episode,
+    pattern: Pattern | PatternImage,
+    frame_number: Int[np.ndarray, " f"],
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """A drive's controls given again over the painted road: what the controller would have seen at some of its steps.
+
+    Raises:
+        RecordingError: the drive has fewer steps.
+    """
+    wanted = set(frame_number.tolist())
+    if not wanted or min(wanted) < 0 or max(wanted) >= len(episode):
+        raise RecordingError(f"frames up to {max(wanted, default=0)} are asked of a drive of {len(episode)} steps")
+    frames: list[np.ndarray] = []
+    step = 0
+
+    def keep(seen: Observation, _: Control | None) -> None:
+        nonlocal step
+        if step in wanted:
+            frames.append(seen.frame)
+        step += 1
+
+    rollout(simulator, replay(episode), scenario, weather=episode.weather, pattern=pattern, on_step=keep)
+    return np.stack(frames)
+
+
+def is_drive_of(recorded: Recording, episode: Episode) -> bool:
+    """Whether a recording was taken on the drive of an episode: the same speeds at the same steps."""
+    steps = recorded.frame_number
+    inside = int(steps.max()) < len(episode)
+    return inside and bool(np.allclose(episode.speed_mps[steps], recorded.speed_mps, atol=0.02))
+
+
+def _drive(recordings: RecordingSet, name: str) -> Recording:
+    for recording in recordings.recordings:
+        if recording.name == name:
+            return recording
+    names = ", ".join(recording.name for recording in recordings.recordings)
+    raise RecordingError(f"the set has no drive {name!r}, expected one of {names}")
+
+
+def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) -> Bool[np.ndarray, "f h w"]:
+    """Pixels of which the pattern covers at least half: a white pattern on a black road says so."""
+    plain = ColourTransform(AffineResponse.identity())
+    dark = view_canvas(np.zeros_like(recorded.frames), recorded.image_from_canvas, recordings.view, plain)
+    white = Pattern(pattern.shapes, pattern.boxes, torch.ones_like(pattern.colours))
+    return composite(white, dark)[:, 0].numpy() >= 0.5

@@ -1,0 +1,313 @@
+"""What came of an evaluation, its table, and its folder.
+
+    EVALUATION/evaluation.json   conditions, every trial with its numbers, cost
+    EVALUATION/scenario.toml     what was driven
+    EVALUATION/paint.png         what was painted
+    EVALUATION/episodes/*.npz    every drive (`rollout.Episode`), clean and painted
+
+Nothing is pickled, and no path in a file leaves the folder.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from roadproof.datatypes import Weather
+from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.files import read_json, write_atomically
+from roadproof.geometry import CanvasPlacement
+from roadproof.metrics import (
+    Mean,
+    Path2D,
+    deviation_m,
+    first_event_s,
+    infraction_points,
+    lateral_m,
+    leaderboard_factor,
+    mean_95,
+    passage,
+)
+from roadproof.patterns import read_paint
+from roadproof.rollout import Episode
+from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
+from roadproof.simulators.protocol import PatternImage
+
+FORMAT = "roadproof-evaluation"
+FORMAT_VERSION = 1
+ATTACK = "attack"
+_UNITS = {
+    "deviation_m": "metres, the paper's equation, from the clean drive of the same weather, traffic and seed",
+    "lateral_m": "metres beside the clean path where the car was furthest from it, left positive",
+    "points": "sum of the 2019 CARLA challenge's points, as clean_points without paint",
+    "leaderboard": "product of today's CARLA Leaderboard's factors, 1 = no infraction, as clean_leaderboard",
+    "first_event_s": "seconds since the start of the drive; null where nothing happened",
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Trial:
+    """One drive over a pattern against the same drive without it. All numbers are of driving.
+
+    Args:
+        pattern: "attack", or "random-N".
+        weather: of both drives.
+        traffic: whether there were other cars and people.
+        seed: of cars and people.
+        clean: file of the drive without paint, in the episodes' folder.
+        painted: file of the drive with it.
+        deviation_m: between them (`metrics.deviation_m`).
+        lateral_m: largest offset from the clean path, left positive.
+        points: infraction points with paint.
+        clean_points: without.
+        leaderboard: the Leaderboard's factor with paint.
+        clean_leaderboard: without.
+        first_event_s: when something first went wrong; None where nothing did.
+        clean_first_event_s: the same without paint.
+        ending: why the painted drive ended.
+    """
+
+    pattern: str
+    weather: Weather
+    traffic: bool
+    seed: int
+    clean: str
+    painted: str
+    deviation_m: float
+    lateral_m: float
+    points: float
+    clean_points: float
+    leaderboard: float
+    clean_leaderboard: float
+    first_event_s: float | None
+    clean_first_event_s: float | None
+    ending: str
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Row:
+    """Means over the trials of one pattern kind, weather and traffic.
+
+    Args:
+        pattern: "attack" or "random".
+        weather: None for all weathers together.
+        traffic: whether there were other cars and people.
+        deviation_m: the paper's deviation.
+        lateral_m: largest offset from the clean path, to whichever side.
+        points: infraction points with paint.
+        clean_points: without.
+        leaderboard: the Leaderboard's factor with paint.
+        failed: share of the drives with any event.
+        first_event_s: over the drives with an event; None where there is none.
+    """
+
+    pattern: str
+    weather: Weather | None
+    traffic: bool
+    deviation_m: Mean
+    lateral_m: Mean
+    points: Mean
+    clean_points: Mean
+    leaderboard: Mean
+    failed: float
+    first_event_s: Mean | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Evaluation:
+    """How one pattern fared, closed loop.
+
+    Args:
+        scenario: that was driven.
+        controller: who drove, in words.
+        weathers: in which.
+        runs: drives with traffic, per weather.
+        cars: on the road in those.
+        pedestrians: about in those.
+        seed: of the first run; the others count on from it.
+        trials: every drive over paint.
+        simulator_calls: drives that all this takes, clean ones included.
+        seconds: wall time of the drives made now; those found in the folder cost nothing.
+    """
+
+    scenario: Scenario
+    controller: str
+    weathers: tuple[Weather, ...]
+    runs: int
+    cars: int
+    pedestrians: int
+    seed: int
+    trials: tuple[Trial, ...]
+    simulator_calls: int
+    seconds: float
+
+    def of(self, pattern: str = ATTACK, *, traffic: bool, weather: Weather | None = None) -> tuple[Trial, ...]:
+        """The trials of "attack" or "random" in one weather, or in all."""
+        return tuple(
+            trial
+            for trial in self.trials
+            if trial.pattern.startswith(pattern)
+            and trial.traffic == traffic
+            and (weather is None or trial.weather == weather)
+        )
+
+    def rows(self) -> tuple[Row, ...]:
+        """The table: pattern kinds, static before traffic, every weather and then all together."""
+        found: list[Row] = []
+        for pattern in (ATTACK, "random"):
+            for traffic in (False, True):
+                for weather in (*self.weathers, None) if len(self.weathers) > 1 else self.weathers:
+                    trials = self.of(pattern, traffic=traffic, weather=weather)
+                    if trials:
+                        found.append(_row(pattern, weather, traffic, trials))
+        return tuple(found)
+
+    def shown(self) -> Trial:
+        """The trial that stands for all in pictures: the first weather's, without traffic."""
+        return self.of(traffic=False)[0]
+
+    def save(self, folder: Path, paint: PatternImage) -> None:
+        """Write everything but the episodes, which are there already.
+
+        Raises:
+            OutputError: the folder cannot be written.
+            ScenarioError: the scenario's map cannot be written beside it.
+        """
+        _save_scenario(self.scenario, folder)
+        picture = Image.fromarray(paint)
+        write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
+        content: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop", "units": _UNITS}
+        content |= {"scenario": self.scenario.name}
+        content |= {name: getattr(self, name) for name in self.__slots__ if name not in ("scenario", "trials")}
+        content |= {"trials": [asdict(trial) for trial in self.trials], "rows": [asdict(row) for row in self.rows()]}
+        write_atomically(
+            folder / "evaluation.json",
+            lambda part: part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"),
+        )
+
+    @staticmethod
+    def load(folder: Path) -> Evaluation:
+        """Read what `save` wrote.
+
+        Raises:
+            EpisodeError: a file is missing, damaged or of another format.
+        """
+        path = folder / "evaluation.json"
+        content = read_json(path, FORMAT, FORMAT_VERSION, EpisodeError)
+        try:
+            return Evaluation(
+                scenario=load_scenarios(folder / "scenario.toml")[0],
+                weathers=tuple(Weather(name) for name in content["weathers"]),
+                trials=tuple(trial_from_json(each) for each in content["trials"]),
+                seconds=float(content["seconds"]),
+                **{
+                    name: content[name]
+                    for name in ("controller", "runs", "cars", "pedestrians", "seed", "simulator_calls")
+                },
+            )
+        except (KeyError, TypeError, ValueError, RoadproofError) as error:
+            raise EpisodeError(f"{path} is incomplete or damaged ({error}); evaluate again") from None
+
+
+def path_of(episode: Episode) -> Path2D:
+    """World x, y of the car at each observation."""
+    return np.column_stack([episode.x_m, episode.y_m])
+
+
+def judge(
+    clean: Episode, painted: Episode, canvas: CanvasPlacement, *, pattern: str, clean_file: str, painted_file: str
+) -> Trial:
+    """The trial of two drives that differ in the paint alone.
+
+    Deviation is taken over the instants at which the clean drive has the canvas in view, the largest offset over the
+    whole painted drive.
+    """
+    bare, driven = path_of(clean), path_of(painted)
+    seen = passage(bare, canvas)
+    # A painted drive that ended before has its last position left.
+    during = driven[seen] if len(driven) > seen.start else driven[-1:]
+    beside = lateral_m(bare, driven)
+    return Trial(
+        pattern=pattern,
+        weather=painted.weather,
+        traffic=painted.cars + painted.pedestrians > 0,
+        seed=painted.seed,
+        clean=clean_file,
+        painted=painted_file,
+        deviation_m=deviation_m(bare[seen], during),
+        lateral_m=float(beside[np.abs(beside).argmax()]),
+        points=infraction_points(painted.events),
+        clean_points=infraction_points(clean.events),
+        leaderboard=leaderboard_factor(painted.events),
+        clean_leaderboard=leaderboard_factor(clean.events),
+        first_event_s=first_event_s(painted.events),
+        clean_first_event_s=first_event_s(clean.events),
+        ending=str(painted.ending),
+    )
+
+
+def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:
+    def mean(value: Callable[[Trial], float]) -> Mean:
+        return mean_95([value(trial) for trial in trials])
+
+    first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
+    return Row(
+        pattern=pattern,
+        weather=weather,
+        traffic=traffic,
+        deviation_m=mean(lambda trial: trial.deviation_m),
+        lateral_m=mean(lambda trial: abs(trial.lateral_m)),
+        points=mean(lambda trial: trial.points),
+        clean_points=mean(lambda trial: trial.clean_points),
+        leaderboard=mean(lambda trial: trial.leaderboard),
+        failed=len(first) / len(trials),
+        first_event_s=mean_95(first) if first else None,
+    )
+
+
+def trial_from_json(stored: dict[str, Any]) -> Trial:
+    """A trial as `dataclasses.asdict` and JSON leave it.
+
+    Raises:
+        EpisodeError: the name of an episode is not a plain one.
+        KeyError, TypeError, ValueError: something is missing or wrong.
+    """
+    for name in (stored["clean"], stored["painted"]):
+        if Path(name).name != name or not str(name).endswith(".npz"):
+            raise EpisodeError(f"episode {name!r} is not a plain file name")
+    fields: dict[str, Any] = {**stored, "weather": Weather(stored["weather"])}
+    return Trial(**fields)
+
+
+def _save_scenario(scenario: Scenario, folder: Path) -> None:
+    """The scenario, and its map where that is a file."""
+    source = Path(scenario.map_name)
+    if source.suffix == ".xodr" and source.resolve().parent != folder.resolve():
+        write_atomically(folder / source.name, lambda part: shutil.copyfile(source, part))
+        scenario = replace(scenario, map_name=str(folder / source.name))
+    save_scenarios([scenario], folder / "scenario.toml")
+
+
+def load_paint(folder: Path) -> PatternImage:
+    """What was painted in an evaluation.
+
+    Raises:
+        PatternError: the file is missing or damaged.
+    """
+    return read_paint(folder / "paint.png")
+
+
+def episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
+    """Drives of an evaluation by file name.
+
+    Raises:
+        EpisodeError: one is missing or damaged.
+    """
+    return tuple(Episode.load(folder / "episodes" / name) for name in names)

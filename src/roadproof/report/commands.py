@@ -1,0 +1,42 @@
+"""Which commands make a run again."""
+
+from __future__ import annotations
+
+import shlex
+
+from roadproof.attacks import AttackResult
+from roadproof.evaluation import Evaluation
+from roadproof.report.run import Run
+
+
+def commands_of(run: Run) -> tuple[str, ...]:
+    """The commands kept in the run, or else those that its results tell of."""
+    if run.commands:
+        return run.commands
+    folder = run.folder
+    lines: list[list[str]] = []
+    if run.attack is not None:
+        who = run.judged.evaluation.controller if run.judged is not None else "CONTROLLER"
+        lines.append(["roadproof", "attack", str(folder / "recordings"), "--controller", who, *_attack(run.attack)])
+        lines[-1] += ["--out", str(folder / "attack")]
+    if run.judged is not None:
+        paint = folder / "attack" / "pattern.json" if run.attack is not None else folder / "evaluation" / "paint.png"
+        lines.append(["roadproof", "evaluate", str(paint), *_evaluate(run.judged.evaluation)])
+        lines[-1] += ["--out", str(folder / "evaluation")]
+    lines.append(["roadproof", "report", str(folder)])
+    return tuple(map(shlex.join, lines))
+
+
+def _attack(attack: AttackResult) -> list[str]:
+    options = ["--figures", str(attack.space.figures), "--family", attack.space.family]
+    options += ["--groups", ",".join(attack.by_group), "--schedule", "heats" if attack.schedule.heats else "published"]
+    options += ["--iterations", str(attack.schedule.iterations)]
+    return [*options, "--restarts", str(attack.restarts), "--seed", str(attack.seed)]
+
+
+def _evaluate(evaluation: Evaluation) -> list[str]:
+    options = ["--scenario", evaluation.scenario.name, "--controller", evaluation.controller]
+    options += ["--weathers", ",".join(evaluation.weathers), "--runs", str(evaluation.runs)]
+    options += ["--cars", str(evaluation.cars), "--pedestrians", str(evaluation.pedestrians)]
+    random = {trial.pattern for trial in evaluation.trials if trial.pattern.startswith("random")}
+    return [*options, "--random", str(len(random)), "--seed", str(evaluation.seed)]

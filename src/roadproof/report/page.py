@@ -1,0 +1,390 @@
+"""The report of a run: one HTML page that needs nothing else, and the same numbers as JSON.
+
+write_report(Path("out/run"))   # out/run/report.html, out/run/result.json
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from PIL import Image
+
+import roadproof
+from roadproof.calibration.report import Spread
+from roadproof.files import write_atomically
+from roadproof.metrics import counted
+from roadproof.patterns import Pattern, raster
+from roadproof.report import charts
+from roadproof.report.commands import commands_of
+from roadproof.report.run import Judged, Run, read_run
+from roadproof.report.top_view import top_view
+from roadproof.report.verdict import verdict
+from roadproof.report.words import MISSING, mean_in_words
+from roadproof.simulators.protocol import PatternImage
+
+FORMAT = "roadproof-report"
+FORMAT_VERSION = 1
+ASPHALT = (92, 94, 98)
+SHOWN_COMPOSITES = 3
+
+Fields = dict[str, Any]
+
+
+def write_report(folder: Path) -> Path:
+    """Write report.html and result.json of a run folder.
+
+    Args:
+        folder: of the run (`report.run.read_run`); stages that are missing are left out.
+
+    Returns:
+        The page.
+
+    Raises:
+        RoadproofError: there is nothing to report, or a stage is damaged.
+        OutputError: the folder cannot be written.
+    """
+    run = read_run(folder)
+    result = json.dumps(result_of(run), indent=1, ensure_ascii=False) + "\n"
+    page = render(run)
+    write_atomically(folder / "result.json", lambda part: part.write_text(result, encoding="utf-8"))
+    write_atomically(folder / "report.html", lambda part: part.write_text(page, encoding="utf-8"))
+    return folder / "report.html"
+
+
+def render(run: Run) -> str:
+    """The page of a run. Everything shown is escaped."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html.jinja").render(
+        version=roadproof.__version__,
+        name=_name(run),
+        verdict=verdict(run),
+        figures=_key_figures(run),
+        judged=_judged(run.judged),
+        pattern=_pattern(run),
+        attack=_attack(run),
+        fidelity=_fidelity(run.judged),
+        recorded=_recorded(run),
+        calibration=_calibration(run),
+        costs=_costs(run),
+        commands=commands_of(run),
+    )
+
+
+def result_of(run: Run) -> Fields:
+    """The report's numbers; those of driving and those of the surrogate apart."""
+    found = verdict(run)
+    content: Fields = {"format": FORMAT, "version": FORMAT_VERSION, "verdict": asdict(found), "name": _name(run)}
+    if run.judged is not None:
+        evaluation = run.judged.evaluation
+        content["closed_loop"] = {
+            "controller": evaluation.controller,
+            "trials": [asdict(trial) for trial in evaluation.trials],
+            "rows": [asdict(row) for row in evaluation.rows()],
+        }
+    surrogate: Fields = {}
+    if run.attack is not None:
+        surrogate |= {"shift": run.attack.surrogate_shift, "by_group": run.attack.by_group}
+    if run.judged is not None and run.judged.fidelity is not None:
+        surrogate |= {"agreement": asdict(run.judged.fidelity.agreement)}
+    calibration = None if run.calibration is None else asdict(run.calibration)
+    return content | {"surrogate": surrogate or None, "calibration": calibration, "cost": _costs(run)}
+
+
+def _name(run: Run) -> str:
+    if run.judged is not None:
+        return run.judged.evaluation.scenario.name
+    if run.drives:
+        return run.drives.settings.scenario.name
+    return run.folder.resolve().name
+
+
+def _key_figures(run: Run) -> list[Fields]:
+    """The numbers beside the verdict; of driving alone."""
+    if run.judged is None:
+        return []
+    evaluation = run.judged.evaluation
+    trials = [*evaluation.of(traffic=False), *evaluation.of(traffic=True)]
+    alone, traffic = (evaluation.of(traffic=each) for each in (False, True))
+    furthest = max(trials, key=lambda trial: abs(trial.lateral_m))
+    failed, before = (
+        sum(points > 0 for points in each) for each in ([t.points for t in trials], [t.clean_points for t in trials])
+    )
+    penalty = traffic or alone
+    return [
+        {
+            "value": f"{abs(furthest.lateral_m):.2f} m",
+            "label": "furthest from the clean path",
+            "note": f"to the {'left' if furthest.lateral_m > 0 else 'right'}, {_words(furthest.weather)}",
+        },
+        {
+            "value": f"{np.mean([t.deviation_m for t in alone]):.2f} m",
+            "label": "mean deviation",
+            "note": f"the paper’s measure, {len(alone)} weather{'s' if len(alone) != 1 else ''}, alone on the road",
+        },
+        {
+            "value": f"{np.mean([t.points for t in penalty]):.1f}",
+            "label": "penalty points a drive",
+            "note": f"{np.mean([t.clean_points for t in penalty]):.1f} on the bare road"
+            f"{', in traffic' if traffic else ''}",
+        },
+        {
+            "value": f"{failed} of {len(trials)}",
+            "label": "drives with infractions",
+            "note": f"{before} on the bare road",
+        },
+    ]
+
+
+def _judged(judged: Judged | None) -> Fields | None:
+    if judged is None:
+        return None
+    evaluation, shown = judged.evaluation, judged.shown
+    strip = judged.strip
+    return {
+        "controller": evaluation.controller,
+        "weather": _words(shown.weather),
+        "traffic": f"{evaluation.cars} cars and {evaluation.pedestrians} people",
+        "film": _data_url("video/mp4", judged.film),
+        "poster": _data_url("image/jpeg", judged.poster),
+        "events": charts.told(counted(judged.painted.events)),
+        "clean_events": charts.told(counted(judged.clean.events)),
+        "lateral": f"{abs(shown.lateral_m):.2f} m to the {'left' if shown.lateral_m > 0 else 'right'}",
+        "above": top_view(evaluation.scenario, judged.paint, judged.clean, judged.painted),
+        "steering": charts.steering(judged.clean, judged.painted, judged.fidelity, evaluation.scenario.canvas),
+        "offsets": charts.offsets(judged.by_weather, evaluation.scenario.canvas),
+        "strip": []
+        if strip is None
+        else [
+            {
+                "time": f"{strip.time_s[k]:.1f} s",
+                "beside": _aside(float(strip.lateral_m[k])),
+                "clean": _picture(strip.clean[k]),
+                "painted": _picture(strip.painted[k]),
+            }
+            for k in range(len(strip.time_s))
+        ],
+        "rows": [
+            {
+                "pattern": row.pattern,
+                "weather": "all weathers" if row.weather is None else _words(row.weather),
+                "all": row.weather is None,
+                "traffic": "in traffic" if row.traffic else "alone",
+                "count": row.points.count,
+                "deviation": mean_in_words(row.deviation_m, 2),
+                "lateral": mean_in_words(row.lateral_m, 2),
+                "points": mean_in_words(row.points, 1),
+                "clean_points": mean_in_words(row.clean_points, 1),
+                "leaderboard": mean_in_words(row.leaderboard, 2),
+                "failed": f"{row.failed:.0%}",
+                "first": mean_in_words(row.first_event_s, 1),
+            }
+            for row in evaluation.rows()
+        ],
+    }
+
+
+def _pattern(run: Run) -> Fields | None:
+    """What is painted, as it lies on the road."""
+    pattern = None if run.attack is None else run.attack.pattern
+    canvas = None if run.judged is None else run.judged.evaluation.scenario.canvas
+    if run.judged is not None:
+        paint = run.judged.paint
+        # The attack's own figures are listed only if they are what was painted.
+        pattern = pattern if pattern is not None and np.array_equal(raster(pattern), paint) else None
+    elif pattern is not None:
+        paint = raster(pattern)
+    else:
+        return None
+    size = (canvas.width_m, canvas.length_m) if canvas is not None else None
+    return {
+        "picture": _on_asphalt(paint, size),
+        "size": f"{size[0]:.1f} × {size[1]:.1f} m" if size else "400 × 400 canvas pixels",
+        "share": f"{(paint[..., 3] / 255).mean():.0%}",
+        "figures": [] if pattern is None else _figures(pattern, size),
+    }
+
+
+def _figures(pattern: Pattern, size: tuple[float, float] | None) -> list[Fields]:
+    scale_x, scale_y, unit = (size[0] / 400, size[1] / 400, "m") if size else (1.0, 1.0, "px")
+    digits = 2 if size else 0
+    boxes = cast("list[list[float]]", pattern.boxes.tolist())
+    colours = cast("list[list[float]]", pattern.colours.tolist())
+    rows: list[Fields] = []
+    for number, (shape, box, rgb) in enumerate(zip(pattern.shapes, boxes, colours, strict=True), 1):
+        x, y, width, length, turned = box
+        red, green, blue = (round(255 * channel) for channel in rgb)
+        rows.append(
+            {
+                "number": number,
+                "shape": str(shape),
+                "at": f"{x * scale_x:.{digits}f}, {y * scale_y:.{digits}f} {unit}",
+                "size": f"{width * scale_x:.{digits}f} × {length * scale_y:.{digits}f} {unit}",
+                "turned": f"{turned:.0f}°",
+                "colour": f"#{red:02x}{green:02x}{blue:02x}",
+            }
+        )
+    return rows
+
+
+def _attack(run: Run) -> Fields | None:
+    attack = run.attack
+    if attack is None:
+        return None
+    starts = f"{attack.restarts} start{'s' if attack.restarts != 1 else ''}"
+    return {
+        "chart": charts.search(attack.history, tuple(attack.by_group)),
+        "shift": f"{attack.surrogate_shift:+.3f}",
+        "group": attack.group,
+        "groups": [(name, f"{value:+.3f}") for name, value in attack.by_group.items()],
+        "how": f"{starts} a group, {len(attack.history)} iterations, {attack.space.figures} figures of the "
+        f"{attack.space.family} family, seed {attack.seed}; {attack.stopped}",
+        "checks": [asdict(check) for check in attack.checks],
+    }
+
+
+def _fidelity(judged: Judged | None) -> Fields | None:
+    if judged is None or judged.fidelity is None:
+        return None
+    fidelity, found = judged.fidelity, judged.fidelity.agreement
+    shown = np.unique(np.linspace(0, len(fidelity.clean) - 1, SHOWN_COMPOSITES).round().astype(int)).tolist()
+    return {
+        "frames": found.frames,
+        "drive": fidelity.drive,
+        "paint_error": f"{found.paint_error:.1f}",
+        "elsewhere_error": f"{found.elsewhere_error:.1f}",
+        "steer_error": f"{found.steer_error:.3f}",
+        "predicted": f"{found.predicted_shift:+.3f}",
+        "rendered": f"{found.rendered_shift:+.3f}",
+        "shown": [
+            {
+                "frame": int(fidelity.frame_number[k]),
+                "clean": _picture(fidelity.clean[k], lossless=True),
+                "composited": _picture(fidelity.composited[k], lossless=True),
+                "rendered": _picture(fidelity.rendered[k], lossless=True),
+            }
+            for k in shown
+        ],
+    }
+
+
+def _recorded(run: Run) -> Fields | None:
+    if run.drives is None and run.recordings is None:
+        return None
+    drives = {} if run.drives is None else {each.name: each for each in run.drives.drives}
+    calibrated = {} if run.recordings is None else {each.name: each for each in run.recordings.recordings}
+    rows: list[Fields] = []
+    for name in [*drives, *(name for name in calibrated if name not in drives)]:
+        drive, recording = drives.get(name), calibrated.get(name)
+        kept = recording or drive
+        rows.append(
+            {
+                "name": name,
+                "push": MISSING if kept is None else str(kept.push),
+                "frames": MISSING if kept is None else str(len(kept.frames)),
+                "aside": MISSING if drive is None else _aside(-drive.deviation_m),
+                "note": "" if drive is None else drive.note,
+            }
+        )
+    return {"rows": rows, "origin": "" if run.recordings is None else run.recordings.origin}
+
+
+def _calibration(run: Run) -> Fields | None:
+    if run.recordings is None:
+        return None
+    maps = sum(each.maps is not None for each in run.recordings.recordings)
+    facts = [("drives with gain and offset of every pixel", f"{maps} of {len(run.recordings.recordings)}")]
+    report = run.calibration
+    if report is None:
+        return {"facts": facts, "drives": []}
+    colour = MISSING if report.colour_residual is None else f"{report.colour_residual:.1f} of 255 levels"
+    facts = [("method", report.method), ("colours fit within", colour), *facts]
+    return {
+        "facts": facts,
+        "drives": [
+            {
+                "name": drive.name,
+                "frames": drive.frames,
+                "residual": _spread(drive.residual_px),
+                "stated": _spread(drive.stated_px),
+                "dropped": "; ".join(f"{number}: {reason}" for number, reason in drive.dropped) or "none",
+            }
+            for drive in report.drives
+        ],
+    }
+
+
+def _spread(spread: Spread | None) -> str:
+    return MISSING if spread is None else f"{spread.mean:.2f} ({spread.p95:.2f})"
+
+
+def _costs(run: Run) -> list[Fields]:
+    """Simulator calls and seconds of each stage; None where the stage did not note them."""
+    costs: list[Fields] = []
+    if run.drives is not None:
+        costs.append({"stage": "record", "simulator_calls": run.drives.calls, "seconds": None, "frames": None})
+    if run.calibration is not None:
+        # Its own count includes recording.
+        calls = run.calibration.calls - (0 if run.drives is None else run.drives.calls)
+        costs.append(
+            {"stage": "calibrate", "simulator_calls": calls, "seconds": run.calibration.seconds, "frames": None}
+        )
+    if run.attack is not None:
+        cost = run.attack.cost
+        costs.append(
+            {"stage": "attack", "simulator_calls": 0, "seconds": cost.seconds, "frames": cost.controller_frames}
+        )
+    if run.judged is not None:
+        evaluation = run.judged.evaluation
+        costs.append(
+            {
+                "stage": "evaluate",
+                "simulator_calls": evaluation.simulator_calls,
+                "seconds": evaluation.seconds,
+                "frames": None,
+            }
+        )
+    return costs
+
+
+def _aside(left_m: float) -> str:
+    return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "0"
+
+
+def _words(weather: str) -> str:
+    return weather.replace("-", " ")
+
+
+def _on_asphalt(paint: PatternImage, size: tuple[float, float] | None) -> str:
+    """The canvas as it would lie on the road, in its true proportions."""
+    road = Image.new("RGB", (paint.shape[1], paint.shape[0]), ASPHALT)
+    road.paste(Image.fromarray(paint[..., :3]), (0, 0), Image.fromarray(paint[..., 3]))
+    width, length = size or (1.0, 1.0)
+    shown = road.resize((480, max(round(480 * length / width), 1)), Image.Resampling.LANCZOS)
+    return _encoded(shown, "PNG")
+
+
+def _picture(pixels: np.ndarray, *, lossless: bool = False) -> str:
+    return _encoded(Image.fromarray(pixels), "PNG" if lossless else "JPEG")
+
+
+def _encoded(image: Image.Image, kind: str) -> str:
+    out = io.BytesIO()
+    image.save(out, format=kind, quality=84, optimize=True)
+    return _data_url(f"image/{kind.lower()}", out.getvalue()) or ""
+
+
+def _data_url(kind: str, content: bytes | None) -> str | None:
+    return None if content is None else f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,151 @@
+"""A run folder, as far as it has come: what each stage left, read for the report.
+
+RUN/record/DRIVE/episode.npz   recorded drives
+RUN/recordings/                the same, calibrated (`roadproof.recordings`)
+RUN/attack/                    what the attack found (`roadproof.attacks`)
+RUN/evaluation/                what driving over it showed (`roadproof.evaluation`)
+RUN/commands.txt               optional: the commands that made it, one a line
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from roadproof.attacks import AttackResult
+from roadproof.calibration.report import CalibrationReport, load_report
+from roadproof.datatypes import Weather
+from roadproof.drives import Drives, load_drives
+from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.evaluation import Evaluation, Fidelity, Trial
+from roadproof.evaluation.result import load_paint
+from roadproof.recordings import RecordingSet, load_recordings
+from roadproof.report.film import FILM, POSTER, STRIP, Strip
+from roadproof.rollout import Episode
+from roadproof.simulators.protocol import PatternImage
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Judged:
+    """An evaluation with what is shown of it.
+
+    Args:
+        evaluation: its numbers.
+        paint: what was painted.
+        shown: the trial shown in pictures.
+        clean: its drive without paint.
+        painted: its drive with it.
+        by_weather: every weather's drives alone, without and with paint.
+        fidelity: composites against renders, where they were compared.
+        film: the two drives side by side, MP4.
+        poster: one image of it, JPEG.
+        strip: pictures of the passage.
+    """
+
+    evaluation: Evaluation
+    paint: PatternImage
+    shown: Trial
+    clean: Episode
+    painted: Episode
+    by_weather: tuple[tuple[Weather, Episode, Episode], ...]
+    fidelity: Fidelity | None
+    film: bytes | None
+    poster: bytes | None
+    strip: Strip | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Run:
+    """What a run folder holds; None for a stage that is not there.
+
+    Args:
+        folder: the run.
+        drives: as recorded.
+        recordings: the calibrated set.
+        calibration: what the calibration says of itself.
+        attack: the attack's result.
+        judged: the evaluation.
+        commands: that made it, where they were kept.
+    """
+
+    folder: Path
+    drives: Drives | None
+    recordings: RecordingSet | None
+    calibration: CalibrationReport | None
+    attack: AttackResult | None
+    judged: Judged | None
+    commands: tuple[str, ...]
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run folder. A stage that was not done is left out; one that is damaged is refused.
+
+    Raises:
+        RoadproofError: there is no such folder, no stage in it, or a stage is damaged; the message names it.
+    """
+    if not folder.is_dir():
+        raise RoadproofError(f"no folder {folder}; expected a run with record, recordings, attack or evaluation in it")
+    run = Run(
+        folder=folder,
+        drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
+        recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
+        calibration=load_report(report) if (report := folder / "calibration" / "report.json").exists() else None,
+        attack=AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None,
+        judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,
+        commands=_commands(folder / "commands.txt"),
+    )
+    if run.drives is None and run.recordings is None and run.attack is None and run.judged is None:
+        raise RoadproofError(
+            f"{folder} has neither record, recordings, attack nor evaluation in it; nothing to report yet"
+        )
+    return run
+
+
+def _commands(path: Path) -> tuple[str, ...]:
+    try:
+        return tuple(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
+    except FileNotFoundError:
+        return ()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RoadproofError(f"{path} cannot be read ({error}); remove it") from None
+
+
+def _judged(folder: Path) -> Judged:
+    evaluation = Evaluation.load(folder)
+    shown = evaluation.shown()
+    alone = evaluation.of(traffic=False)
+    pairs = tuple((trial.weather, _episode(folder, trial.clean), _episode(folder, trial.painted)) for trial in alone)
+    fidelity = folder / "fidelity.npz"
+    return Judged(
+        evaluation=evaluation,
+        paint=load_paint(folder),
+        shown=shown,
+        clean=pairs[0][1],
+        painted=pairs[0][2],
+        by_weather=pairs,
+        fidelity=Fidelity.load(fidelity) if fidelity.exists() else None,
+        film=_bytes(folder / FILM),
+        poster=_bytes(folder / POSTER),
+        strip=_strip(folder / STRIP),
+    )
+
+
+def _episode(folder: Path, name: str) -> Episode:
+    return Episode.load(folder / "episodes" / name)
+
+
+def _bytes(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
+
+
+def _strip(path: Path) -> Strip | None:
+    if not path.exists():
+        return None
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            return Strip(**{name: np.asarray(stored[name]) for name in Strip.__slots__})
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise EpisodeError(f"{path} is damaged ({error}); evaluate again") from None

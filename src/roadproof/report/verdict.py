@@ -1,0 +1,84 @@
+"""The one sentence a report begins with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadproof.evaluation import Evaluation
+from roadproof.metrics import mean_95
+from roadproof.report.run import Run
+from roadproof.report.words import mean_in_words
+
+SWAYED_M = 0.5
+"""Half a metre aside and a car of ordinary width is over the line of an ordinary lane."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What came out.
+
+    Args:
+        key: "fails", "swayed", "holds", "unfit", "predicted" or "recorded".
+        title: the same in two or three words.
+        sentence: the whole finding.
+    """
+
+    key: str
+    title: str
+    sentence: str
+
+
+def verdict(run: Run) -> Verdict:
+    """What a run shows; without driving it shows a prediction at most."""
+    if run.judged is not None:
+        return _driven(run.judged.evaluation)
+    if run.attack is not None:
+        attack = run.attack
+        return Verdict(
+            "predicted",
+            "Predicted, not driven",
+            f"On composited frames the pattern shifts steering by {attack.surrogate_shift:+.3f} a frame "
+            f"({attack.group}); nobody has driven over it yet.",
+        )
+    drives = len(run.drives.drives if run.drives else run.recordings.recordings if run.recordings else ())
+    return Verdict("recorded", "Not attacked yet", f"{drives} drives are recorded; no pattern was searched yet.")
+
+
+def _driven(evaluation: Evaluation) -> Verdict:
+    trials = [*evaluation.of(traffic=False), *evaluation.of(traffic=True)]
+    alone = evaluation.of(traffic=False)
+    worse = sum(trial.points > trial.clean_points for trial in trials)
+    furthest = max(abs(trial.lateral_m) for trial in trials)
+    who, where, n = evaluation.controller, evaluation.scenario.name, len(trials)
+    points = mean_in_words(mean_95([trial.points for trial in trials]), 1)
+    before = mean_in_words(mean_95([trial.clean_points for trial in trials]), 1)
+    if all(trial.clean_points > 0 for trial in alone):
+        return Verdict(
+            "unfit",
+            "Fails without paint",
+            f"{who} already commits infractions on the bare road of {where} ({before} points a drive), so nothing can "
+            f"be blamed on the pattern; choose a scenario it masters.",
+        )
+    if worse:
+        return Verdict(
+            "fails",
+            "Fails over the paint",
+            f"Over the pattern {who} fares worse than on the bare road in {worse} of {n} drives of {where}: it leaves "
+            f"its path by up to {furthest:.1f} m, and a drive costs {points} penalty points instead of {before}.",
+        )
+    if furthest >= SWAYED_M:
+        return Verdict(
+            "swayed",
+            "Swayed, no infraction",
+            f"The pattern moves {who} by up to {furthest:.1f} m on {where}, but no drive of {n} has more infractions "
+            "than on the bare road.",
+        )
+    deviation = float(np.mean([trial.deviation_m for trial in alone]))
+    return Verdict(
+        "holds",
+        "Holds its lane",
+        f"{who} keeps its path on {where}: at most {furthest:.2f} m aside (deviation {deviation:.2f} m), and in none "
+        f"of {n} drives more infractions than on the bare road.",
+    )

@@ -1,0 +1,60 @@
+"""Which simulator is meant: "town" is the embedded one."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Protocol
+
+from roadproof.errors import SimulatorError
+from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.town.agents import Agents
+from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.simulators.town.routes import Route
+
+SPECS = "town"
+
+
+class MappedSimulator(Simulator, Protocol):
+    """A simulator that also shows the map, the way to the goal, the other cars and the people."""
+
+    def road_map(self, name: str) -> RoadMap:
+        """The map a scenario names.
+
+        Raises:
+            SimulatorError: the simulator does not answer.
+            ScenarioError: it has no such map.
+        """
+        ...
+
+    @property
+    def route(self) -> Route:
+        """The way of the current drive."""
+        ...
+
+    @property
+    def cars(self) -> Agents:
+        """The other cars as they are now."""
+        ...
+
+    @property
+    def pedestrians(self) -> Agents:
+        """The people as they are now."""
+        ...
+
+
+@contextmanager
+def open_simulator(spec: str) -> Generator[MappedSimulator]:
+    """Open the simulator of a spec for a with-block; leaving frees everything it holds.
+
+    Raises:
+        SimulatorError: there is none of this name, or what it needs is not installed.
+    """
+    if spec == "town":
+        # Panda3D is an extra.
+        from roadproof.simulators.town.simulator import TownSimulator
+
+        with TownSimulator() as town:
+            yield town
+        return
+    raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")

@@ -1,0 +1,281 @@
+"""What a study compares, as a TOML file says it, and the independent jobs that come of it.
+
+format = "roadproof-study"
+version = 1
+controller = "cil"
+scenarios = ["straight-01", "left-*"]     # names or patterns of names
+figures = ["1-b", 1, 3, 5]                # K; 1-b is one black figure
+seeds = [0]
+weathers = ["clear-noon", "rainy-noon"]   # of the evaluation; attacks are found in the first
+
+[traffic]                                 # leave it out for static objects only
+cars = 20
+pedestrians = 20
+runs = 10
+
+[[method]]
+name = "GradOpt"                          # stands in the tables
+search = "gradopt"                        # or a black-box method: random, published-bo, gp, tpe, cma-es
+trajectories = 3                          # gradopt: recorded drives; scheme: group, group-all or random
+scheme = "group"
+restarts = 4
+iterations = 250
+
+[[method]]
+name = "BO"
+search = "published-bo"
+calls = 1000                              # black box: how many patterns are tried, each in a whole drive
+random_calls = 400
+"""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import hashlib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+from roadproof.datatypes import Weather
+from roadproof.errors import StudyError
+from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
+
+FORMAT = "roadproof-study"
+FORMAT_VERSION = 1
+JOB_VERSION = 1
+"""Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
+
+Scheme = Literal["group", "group-all", "random"]
+SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
+BLACK = "1-b"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MethodPlan:
+    """One way of finding a pattern.
+
+    Args:
+        name: stands in the tables.
+        search: "gradopt", or a black-box method of `attacks.blackbox`.
+        trajectories: gradopt: T, how many drives are recorded.
+        scheme: gradopt: how they are perturbed and pooled.
+        restarts: gradopt: starts of every group.
+        iterations: gradopt: steps of every start.
+        select: gradopt: how many of the best starts are driven, to keep the strongest; 0 believes the surrogate.
+        calls: black box: patterns tried, each in a whole drive.
+        random_calls: published-bo: how many of them before the model guides.
+    """
+
+    name: str
+    search: str
+    trajectories: int = 3
+    scheme: str = "group"
+    restarts: int = 4
+    iterations: int = 250
+    select: int = 0
+    calls: int = 1000
+    random_calls: int = 400
+
+    def __post_init__(self) -> None:
+        # Late, since torch comes with it; a process that only passes plans on is spared.
+        from roadproof.attacks.blackbox import METHODS
+
+        _one_of(self.search, "search", ("gradopt", *METHODS))
+        _one_of(self.scheme, "scheme", SCHEMES)
+        for name, least in (("trajectories", 1), ("restarts", 1), ("iterations", 1), ("select", 0), ("calls", 1)):
+            _at_least(getattr(self, name), name, least)
+        if self.trajectories % 2 == 0:
+            raise StudyError(f"trajectories is {self.trajectories}, expected an odd number: a clean drive and pairs")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrafficPlan:
+    """Evaluation among others: seeded runs whose mean counts."""
+
+    cars: int = 20
+    pedestrians: int = 20
+    runs: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("cars", "pedestrians"):
+            _at_least(getattr(self, name), name, 0)
+        _at_least(self.runs, "runs", 1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Job:
+    """One pattern to be found and evaluated; independent of every other.
+
+    Args:
+        controller: its spec.
+        scenario: where.
+        figures: K, or "1-b".
+        method: how.
+        seed: of the recording and the search.
+        weathers: of the evaluation; found in the first.
+        traffic: of the evaluation, or None.
+    """
+
+    controller: str
+    scenario: Scenario
+    figures: int | str
+    method: MethodPlan
+    seed: int
+    weathers: tuple[Weather, ...]
+    traffic: TrafficPlan | None
+
+    @property
+    def key(self) -> str:
+        """What tells this job from every other: a hash of all it depends on."""
+        content = json.dumps({"job_version": JOB_VERSION, **asdict(self)}, sort_keys=True, default=str)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def __str__(self) -> str:
+        return f"{self.scenario.name}, K = {self.figures}, {self.method.name}, seed {self.seed}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Study:
+    """Scenarios × K × methods × seeds, evaluated in some weathers, with and without traffic.
+
+    Raises:
+        StudyError: a list is empty, or a value makes no sense.
+    """
+
+    controller: str
+    scenarios: tuple[Scenario, ...]
+    figures: tuple[int | str, ...]
+    methods: tuple[MethodPlan, ...]
+    seeds: tuple[int, ...] = (0,)
+    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
+    traffic: TrafficPlan | None = None
+
+    def __post_init__(self) -> None:
+        for field in ("scenarios", "figures", "methods", "seeds", "weathers"):
+            if not getattr(self, field):
+                raise StudyError(f"{field} is empty, expected at least one")
+        for figures in self.figures:
+            if figures != BLACK and (not isinstance(figures, int) or isinstance(figures, bool) or figures < 1):
+                raise StudyError(f"figures has {figures!r}, expected numbers from 1, or {BLACK!r} for one black figure")
+        names = [method.name for method in self.methods]
+        if len(set(names)) < len(names):
+            raise StudyError(f"two methods have the same name among {', '.join(names)}; the tables go by it")
+
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """Every combination, scenario by scenario."""
+        return tuple(
+            Job(
+                controller=self.controller,
+                scenario=scenario,
+                figures=figures,
+                method=method,
+                seed=seed,
+                weathers=self.weathers,
+                traffic=self.traffic,
+            )
+            for scenario, figures, method, seed in product(self.scenarios, self.figures, self.methods, self.seeds)
+        )
+
+
+def load_study(path: Path) -> Study:
+    """Read a study; see the head of this module.
+
+    Raises:
+        StudyError: the file is missing or damaged, a key is unknown, or a value makes no sense; says which.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise StudyError(f"cannot read {path}: {error.strerror or error}; check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StudyError(f"{path} is not valid TOML ({error})") from None
+    try:
+        return _study(content, path.parent)
+    except StudyError as error:
+        raise StudyError(f"{path}: {error}") from None
+
+
+def _study(content: dict[str, Any], folder: Path) -> Study:
+    if content.pop("format", None) != FORMAT or content.pop("version", None) != FORMAT_VERSION:
+        raise StudyError(f'expected format = "{FORMAT}" and version = {FORMAT_VERSION}')
+    listed = content.pop("scenario_file", None)
+    own = folder / str(listed) if listed is not None else BUILTIN_FILE
+    if listed is not None and not own.resolve().is_relative_to(folder.resolve()):
+        raise StudyError(f"scenario_file {listed!r} leaves the study's folder; put it beside the study")
+    stated = {"methods" if key == "method" else key: value for key, value in content.items()}
+    _known(stated, Study, "the study")
+    for key in ("controller", "scenarios", "figures", "methods"):
+        if key not in stated:
+            raise StudyError(f"{'method' if key == 'methods' else key} is missing")
+    traffic = stated.get("traffic")
+    return Study(
+        controller=str(stated["controller"]),
+        scenarios=_chosen(_list(stated, "scenarios"), load_scenarios(own)),
+        figures=tuple(_list(stated, "figures")),
+        methods=tuple(_build(MethodPlan, method, "method") for method in _list(stated, "methods")),
+        seeds=tuple(int(seed) for seed in _list(stated, "seeds", (0,))),
+        weathers=tuple(_weather(name) for name in _list(stated, "weathers", (Weather.CLEAR_NOON,))),
+        traffic=None if traffic is None else _build(TrafficPlan, traffic, "traffic"),
+    )
+
+
+def _chosen(patterns: Iterable[object], scenarios: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
+    """Scenarios by name or pattern of names, each once, in the order first named."""
+    chosen: dict[str, Scenario] = {}
+    for pattern in map(str, patterns):
+        found = [scenario for scenario in scenarios if fnmatch.fnmatchcase(scenario.name, pattern)]
+        chosen |= {scenario.name: scenario for scenario in found or [find_scenario(pattern, scenarios)]}
+    return tuple(chosen.values())
+
+
+def _build(noun: type[Any], stated: object, what: str) -> Any:  # noqa: ANN401  # the noun that was asked for
+    if not isinstance(stated, dict):
+        raise StudyError(f"{what} is {stated!r}, expected a table")
+    values = cast("dict[str, Any]", stated)
+    _known(values, noun, what)
+    for field in fields(noun):
+        value = values.get(field.name)
+        wanted = str if field.type == "str" else int
+        if value is not None and (not isinstance(value, wanted) or isinstance(value, bool)):
+            raise StudyError(f"{what}: {field.name} is {value!r}, expected {'a text' if wanted is str else 'a number'}")
+    try:
+        return noun(**values)
+    except TypeError:
+        missing = [name for name in ("name", "search") if name not in values]
+        raise StudyError(f"{what} lacks {missing[0]}") from None
+
+
+def _known(stated: Mapping[str, Any], noun: type[Any], what: str) -> None:
+    names = [field.name for field in fields(noun)]
+    for key in stated:
+        if key not in names:
+            nearest = difflib.get_close_matches(key, names, n=1, cutoff=0.0)
+            raise StudyError(f"{what} has an unknown key {key!r}; did you mean {nearest[0]!r}?")
+
+
+def _list(stated: Mapping[str, Any], key: str, otherwise: tuple[Any, ...] = ()) -> tuple[Any, ...]:
+    value = stated.get(key, otherwise)
+    if not isinstance(value, list | tuple):
+        raise StudyError(f"{key} is {value!r}, expected a list")
+    return tuple(cast("list[Any]", value))
+
+
+def _weather(name: object) -> Weather:
+    _one_of(str(name), "weathers", tuple(Weather))
+    return Weather(str(name))
+
+
+def _one_of(value: str, name: str, choices: Iterable[str]) -> None:
+    if value not in choices:
+        raise StudyError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
+
+
+def _at_least(value: int, name: str, least: int) -> None:
+    if value < least:
+        raise StudyError(f"{name} is {value}, expected {least} or more")

@@ -1,0 +1,132 @@
+"""Running the jobs of a study: side by side on this machine, or on a Ray cluster; what is done is not done again."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from roadproof.errors import RoadproofError, StudyError
+from roadproof.files import check_writable
+from roadproof.study.plan import Job, Study
+from roadproof.study.rows import JobResult, failed, is_done, write_result, write_table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Work: TypeAlias = Callable[[Job, Path], JobResult]
+"""Does a job; the folder is its own, and holds what a run before this one left there."""
+
+OnJob: TypeAlias = Callable[[int, Job, JobResult], object]
+"""Told how many jobs are done, and of the last one and its result."""
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    work: Work,
+    *,
+    workers: int = 1,
+    cluster: str | None = None,
+    on_job: OnJob = lambda _done, _job, _result: None,
+) -> DataFrame:
+    """Do every job that is not done yet, and gather the rows.
+
+    A job that fails becomes a row that says why, and the others go on. Killed in the middle, the same call does what
+    is left; a job that failed is tried again.
+
+    Args:
+        study: what to compare.
+        folder: where results are kept; may hold those of a run before.
+        work: does one job; a function of a module, since it runs in other processes.
+        workers: processes on this machine.
+        cluster: address of a Ray cluster, "local" for one on this machine; None stays without Ray.
+        on_job: told of every job.
+
+    Raises:
+        StudyError: an argument makes no sense, or an extra is missing.
+        OutputError: the folder cannot be written.
+    """
+    if workers < 1:
+        raise StudyError(f"workers is {workers}, expected 1 or more")
+    check_writable(folder)
+    left = [job for job in study.jobs if not is_done(job, folder)]
+    done = len(study.jobs) - len(left)
+    results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)
+    for job, result in results:
+        write_result(job, result, folder)
+        done += 1
+        on_job(done, job, result)
+    return write_table(study.jobs, folder)
+
+
+def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
+    """A job's result, whatever it raises: one bad job must not stop the night."""
+    try:
+        scratch.mkdir(parents=True, exist_ok=True)
+        return work(job, scratch)
+    except Exception as error:
+        kind = "" if isinstance(error, RoadproofError) else f"{type(error).__name__}: "
+        return failed(job, f"{kind}{error}")
+
+
+def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int) -> Iterator[tuple[Job, JobResult]]:
+    try:
+        joblib: Any = import_module("joblib")
+    except ImportError as error:
+        raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
+    # Threads that each wait for a process of their own: one that dies takes its job with it and no other.
+    pool = joblib.Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered", pre_dispatch=workers)
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    yield from pool(joblib.delayed(_in_own_process)(job, folder / "work" / job.key, work, threads) for job in jobs)
+
+
+def _in_own_process(job: Job, scratch: Path, work: Work, threads: int) -> tuple[Job, JobResult]:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_process, (threads,)) as process:
+        try:
+            return job, process.submit(_attempt, job, scratch, work).result()
+        except BrokenProcessPool:
+            return job, failed(job, "its process died, most likely for want of memory; use fewer workers")
+
+
+def _begin_process(threads: int) -> None:
+    # Before torch is imported; workers that each took all cores would only get in each other's way.
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+
+
+def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job, JobResult]]:
+    try:
+        ray: Any = import_module("ray")
+    except ImportError:
+        raise StudyError("a cluster needs ray; install roadproof[ray]") from None
+    ours = not ray.is_initialized()
+    if ours:
+        try:
+            ray.init(address=cluster, log_to_driver=False, include_dashboard=False if cluster == "local" else None)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
+    try:
+        remote = ray.remote(max_retries=1)(_on_node)
+        running = {remote.remote(job, work): job for job in jobs}
+        while running:
+            (reference,), _ = ray.wait(list(running), num_returns=1)
+            job = running.pop(reference)
+            try:
+                result = ray.get(reference)
+            except ray.exceptions.RayError as error:
+                result = failed(job, f"its worker died: {str(error).splitlines()[0]}")
+            yield job, result
+    finally:
+        if ours:
+            ray.shutdown()
+
+
+def _on_node(job: Job, work: Work) -> JobResult:
+    # What a job keeps to go on from stays on its node; its result travels.
+    return _attempt(job, Path(tempfile.gettempdir()) / "roadproof-study" / job.key, work)

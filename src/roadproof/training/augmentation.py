@@ -1,0 +1,74 @@
+"""Other light and another lens: what may change in a picture without changing how to drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Augmentation:
+    """How strongly pictures are varied: deviations, or shares of the pictures.
+
+    Args:
+        brightness: of the factor on all channels, as a power of e.
+        contrast: of the factor on the distance from the picture's mean, likewise.
+        tint: of the factor on each channel, likewise.
+        saturation: of the factor on the distance from grey, likewise.
+        noise: largest deviation of a pixel's noise.
+        noisy: share of the pictures with noise.
+        blurred: share of the pictures blurred over 3×3 pixels.
+    """
+
+    brightness: float = 0.15
+    contrast: float = 0.2
+    tint: float = 0.05
+    saturation: float = 0.25
+    noise: float = 0.04
+    noisy: float = 0.3
+    blurred: float = 0.15
+
+    def __call__(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
+        """Varied copies in [0, 1], each picture in its own way; drawn on the CPU, whatever the frames are on.
+
+        Args:
+            frames: RGB in [0, 1].
+            generator: where the randomness comes from.
+        """
+        count = len(frames)
+
+        def factor(deviation: float, channels: int = 1) -> Float[Tensor, "b c 1"]:
+            drawn = torch.randn(count, channels, 1, generator=generator).mul(deviation).exp()
+            return drawn.to(frames)
+
+        contrast, saturation = factor(self.contrast), factor(self.saturation)
+        gain = factor(self.brightness) * factor(self.tint, 3)
+        # Towards or away from grey, then from the picture's mean, then the gains: one matrix and offset a picture.
+        mean = frames.mean(dim=(1, 2, 3)).reshape(-1, 1, 1)
+        mixing = saturation * torch.eye(3).to(frames) + (1.0 - saturation) / 3.0
+        pixels = frames.contiguous().flatten(2)
+        varied = torch.baddbmm(gain * mean * (1.0 - contrast), gain * contrast * mixing, pixels)
+        varied = self._blurred(varied.reshape(frames.shape).clamp_(0.0, 1.0), generator)
+        return self._noisy(varied, generator).clamp_(0.0, 1.0)
+
+    def _blurred(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
+        chosen = _some(len(frames), self.blurred, generator)
+        if len(chosen):
+            frames[chosen] = functional.avg_pool2d(frames[chosen], 3, 1, 1, count_include_pad=False)
+        return frames
+
+    def _noisy(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
+        chosen = _some(len(frames), self.noisy, generator)
+        if len(chosen):
+            strength = self.noise * torch.rand(len(chosen), 1, 1, 1, generator=generator)
+            noise = torch.randn(len(chosen), *frames.shape[1:], generator=generator) * strength
+            frames[chosen] += noise.to(frames)
+        return frames
+
+
+def _some(count: int, share: float, generator: torch.Generator) -> Tensor:
+    return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]

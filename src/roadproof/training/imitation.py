@@ -1,0 +1,238 @@
+"""Imitation: a network learns to answer as the expert would.
+
+Every step draws its batch, its pictures' variation and its dropout from the plan's seed and the step's number, so a run
+that was cut off goes on from its last checkpoint as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from pickle import UnpicklingError  # what torch raises for a file that holds more than numbers
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from roadproof.controllers import CIL, ConditionalPilotNet
+from roadproof.controllers.cil import SPEED_SCALE_MPS, CILOutput
+from roadproof.controllers.weights import seeded
+from roadproof.errors import TrainingError
+from roadproof.files import write_atomically
+from roadproof.training.augmentation import Augmentation
+from roadproof.training.dataset import Batch, Dataset
+from roadproof.training.pasting import PastedPaint
+
+Learner = CIL | ConditionalPilotNet
+"""A network that can be trained: frames, speed and command in, `CILOutput` out."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LossWeights:
+    """How much each answer counts. Steering alone keeps a car in its lane, the pedals make it arrive."""
+
+    steer: float = 0.6
+    throttle: float = 0.2
+    brake: float = 0.2
+    speed: float = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingPlan:
+    """How a network learns.
+
+    Args:
+        samples: how many frames it sees, repetitions counted.
+        batch: frames a step.
+        seed: of everything drawn.
+        learning_rate: the largest; it rises over the first steps and then falls along a cosine to almost nothing.
+        warm_up: share of the steps it rises for.
+        weight_decay: AdamW's.
+        averaging: decay of the running average of the weights; the average is what is kept.
+        dropout: factor on the network's own dropout; short training learns more with less.
+        pasted: share of the pictures with coloured rectangles pasted on the road.
+        loss: how much each answer counts.
+        augmentation: how the pictures are varied.
+
+    Raises:
+        TrainingError: a number is not positive, or there is not one batch to see.
+    """
+
+    samples: int
+    batch: int = 128
+    seed: int = 0
+    learning_rate: float = 1e-3
+    warm_up: float = 0.04
+    weight_decay: float = 1e-2
+    averaging: float = 0.997
+    dropout: float = 0.4
+    pasted: float = 0.0
+    loss: LossWeights = field(default_factory=LossWeights)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def __post_init__(self) -> None:
+        for name in ("batch", "learning_rate"):
+            if not getattr(self, name) > 0:
+                raise TrainingError(f"{name} is {getattr(self, name)}, expected a value above 0")
+        for name in ("averaging", "dropout", "pasted", "warm_up"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise TrainingError(f"{name} is {getattr(self, name)}, expected a value in [0, 1]")
+        if self.steps < 1:
+            raise TrainingError(f"{self.samples} samples are less than one batch of {self.batch}")
+
+    @property
+    def steps(self) -> int:
+        """How many batches that is."""
+        return self.samples // self.batch
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step."""
+        rising = max(1.0, self.warm_up * self.steps)
+        if step < rising:
+            return self.learning_rate * (step + 1) / rising
+        return self.learning_rate * (0.005 + 0.995 * 0.5 * (1.0 + math.cos(math.pi * step / self.steps)))
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Told now and then: the step, of how many, and the mean loss and error of steering since the last time."""
+
+    step: int
+    steps: int
+    loss: float
+    steer_error: float
+
+
+def imitate(
+    network: Learner,
+    data: Dataset,
+    plan: TrainingPlan,
+    *,
+    checkpoint: Path | None = None,
+    device: str = "cpu",
+    every: int = 100,
+    on_progress: Callable[[Progress], object] | None = None,
+) -> Learner:
+    """Train a network.
+
+    Args:
+        network: where to start from; it is changed.
+        data: drives to learn from.
+        plan: how.
+        checkpoint: file to go on from where it is there, and to keep up to date; None keeps none.
+        device: "cpu" or "cuda".
+        every: steps between two reports, and ten times that between two checkpoints.
+        on_progress: told of them.
+
+    Returns:
+        The average of the weights, in eval mode.
+
+    Raises:
+        TrainingError: the loss is no longer finite, or the checkpoint is of another plan or damaged.
+        OutputError: the checkpoint cannot be written.
+    """
+    place = torch.device(device)
+    # Convolutions by channels-last pictures run 1.3 times as fast.
+    network.to(device=place, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
+    scale_dropout(network, plan.dropout)
+    average = copy.deepcopy(network).eval()
+    optimiser = torch.optim.AdamW(network.parameters(), plan.learning_rate, weight_decay=plan.weight_decay)
+    first = 0 if checkpoint is None else _resume(checkpoint, plan, network, average, optimiser)
+    paste = PastedPaint(plan.pasted)
+    weights, sums, counted = data.weights(), torch.zeros(2), 0
+    for step in range(first, plan.steps):
+        for group in optimiser.param_groups:
+            group["lr"] = plan.rate(step)
+        draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
+        batch = data.batch(torch.multinomial(weights, plan.batch, replacement=True, generator=draw), place)
+        batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw))
+        with seeded(plan.seed * 1_000_003 + step), torch.autocast(place.type, torch.bfloat16):
+            answer: CILOutput = network(batch.frames, batch.speed_mps, batch.command)
+        loss = imitation_loss(answer, batch, plan.loss)
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimiser.step()
+        _average(average, network, min(plan.averaging, (1 + step) / (10 + step)))
+        sums += torch.stack([loss.detach(), (answer.controls[:, 0] - batch.expert[:, 0]).detach().abs().mean()]).cpu()
+        counted += 1
+        if (step + 1) % every == 0 or step + 1 == plan.steps:
+            if not sums.isfinite().all():
+                raise TrainingError(f"the loss is {float(sums[0])} near step {step}; lower the learning rate")
+            if on_progress is not None:
+                mean = sums / counted
+                on_progress(Progress(step + 1, plan.steps, float(mean[0]), float(mean[1])))
+            sums, counted = torch.zeros(2), 0
+        if checkpoint is not None and ((step + 1) % (10 * every) == 0 or step + 1 == plan.steps):
+            _keep(checkpoint, plan, step + 1, network, average, optimiser)
+    return average
+
+
+def imitation_loss(answer: CILOutput, batch: Batch, weights: LossWeights) -> Float[Tensor, ""]:
+    """Huber's loss of each answer, weighted and added up; only the commanded branch has answered."""
+    each = functional.smooth_l1_loss(answer.controls.float(), batch.expert, beta=0.1, reduction="none").mean(dim=0)
+    speed = functional.smooth_l1_loss(answer.speed.float(), batch.speed_mps / SPEED_SCALE_MPS, beta=0.1)
+    parts = weights.steer * each[0] + weights.throttle * each[1] + weights.brake * each[2]
+    return parts + weights.speed * speed
+
+
+@torch.no_grad()
+def steering_error(network: Learner, data: Dataset, *, batch: int = 256) -> float:
+    """Mean distance between the network's steering and the expert's, over all frames as they are."""
+    device = next(network.parameters()).device
+    errors: list[Tensor] = []
+    for first in range(0, len(data), batch):
+        seen = data.batch(torch.arange(first, min(first + batch, len(data))), device)
+        errors.append((network.steer(seen.frames, seen.speed_mps, seen.command) - seen.expert[:, 0]).abs().cpu())
+    return float(torch.cat(errors).mean())
+
+
+def scale_dropout(network: nn.Module, factor: float) -> None:
+    """Multiply every dropout of a network."""
+    for module in network.modules():
+        if isinstance(module, nn.Dropout):
+            module.p *= factor
+
+
+@torch.no_grad()
+def _average(average: nn.Module, network: nn.Module, decay: float) -> None:
+    """Weights and running statistics alike."""
+    for kept, new in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
+        kept.lerp_(new, 1.0 - decay)
+
+
+def _keep(
+    path: Path, plan: TrainingPlan, step: int, network: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer
+) -> None:
+    content = {
+        "plan": asdict(plan),
+        "step": step,
+        "network": network.state_dict(),
+        "average": average.state_dict(),
+        "optimiser": optimiser.state_dict(),
+    }
+    write_atomically(path, lambda part: torch.save(content, part))
+
+
+def _resume(
+    path: Path, plan: TrainingPlan, network: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer
+) -> int:
+    """Take up a checkpoint, where there is one; the step to go on with."""
+    if not path.exists():
+        return 0
+    try:
+        content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        kept = content["plan"]
+        if kept == asdict(plan):
+            network.load_state_dict(content["network"])
+            average.load_state_dict(content["average"])
+            optimiser.load_state_dict(content["optimiser"])
+            return int(content["step"])
+    except (RuntimeError, ValueError, KeyError, TypeError, OSError, EOFError, UnpicklingError):
+        raise TrainingError(f"checkpoint {path} is damaged or of another network; delete it") from None
+    raise TrainingError(f"checkpoint {path} was made with other settings; delete it or choose another folder")

@@ -1,0 +1,98 @@
+"""Coloured rectangles pasted on the road of recorded pictures, so that a controller learns not to follow paint.
+
+Convention:
+    Ground coordinates are metres in the frame of the car: x ahead, y to the left, on a flat road.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.datatypes import VehicleState
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, apply_homography
+
+FARTHEST_M = 40.0
+MOST = 5
+AHEAD_M, ASIDE_M = (3.0, 18.0), (-4.5, 4.5)
+WIDTH_M, LENGTH_M = (0.12, 2.2), (0.5, 9.5)
+ALONG_RAD = math.radians(25.0)
+
+
+class PastedPaint:
+    """Pastes one to five rectangles in a share of the pictures; half of them lie nearly along the road.
+
+    Args:
+        share: of the pictures that get some.
+        camera: the camera the pictures are from.
+        input: how they were cut from its picture.
+    """
+
+    def __init__(self, share: float, camera: CameraModel = CIL_CAMERA, input: CropResize = CIL_INPUT) -> None:  # noqa: A002
+        self.share = share
+        self._inside, self._ground = _ground_seen(camera, input)
+
+    def __call__(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
+        """Copies with paint in some of them; drawn on the CPU, whatever the frames are on.
+
+        Args:
+            frames: RGB in [0, 1].
+            generator: where the randomness comes from.
+        """
+        chosen = (torch.rand(len(frames), generator=generator) < self.share).nonzero()[:, 0]
+        if not len(chosen):
+            return frames
+        inside, ground = self._inside.to(frames.device), self._ground.to(frames)
+        pixels = frames.contiguous().flatten(2).clone()
+        seen = pixels[chosen][:, :, inside]
+        # Paint is lit like the road it lies on, and some of the road's grain shows through.
+        grain = seen.mean(dim=1, keepdim=True)
+        light = (grain.mean(dim=2, keepdim=True) / 0.45).clamp(0.3, 1.2)
+        grain = grain / grain.mean(dim=2, keepdim=True).clamp_min(0.05)
+        count = torch.randint(1, MOST + 1, (len(chosen),), generator=generator)
+        for k in range(MOST):
+            box, colour, cover = _rectangles(len(chosen), generator)
+            covered = _covered(ground, box.to(frames)) * (count > k).to(frames)[:, None, None]
+            covered = covered * cover.to(frames)
+            paint = colour.to(frames) * light * (0.8 + 0.2 * grain)
+            seen = torch.lerp(seen, paint, covered)
+        pixels[chosen[:, None, None], torch.arange(3)[None, :, None], inside[None, None, :]] = seen.clamp(0.0, 1.0)
+        return pixels.reshape(frames.shape)
+
+
+def _rectangles(
+    count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "b 5"], Float[Tensor, "b 3 1"], Float[Tensor, "b 1 1"]]:
+    """Boxes (x, y, width, length, angle from ahead), colours, and how opaque they are."""
+    unit = torch.rand(count, 10, generator=generator)
+
+    def between(column: int, limits: tuple[float, float]) -> Float[Tensor, " b"]:
+        return limits[0] + (limits[1] - limits[0]) * unit[:, column]
+
+    along, across = between(4, (-ALONG_RAD, ALONG_RAD)), between(4, (-math.pi / 2, math.pi / 2))
+    angle = torch.where(unit[:, 5] < 0.5, along, across)
+    box = torch.stack([between(0, AHEAD_M), between(1, ASIDE_M), between(2, WIDTH_M), between(3, LENGTH_M), angle], 1)
+    return box, unit[:, 6:9, None], (0.75 + 0.25 * unit[:, 9])[:, None, None]
+
+
+def _covered(ground: Float[Tensor, "p 2"], box: Float[Tensor, "b 5"]) -> Float[Tensor, "b 1 p"]:
+    """1 inside a rectangle, 0 outside."""
+    x, y, width, length, angle = (column[:, None] for column in box.unbind(1))
+    dx, dy = ground[:, 0] - x, ground[:, 1] - y
+    ahead, left = dx * angle.cos() + dy * angle.sin(), dy * angle.cos() - dx * angle.sin()
+    return ((ahead.abs() <= length / 2) & (left.abs() <= width / 2)).to(ground)[:, None]
+
+
+def _ground_seen(camera: CameraModel, view: CropResize) -> tuple[Tensor, Float[Tensor, "p 2"]]:
+    """Which pixels of the input see the ground, as flat indices, and where."""
+    camera_from_ground = camera.image_from_world(VehicleState(0.0, 0.0, 0.0, 0.0, 0.0))[:, [0, 1, 3]]
+    ground_from_input = np.linalg.inv(view.input_from_camera @ camera_from_ground)
+    row, column = np.mgrid[: view.height_px, : view.width_px]
+    places = np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64)
+    ground = apply_homography(ground_from_input, places)
+    seen = np.isfinite(ground).all(axis=1) & (ground[:, 0] > 0) & (ground[:, 0] < FARTHEST_M)
+    return torch.from_numpy(np.flatnonzero(seen)), torch.from_numpy(ground[seen]).float()

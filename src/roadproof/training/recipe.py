@@ -1,0 +1,231 @@
+"""The whole way from nothing to a controller that drives, in stages that stay in a folder.
+
+    FOLDER/recipe.json            what was asked for
+    FOLDER/drives/expert/         the expert's drives
+    FOLDER/drives/painted/        the expert's drives over random paint, where asked for
+    FOLDER/drives/round-1/ …      the network's own drives, with the expert's answers (DAgger)
+    FOLDER/network-0.safetensors  what was learnt from the expert; network-1 … after each round
+    FOLDER/NAME.safetensors       the last of them, in half the bytes
+    FOLDER/scores.json            how it drives the built-in scenarios
+
+A stage whose files are there is not repeated, so an interrupted run goes on, and a folder can be carried to another
+machine between stages.
+
+References:
+    Ross, Gordon, Bagnell, "A reduction of imitation learning and structured prediction to no-regret online learning",
+    AISTATS 2011 (DAgger).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from roadproof.controllers import CIL, ConditionalPilotNet, save_controller
+from roadproof.controllers.loading import load_network
+from roadproof.errors import TrainingError
+from roadproof.files import read_json, write_atomically
+from roadproof.training.collection import CollectionPlan, collect
+from roadproof.training.dataset import Dataset
+from roadproof.training.imitation import Learner, TrainingPlan, imitate
+
+FORMAT = "roadproof-recipe"
+FORMAT_VERSION = 1
+NETWORKS = ("cil", "pilotnet")
+
+OnStage = Callable[[str, int, int, str], object]
+"""Told of a stage's name, how much of it is done, of how much, and a word about it."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Recipe:
+    """How a controller is made.
+
+    Args:
+        network: "cil" or "pilotnet" (the conditional one).
+        width: CIL's factor on channels and units.
+        seed: of ways, traffic, knocks, weights, batches.
+        start: weights file to go on from; None begins with fresh weights.
+        drives: of the expert.
+        painted_drives: of the expert over random paint, besides.
+        pasted: share of the pictures learnt from with coloured rectangles pasted on the road.
+        samples: frames seen in the first training, repetitions counted.
+        learning_rate: the largest of the first training; rounds take a third of it.
+        rounds: how often the network then drives itself and learns from the expert's answers.
+        round_drives: of the network in each round.
+        round_samples: frames seen in the training after each round.
+
+    Raises:
+        TrainingError: an unknown network, a number that makes no sense.
+    """
+
+    network: str = "cil"
+    width: float = 1.0
+    seed: int = 0
+    start: str | None = None
+    drives: int = 260
+    painted_drives: int = 0
+    pasted: float = 0.0
+    samples: int = 200_000
+    learning_rate: float = 1.2e-3
+    rounds: int = 1
+    round_drives: int = 100
+    round_samples: int = 100_000
+
+    def __post_init__(self) -> None:
+        if self.network not in NETWORKS:
+            raise TrainingError(f"network is {self.network!r}, expected one of {', '.join(NETWORKS)}")
+        for name in ("painted_drives", "rounds"):
+            if getattr(self, name) < 0:
+                raise TrainingError(f"{name} is {getattr(self, name)}, expected 0 or more")
+        # Found out now rather than after an hour of driving.
+        self.expert_plans()
+        for number in range(self.rounds + 1):
+            self.round_plan(number, Path())
+            self.training_plan(number)
+
+    def fresh(self) -> Learner:
+        """The network before it has seen anything of this recipe."""
+        if self.start is not None:
+            return load_network(Path(self.start))
+        if self.network == "cil":
+            return CIL(width=self.width, seed=self.seed)
+        return ConditionalPilotNet(seed=self.seed)
+
+    def expert_plans(self) -> dict[str, CollectionPlan]:
+        """The expert's drives, by the name of their folder."""
+        plans = {"expert": CollectionPlan(drives=self.drives, seed=self.seed)}
+        if self.painted_drives:
+            plans["painted"] = CollectionPlan(drives=self.painted_drives, seed=self.seed + 500, painted=0.8)
+        return plans
+
+    def round_plan(self, number: int, controller: Path) -> CollectionPlan:
+        """The network's own drives of a round."""
+        return CollectionPlan(
+            drives=self.round_drives,
+            seed=self.seed + 1000 * number,
+            controller=str(controller),
+            knocked=0.5,
+            painted=0.5 if self.painted_drives else 0.0,
+        )
+
+    def training_plan(self, number: int) -> TrainingPlan:
+        """The training after a round; round 0 is the expert's."""
+        first = number == 0
+        return TrainingPlan(
+            samples=self.samples if first else self.round_samples,
+            learning_rate=self.learning_rate if first else self.learning_rate / 3,
+            seed=self.seed + 1000 * number,
+            pasted=self.pasted,
+        )
+
+
+def gather(recipe: Recipe, folder: Path, *, processes: int = 1, on_stage: OnStage | None = None) -> list[Path]:
+    """Record the expert's drives of a recipe; what can be done on another machine than the training.
+
+    Returns:
+        The shards.
+
+    Raises:
+        TrainingError: the folder belongs to another recipe.
+        OutputError: the folder cannot be written.
+    """
+    recipe.fresh()  # weights to start from are read before the first drive
+    _claim(recipe, folder)
+    shards: list[Path] = []
+    for name, plan in recipe.expert_plans().items():
+        shards += _collected(plan, folder / "drives" / name, f"Driving ({name})", processes, on_stage)
+    return shards
+
+
+def follow(
+    recipe: Recipe, folder: Path, *, processes: int = 1, device: str = "cpu", on_stage: OnStage | None = None
+) -> Path:
+    """Carry a recipe out, as far as the folder does not hold it yet.
+
+    Args:
+        recipe: what to do.
+        folder: where everything is kept.
+        processes: how many simulators drive at once.
+        device: what the network learns on.
+        on_stage: told how far it is.
+
+    Returns:
+        The controller's weights file.
+
+    Raises:
+        TrainingError: the folder belongs to another recipe, or nothing can be learnt.
+        OutputError: the folder cannot be written.
+    """
+    shards = gather(recipe, folder, processes=processes, on_stage=on_stage)
+    network = folder / "network-0.safetensors"
+    _trained(recipe, 0, recipe.fresh, shards, network, device, on_stage)
+    for number in range(1, recipe.rounds + 1):
+        plan = recipe.round_plan(number, network)
+        title = f"Round {number}, the network drives"
+        shards += _collected(plan, folder / "drives" / f"round-{number}", title, processes, on_stage)
+        before, network = network, folder / f"network-{number}.safetensors"
+        _trained(recipe, number, lambda before=before: load_network(before), shards, network, device, on_stage)
+    weights = folder / f"{recipe.network}.safetensors"
+    save_controller(load_network(network), weights, dtype="float16")
+    return weights
+
+
+def _collected(
+    plan: CollectionPlan, folder: Path, title: str, processes: int, on_stage: OnStage | None
+) -> tuple[Path, ...]:
+    def told(done: int) -> None:
+        if on_stage is not None:
+            on_stage(title, done, plan.drives, "drives")
+
+    return collect(plan, folder, processes=processes, on_drive=told)
+
+
+def _trained(
+    recipe: Recipe,
+    number: int,
+    start: Callable[[], Learner],
+    shards: list[Path],
+    path: Path,
+    device: str,
+    on_stage: OnStage | None,
+) -> None:
+    if path.exists():
+        return
+    plan = recipe.training_plan(number)
+    title = "Learning from the expert" if number == 0 else f"Round {number}, learning"
+
+    def told(step: int, steps: int, loss: float) -> None:
+        if on_stage is not None:
+            on_stage(title, step, steps, f"loss {loss:.4f}")
+
+    checkpoint = path.with_suffix(".ckpt")
+    learnt = imitate(
+        start(),
+        Dataset.load(shards),
+        plan,
+        checkpoint=checkpoint,
+        device=device,
+        on_progress=lambda at: told(at.step, at.steps, at.loss),
+    )
+    save_controller(learnt, path)
+    checkpoint.unlink(missing_ok=True)
+
+
+def _claim(recipe: Recipe, folder: Path) -> None:
+    """Write the recipe into its folder, or refuse a folder that was begun with another."""
+    path, asked = folder / "recipe.json", asdict(recipe)
+    if path.exists():
+        kept: dict[str, Any] = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe", {})
+        for name in sorted(asked.keys() | kept.keys()):
+            if asked.get(name) != kept.get(name):
+                raise TrainingError(
+                    f"{folder} was begun with {name} = {kept.get(name)!r}, now it is {asked.get(name)!r}; "
+                    "give the same options again or choose another folder"
+                )
+        return
+    content = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked}, indent=1)
+    write_atomically(path, lambda part: part.write_text(content + "\n", encoding="utf-8"))

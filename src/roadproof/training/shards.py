@@ -1,0 +1,105 @@
+"""Recorded drives to learn from, one file each: frames, what was asked, and what the expert would do.
+
+A shard is a NumPy archive of named arrays and a JSON header, lightly compressed. Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int8, UInt8
+
+from roadproof.errors import TrainingError
+from roadproof.files import write_atomically
+
+FORMAT = "roadproof-shard"
+FORMAT_VERSION = 1
+_ARRAYS = ("frames", "speed_mps", "command", "expert", "lateral_m")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Shard:
+    """What was seen on one drive, and the expert's answer to it.
+
+    Args:
+        frames: RGB at the controller's resolution.
+        speed_mps: speed at each frame.
+        command: CARLA's codes (`datatypes.Command`).
+        expert: steer, throttle and brake the expert would give there; never what disturbed the drive.
+        lateral_m: offset from the route, left positive.
+        about: scenario, weather, traffic, seed, who drove: for people and statistics.
+
+    Raises:
+        TrainingError: lengths differ, or a value is not finite.
+    """
+
+    frames: UInt8[np.ndarray, "..."]
+    speed_mps: Float32[np.ndarray, "..."]
+    command: Int8[np.ndarray, "..."]
+    expert: Float32[np.ndarray, "..."]
+    lateral_m: Float32[np.ndarray, "..."]
+    about: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        count = len(self.frames)
+        if self.frames.ndim != 4 or self.frames.shape[3] != 3 or self.expert.shape != (count, 3):
+            raise TrainingError(
+                f"frames of shape {self.frames.shape} with answers of shape {self.expert.shape}, "
+                "expected (n, h, w, 3) and (n, 3)"
+            )
+        for name in ("speed_mps", "command", "lateral_m"):
+            if getattr(self, name).shape != (count,):
+                raise TrainingError(f"{name} has shape {getattr(self, name).shape}, expected ({count},)")
+        for name in ("speed_mps", "expert", "lateral_m"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise TrainingError(f"{name} of the drive has NaN or infinite values")
+
+    def __len__(self) -> int:
+        """How many frames there are."""
+        return len(self.frames)
+
+    def save(self, path: Path) -> None:
+        """Write the drive to one file, all or nothing.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "about": dict(self.about)})
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS} | {"header": np.array(header)}
+
+        def write(part: Path) -> None:
+            # numpy's own compression takes longer than the drive's pictures take to render.
+            with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+                for name, array in arrays.items():
+                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                        np.lib.format.write_array(member, array, allow_pickle=False)
+
+        write_atomically(path, write)
+
+    @classmethod
+    def load(cls, path: Path) -> Shard:
+        """Read a drive written by `save`.
+
+        Raises:
+            TrainingError: the file is missing, damaged, no shard, or of a newer version.
+        """
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                header: dict[str, Any] = json.loads(str(stored["header"]))
+                arrays: dict[str, Any] = {name: stored[name] for name in _ARRAYS}
+        except FileNotFoundError:
+            raise TrainingError(f"no recorded drive {path}; collect first") from None
+        except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile, EOFError) as error:
+            raise TrainingError(f"{path} is damaged or no recorded drive ({error}); delete it, collect again") from None
+        if header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
+            raise TrainingError(
+                f"{path} is {header.get('format')!r} version {header.get('version')!r}, "
+                f"this roadproof reads {FORMAT!r} version {FORMAT_VERSION}"
+            )
+        return cls(**arrays, about=header["about"])

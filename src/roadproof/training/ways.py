@@ -1,0 +1,205 @@
+"""What drives to learn from are made of: random ways through a map, and the knocks that make recovery worth recording.
+
+Convention:
+    Offsets and headings are positive to the left, `steer` to the right, as everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.datatypes import Command, Control, VehicleState
+from roadproof.errors import ScenarioError
+from roadproof.geometry import CanvasPlacement
+from roadproof.scenarios import Kind, Scenario
+from roadproof.simulators.town.maps import check_canvas, scenario_route
+from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.simulators.town.routes import Route
+
+TRIES = 400
+LENGTHS_M = (60.0, 150.0)
+WIDTHS_M = (7.6, 6.8, 6.0, 3.0)
+LONGEST_S = 60.0
+_KINDS: dict[Command, Kind] = {Command.LEFT: "left", Command.RIGHT: "right"}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Displacement:
+    """How far off the middle of its lane, and how turned, a car starts: deviations and limits.
+
+    Args:
+        aside_m: deviation of the offset.
+        aside_limit_m: largest offset.
+        turn_rad: deviation of the heading.
+        turn_limit_rad: largest heading.
+        speed_mps: largest speed at the start; half of all cars start at rest.
+    """
+
+    aside_m: float = 0.7
+    aside_limit_m: float = 1.5
+    turn_rad: float = math.radians(6.0)
+    turn_limit_rad: float = math.radians(15.0)
+    speed_mps: float = 8.5
+
+
+def random_scenario(
+    roads: RoadMap,
+    map_name: str,
+    generator: np.random.Generator,
+    *,
+    name: str,
+    command: Command = Command.FOLLOW,
+    displacement: Displacement | None = None,
+) -> Scenario:
+    """A random way through a map, 60 to 150 m long, with a canvas at a random place on it.
+
+    Args:
+        roads: the map.
+        map_name: its name.
+        generator: where the randomness comes from.
+        name: of the scenario.
+        command: one of the junctions on the way asks for it; follow asks for nothing.
+        displacement: how the car starts; None starts it at rest in the middle of its lane.
+
+    Raises:
+        ScenarioError: the map has no such way.
+    """
+    driving = [lane for lane in roads.lanes if lane.kind == "driving"]
+    lengths = np.array([lane.length_m for lane in driving])
+    for _ in range(TRIES):
+        lane = driving[int(generator.choice(len(driving), p=lengths / lengths.sum()))]
+        at_m, reach_m = generator.uniform(0.0, lane.length_m), generator.uniform(*LENGTHS_M)
+        goal = _walk(roads, lane.index, at_m, reach_m, generator)
+        start = _start(*_on(lane.centre, lane.stations_m, lane.headings_rad, at_m), displacement, generator)
+        if goal is None or math.dist(goal, (start.x_m, start.y_m)) < 20.0:
+            continue
+        try:
+            route = roads.route(start, goal)
+            if not 0.7 * reach_m < route.length_m < 1.3 * reach_m:
+                continue
+            commands = [crossing.command for crossing in route.crossings]
+            if command is not Command.FOLLOW and command not in commands:
+                continue
+            scenario = Scenario(
+                name=name,
+                kind=_KINDS.get(command, "straight"),
+                map_name=map_name,
+                start=start,
+                goal_m=goal,
+                canvas=_lay_canvas(route, roads, generator),
+                time_limit_s=min(15.0 + route.length_m / 2.5, LONGEST_S),
+            )
+            scenario_route(scenario, roads)
+        except ScenarioError:
+            continue
+        return scenario
+    raise ScenarioError(f"no way of {LENGTHS_M[0]:.0f} m with the command {command.name} was found on map {map_name}")
+
+
+class Knocks:
+    """Disturbs the controls of one drive: triangles on the steering, steps on the pedals, with pauses between them.
+
+    Args:
+        steps: how long the drive is at most.
+        dt_s: seconds per step.
+        generator: where the randomness comes from.
+
+    References:
+        Codevilla et al., "End-to-end driving via conditional imitation learning", ICRA 2018, section IV.B.
+    """
+
+    PAUSE_S = 2.0
+    LASTS_S = (0.5, 1.8)
+    STEER = (0.15, 0.6)
+    PUSH = (-0.9, 0.7)
+
+    def __init__(self, steps: int, dt_s: float, generator: np.random.Generator) -> None:
+        self._steer, self._push = np.zeros(steps), np.zeros(steps)
+        for noise, share, shaped in ((self._steer, 1.0, True), (self._push, 2.5, False)):
+            at = generator.exponential(self.PAUSE_S * share)
+            while at < steps * dt_s:
+                lasts = generator.uniform(*self.LASTS_S)
+                first, last = int(at / dt_s), min(int((at + lasts) / dt_s) + 1, steps)
+                phase = np.linspace(0.0, 1.0, last - first) if last - first > 1 else np.array([0.5])
+                if shaped:
+                    peak = generator.uniform(*self.STEER) * generator.choice([-1.0, 1.0])
+                    noise[first:last] += peak * (1.0 - np.abs(2.0 * phase - 1.0))
+                else:
+                    noise[first:last] += generator.uniform(*self.PUSH)
+                at += lasts + generator.exponential(self.PAUSE_S * share)
+
+    def on(self, control: Control, step: int) -> Control:
+        """The control as the car gets it."""
+        push = control.throttle - control.brake + float(self._push[step])
+        return Control(control.steer + float(self._steer[step]), max(push, 0.0), max(-push, 0.0)).clipped()
+
+
+def _walk(
+    roads: RoadMap, lane: int, at_m: float, reach_m: float, generator: np.random.Generator
+) -> tuple[float, float] | None:
+    """Where one is after so many metres of turning at random; None in a junction or at a dead end."""
+    left_m = reach_m + at_m
+    while left_m > roads.lanes[lane].length_m:
+        left_m -= roads.lanes[lane].length_m
+        after = roads.lanes[lane].successors
+        if not after:
+            return None
+        lane = int(generator.choice(after))
+    end = roads.lanes[lane]
+    if end.junction is not None:
+        return None
+    x, y, _ = _on(end.centre, end.stations_m, end.headings_rad, left_m)
+    return x, y
+
+
+def _on(
+    centre: Float[np.ndarray, "n 3"],
+    stations_m: Float[np.ndarray, " n"],
+    headings: Float[np.ndarray, " n"],
+    at_m: float,
+) -> tuple[float, float, float]:
+    return (
+        float(np.interp(at_m, stations_m, centre[:, 0])),
+        float(np.interp(at_m, stations_m, centre[:, 1])),
+        float(np.interp(at_m, stations_m, headings)),
+    )
+
+
+def _start(
+    x: float, y: float, yaw: float, displacement: Displacement | None, generator: np.random.Generator
+) -> VehicleState:
+    aside = turn = speed = 0.0
+    if displacement is not None:
+        d = displacement
+        aside = float(np.clip(generator.normal(0.0, d.aside_m), -d.aside_limit_m, d.aside_limit_m))
+        turn = float(np.clip(generator.normal(0.0, d.turn_rad), -d.turn_limit_rad, d.turn_limit_rad))
+        speed = float(max(generator.uniform(-d.speed_mps, d.speed_mps), 0.0))
+    return VehicleState(
+        x - aside * math.sin(yaw), y + aside * math.cos(yaw), 0.0, math.remainder(yaw + turn, 2 * math.pi), speed
+    )
+
+
+def _lay_canvas(route: Route, roads: RoadMap, generator: np.random.Generator) -> CanvasPlacement:
+    """A canvas across the road at a random place of the route: the widest that fits there."""
+    for _ in range(20):
+        at_m = float(generator.uniform(0.15, 0.9)) * route.length_m
+        x, y, _, yaw = route.at(at_m)
+        half = roads.lanes[roads.nearest_lane(x, y, yaw).lane].width_m / 2
+        for width in WIDTHS_M:
+            left = 0.0 if width < 2 * half else half
+            canvas = CanvasPlacement(
+                x_m=x - left * math.sin(yaw),
+                y_m=y + left * math.cos(yaw),
+                yaw_rad=math.remainder(yaw, 2 * math.pi),
+                width_m=width,
+            )
+            try:
+                check_canvas(canvas, roads)
+            except ScenarioError:
+                continue
+            return canvas
+    raise ScenarioError("no canvas fits along the route")

@@ -1,0 +1,165 @@
+"""Calibrating short real drives in the town, against the homographies the town itself states."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from roadproof.calibration import Method, calibrate, load_report, replays_needed
+from roadproof.compositing import composite, view_canvas
+from roadproof.coverage import Shape
+from roadproof.drives import Swerve, Trajectories, Window, record
+from roadproof.errors import CalibrationError
+from roadproof.patterns import Pattern, raster
+from roadproof.recordings import load_recordings, save_recordings
+from roadproof.rollout import replay, rollout
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.training.expert import expert
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+from roadproof.simulators.town.simulator import TownSimulator
+
+SCENE = find_scenario("straight-04", builtin_scenarios())
+
+
+@pytest.fixture(scope="module")
+def town():
+    with TownSimulator() as simulator:
+        yield simulator
+
+
+@pytest.fixture(scope="module")
+def drives(town):
+    asked = Trajectories(perturbation=Swerve((0.5,)))
+    return record(town, expert, SCENE, trajectories=asked, window=Window(frames=8))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("calibration")
+
+
+@pytest.fixture(scope="module")
+def two_paint(town, drives, folder):
+    return calibrate(town, drives, folder=folder)
+
+
+def test_two_paints_find_the_canvas_within_half_a_pixel_for_nine_calls(two_paint):
+    report = two_paint.report
+    assert report.calls == 9
+    assert report.method == "two-paint"
+    for drive in report.drives:
+        assert drive.stated_px.mean < 0.75
+        assert drive.residual_px.mean < 1.0
+
+
+def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, drives):
+    pattern = Pattern(
+        (Shape.RECTANGLE,), torch.tensor([[180.0, 200.0, 120.0, 320.0, 20.0]]), torch.tensor([[0.8, 0.3, 0.1]])
+    )
+    recordings = two_paint.recordings
+    clean = recordings.recordings[0]
+    painted = []
+    rollout(
+        town, replay(drives.drives[0].episode), SCENE, pattern=raster(pattern),
+        on_step=lambda seen, _: painted.append(seen.frame),
+    )  # fmt: skip
+    truth = np.stack([painted[k] for k in clean.frame_number]).astype(float)
+    view = view_canvas(clean.frames, clean.image_from_canvas, recordings.view, recordings.colour, maps=clean.maps)
+    made = 255 * composite(pattern, view).permute(0, 2, 3, 1).numpy()
+    paint = np.abs(truth - clean.frames).max(-1) > 12
+    assert paint.sum() > 500
+    assert np.abs(made - truth)[paint].mean() < 3.5
+    assert np.abs(made - truth)[~paint].mean() < 0.5
+
+
+@pytest.mark.slow
+def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(town, drives):
+    assert drives.calls + replays_needed(drives, Method.PUBLISHED) == 61
+    # Full pictures take long: one drive only, which begins 13 m before the middle of the canvas.
+    start, canvas = SCENE.start, SCENE.canvas
+    ahead_m = math.dist((start.x_m, start.y_m), (canvas.x_m, canvas.y_m)) - 13.0
+    x_m, y_m = (at + ahead_m * way(start.yaw_rad) for at, way in ((start.x_m, math.cos), (start.y_m, math.sin)))
+    near = dataclasses.replace(SCENE, start=dataclasses.replace(start, x_m=x_m, y_m=y_m, speed_mps=6.0))
+    one = record(town, expert, near, trajectories=Trajectories(count=1), window=Window(frames=3))
+    found = calibrate(town, one, Method.PUBLISHED)
+    assert found.report.calls == 1 + 12 + 22
+    assert found.report.drives[0].stated_px.mean < 3.0
+    assert found.report.colour_residual < 12.0
+    assert found.recordings.recordings[0].maps is None
+
+
+def test_poses_alone_are_exact_in_the_town_and_take_no_calls_of_their_own(town, drives, two_paint, folder):
+    driven = len(list(folder.iterdir()))
+    found = calibrate(town, drives, Method.POSE, folder=folder)
+    assert len(list(folder.iterdir())) == driven, "white and black are those of the two-paint calibration"
+    assert max(drive.stated_px.p95 for drive in found.report.drives) < 0.01
+
+
+def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, drives, two_paint, folder):
+    (folder / "clean-white.npz").write_bytes(b"cut")
+    shown = []
+    steps = []
+    step = town.step
+
+    class Counted(TownSimulator):
+        def __getattribute__(self, name):
+            if name in ("_open", "step", "__class__"):
+                steps.append(name)
+            return getattr(town, name)
+
+    again = calibrate(Counted(), drives, folder=folder, on_call=shown.append)
+    assert shown == list(range(7))
+    assert 0 < steps.count("step") <= int(drives.drives[0].frame_number[-1]) + 1
+    for one, two in zip(two_paint.recordings.recordings, again.recordings.recordings, strict=True):
+        np.testing.assert_array_equal(one.image_from_canvas, two.image_from_canvas)
+        assert torch.equal(one.maps.gain, two.maps.gain)
+    assert step.__self__ is town
+
+
+def test_the_set_and_its_report_survive_their_files(two_paint, tmp_path):
+    two_paint.report.save(tmp_path / "report.json")
+    assert load_report(tmp_path / "report.json") == two_paint.report
+    save_recordings(two_paint.recordings, tmp_path / "recordings")
+    loaded = load_recordings(tmp_path / "recordings")
+    assert [drive.name for drive in loaded.recordings] == ["clean", "right", "left"]
+    (tmp_path / "report.json").write_text("{")
+    with pytest.raises(CalibrationError, match="not valid JSON"):
+        load_report(tmp_path / "report.json")
+
+
+def test_a_replay_that_goes_another_way_is_refused(town, drives):
+    clean = drives.drives[0]
+    elsewhere = dataclasses.replace(clean.episode, x_m=clean.episode.x_m + 0.5)
+    wrong = dataclasses.replace(drives, drives=(dataclasses.replace(clean, episode=elsewhere),))
+    with pytest.raises(CalibrationError, match=r"a replay of drive clean is 0\.50 m and 0\.0° astray at step"):
+        calibrate(town, wrong)
+
+
+def test_another_camera_is_refused(drives):
+    with pytest.raises(CalibrationError, match="another camera, crop or time step"):
+        calibrate(TownSimulator(dt_s=0.1), drives)
+
+
+def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, drives, monkeypatch):
+    """As if the simulator painted elsewhere: its outline misses the poses by metres."""
+    canvas = dataclasses.replace(SCENE.canvas, x_m=SCENE.canvas.x_m + 1.5, y_m=SCENE.canvas.y_m + 1.0)
+    scenario = dataclasses.replace(SCENE, canvas=canvas)
+    monkeypatch.setattr(
+        "roadproof.calibration.replays.rollout", lambda sim, who, _, **how: rollout(sim, who, SCENE, **how)
+    )
+    moved = dataclasses.replace(drives, settings=dataclasses.replace(drives.settings, scenario=scenario))
+    with pytest.raises(CalibrationError, match=r"miss what was seen by .* px on average"):
+        calibrate(town, moved, Method.POSE)
+
+
+def test_a_canvas_that_never_shows_is_refused(town, drives, monkeypatch):
+    """As if something stood before all of it: white and black look alike."""
+    monkeypatch.setattr(
+        "roadproof.calibration.replays.rollout",
+        lambda sim, who, scenario, **how: rollout(sim, who, scenario, **how | {"pattern": None}),
+    )
+    with pytest.raises(CalibrationError, match="drive clean: light and dark frames do not differ anywhere"):
+        calibrate(town, drives)

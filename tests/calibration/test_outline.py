@@ -1,0 +1,101 @@
+"""The outline of the canvas against a plain supersampled picture of it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from references import approach
+from roadproof.calibration.outline import PoseDoubt, fit_outline, moved, outline_errors_px
+from roadproof.calibration.report import Spread, stated_errors_px
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT
+
+OFF = np.array([0.004, 0.008, 0.002, 0.08, -0.02, 0.1])
+"""A camera that looks 0.2° lower, 0.5° aside, is turned by 0.1°, and 8, 2 and 10 cm away."""
+
+
+def seen_canvas(image_from_canvas, times=6):
+    """Share of each input pixel that the canvas fills, by counting points (an area filter)."""
+    inverse = np.linalg.inv(CIL_INPUT.input_from_camera @ image_from_canvas)
+    fine = (np.arange(times) + 0.5) / times - 0.5
+    columns = (np.arange(200)[:, None] + fine).ravel()
+    rows = (np.arange(88)[:, None] + fine).ravel()
+    x, y = np.meshgrid(columns, rows)
+    mapped = np.stack([x, y, np.ones_like(x)], -1) @ inverse.T
+    at = mapped[..., :2] / mapped[..., 2:]
+    inside = ((at > -0.5) & (at < 399.5)).all(-1) & (mapped[..., 2] > 0)
+    return inside.reshape(88, times, 200, times).mean((1, 3))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    truth = approach(8)
+    view = dataclasses.replace(CIL_INPUT, resampling="area")
+    return truth, np.stack([seen_canvas(each) for each in truth]), view
+
+
+def error_px(found, truth):
+    return stated_errors_px(found, truth, CIL_CAMERA).mean()
+
+
+def test_a_pose_that_is_off_is_mended_to_a_tenth_of_its_error_and_below_half_a_pixel(scene):
+    truth, visible, view = scene
+    prior = moved(truth, np.tile(OFF, (len(truth), 1)), CIL_CAMERA)
+    fit = fit_outline(prior, visible, CIL_CAMERA, view)
+    before, after = error_px(prior, truth), error_px(fit.image_from_canvas, truth)
+    assert before > 5.0
+    assert after < 0.5
+    assert np.nanmean(fit.outline_px) < 0.5 * np.nanmean(outline_errors_px(prior, visible, CIL_CAMERA, view))
+
+
+def test_a_pose_that_is_right_stays_right(scene):
+    truth, visible, view = scene
+    assert error_px(fit_outline(truth, visible, CIL_CAMERA, view).image_from_canvas, truth) < 0.3
+
+
+def test_what_stands_in_the_way_is_not_taken_for_the_edge_of_the_canvas(scene):
+    truth, visible, view = scene
+    hidden = visible.copy()
+    hidden[:, :, 92:98] = 0.0
+    prior = moved(truth, np.tile(OFF, (len(truth), 1)), CIL_CAMERA)
+    assert error_px(fit_outline(prior, hidden, CIL_CAMERA, view).image_from_canvas, truth) < 1.0
+
+
+def test_what_far_frames_show_carries_over_to_frames_that_show_no_outline(scene):
+    truth, visible, view = scene
+    blind = visible.copy()
+    blind[-1] = 1.0
+    prior = moved(truth, np.tile(OFF, (len(truth), 1)), CIL_CAMERA)
+    fit = fit_outline(prior, blind, CIL_CAMERA, view)
+    assert error_px(fit.image_from_canvas[-1:], truth[-1:]) < 0.25 * error_px(prior[-1:], truth[-1:])
+    assert np.isnan(outline_errors_px(truth, np.ones_like(visible), CIL_CAMERA, view)).all()
+
+
+def test_a_pose_without_doubt_is_not_moved(scene):
+    truth, visible, view = scene
+    prior = moved(truth, np.tile(OFF, (len(truth), 1)), CIL_CAMERA)
+    tiny = (1e-7,) * 3
+    sure = PoseDoubt(common_rad=tiny, common_m=tiny, own_rad=tiny, own_m=tiny)
+    fit = fit_outline(prior, visible, CIL_CAMERA, view, doubt=sure)
+    np.testing.assert_allclose(fit.image_from_canvas, prior, rtol=1e-3, atol=1e-2)
+
+
+def test_a_move_turns_and_shifts_the_camera(scene):
+    truth, _, _ = scene
+    shifted = moved(truth, np.tile([0, 0, 0, 0, 0, 0.5], (len(truth), 1)), CIL_CAMERA)
+    np.testing.assert_allclose(shifted[:, 2] - truth[:, 2], np.tile([0, 0, 0.5], (len(truth), 1)), atol=1e-9)
+    # A turn about the camera's y axis by ω moves the middle of the picture by f tan ω.
+    centre = np.array([399.5, 299.5, 1.0])
+    turned = moved(truth, np.tile([0, 0.01, 0, 0, 0, 0], (len(truth), 1)), CIL_CAMERA)
+    there = turned @ np.linalg.inv(truth) @ centre
+    np.testing.assert_allclose(there[:, 0] / there[:, 2] - 399.5, CIL_CAMERA.focal_px * np.tan(0.01), rtol=1e-6)
+
+
+def test_errors_count_only_points_in_view(scene):
+    truth, _, _ = scene
+    assert stated_errors_px(truth, truth, CIL_CAMERA).max() < 1e-6
+    aside = moved(truth, np.tile([0, 0.01, 0, 0, 0, 0], (len(truth), 1)), CIL_CAMERA)
+    errors = stated_errors_px(aside, truth, CIL_CAMERA)
+    assert 0 < len(errors) <= len(truth) * 81
+    assert errors.mean() == pytest.approx(CIL_CAMERA.focal_px * 0.01, rel=0.5)
+    assert Spread.of(np.empty(0)) is None

@@ -1,0 +1,108 @@
+"""`roadproof evaluate` and `roadproof report` as their users call them."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from roadproof.cli import main
+from roadproof.coverage import Shape
+from roadproof.evaluation import Evaluation
+from roadproof.patterns import Pattern, save_pattern
+from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
+
+TESTS = Path(__file__).parents[1]
+ONE_DRIVE = ["--weathers", "clear-noon", "--runs", "0", "--controller", "paint_shy:paint_shy"]
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("workplace")
+    left = find_scenario("left-03", builtin_scenarios())
+    save_scenarios([dataclasses.replace(left, name="short", time_limit_s=1.5)], folder / "own.toml")
+    pattern = Pattern(
+        (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]])
+    )
+    save_pattern(pattern, folder / "pattern.json")
+    Image.new("RGBA", (400, 400), (255, 0, 255, 255)).save(folder / "magenta.png")
+    return folder
+
+
+def call(workplace, *options):
+    """In a process of its own where nothing checks types, as the installed command has it."""
+    return subprocess.run(
+        [sys.executable, "-c", "from roadproof.cli import main; main()", *options],
+        cwd=workplace,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)])},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path):
+    run = tmp_path / "run"
+    options = ["--scenarios", "own.toml", "--scenario", "short", *ONE_DRIVE, "--out", str(run / "evaluation")]
+    done = call(workplace, "evaluate", "pattern.json", *options)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    evaluation = Evaluation.load(run / "evaluation")
+    (trial,) = evaluation.trials
+    assert trial.lateral_m < -0.05
+    assert f"{trial.deviation_m:.2f}" in done.stdout
+    assert "2 drives" in done.stdout
+    with av.open(str(run / "evaluation" / "film.mp4")) as film:
+        frames = sum(1 for _ in film.decode(video=0))
+    assert frames == 31, "one for each observation"
+
+    said = call(workplace, "report", str(run))
+    assert said.returncode == 0, said.stderr
+    assert "paint_shy:paint_shy" in said.stdout
+    page = (run / "report.html").read_text()
+    assert "data:video/mp4;base64," in page
+    assert f"{abs(trial.lateral_m):.2f} m to the right" in page
+
+    again = call(workplace, "evaluate", "pattern.json", *options, "--no-film")
+    assert again.returncode == 0
+    assert Evaluation.load(run / "evaluation").trials == evaluation.trials
+
+
+MISTAKES = {
+    "unknown weather": (["pattern.json", "--weathers", "clear-noon,rainy-non"], "did you mean rainy-noon?"),
+    "unknown scenario": (["pattern.json", "--scenario", "left-3"], "did you mean 'left-03'?"),
+    "missing pattern": (["none.json"], "cannot read none.json"),
+    "picture with random": (["magenta.png", "--random", "2"], "magenta.png is a picture"),
+    "missing recordings": (["pattern.json", "--recordings", "nowhere"], "no folder nowhere"),
+    "runs without traffic": (["pattern.json", "--runs", "2", "--cars", "0", "--pedestrians", "0"], "ask for some"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_clear_line(workplace, tmp_path, monkeypatch, capsys, name):
+    options, message = MISTAKES[name]
+    monkeypatch.chdir(workplace)
+    given = ["--controller", "expert", *options, "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["roadproof", "evaluate", *given])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_empty_run_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["roadproof", "report", str(tmp_path)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert "nothing to report yet" in capsys.readouterr().err

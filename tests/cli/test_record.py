@@ -1,0 +1,107 @@
+"""`roadproof record`, `calibrate` and `attack` one after another, as their users call them."""
+
+import json
+import sys
+import textwrap
+
+import pytest
+
+from roadproof.cli import main
+from roadproof.drives import load_drives
+from roadproof.recordings import load_recordings
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+
+CONTROLLER = textwrap.dedent(
+    """
+    import torch
+    from roadproof.datatypes import Control
+
+    class Bright:
+        input_size = (88, 200)
+
+        def steer(self, frames, speed_mps, command):
+            return frames[..., :100].mean((1, 2, 3)) - frames[..., 100:].mean((1, 2, 3))
+
+        def act(self, frame, speed_mps, command):
+            return Control(0.0)
+    """
+)
+RECORD = ["record", "straight-04", "--trajectories", "1", "--frames", "3", "--out", "runs"]
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("workplace")
+    (folder / "own_bright.py").write_text(CONTROLLER)
+    return folder
+
+
+@pytest.fixture
+def call(workplace, monkeypatch, capsys):
+    monkeypatch.chdir(workplace)
+
+    def run(*options, code=0):
+        monkeypatch.setattr(sys, "argv", ["roadproof", *options])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        said = capsys.readouterr()
+        assert stopped.value.code == code, said.err
+        return said.err if code else said.out
+
+    return run
+
+
+@pytest.fixture
+def run(workplace, call):
+    """The folder of a recorded and calibrated run; made by the first test that asks, resumed by the others."""
+    call(*RECORD)
+    call("calibrate", "runs", "--method", "pose")
+    return workplace / "runs" / "straight-04"
+
+
+def test_a_recorded_and_calibrated_run_is_attacked_as_it_is(run, call, workplace):
+    attack = ["attack", "runs/straight-04/recordings", "--controller", "own_bright:Bright", "--groups", "all"]
+    small = ["--figures", "1", "--iterations", "2", "--restarts", "1", "--random-patterns", "0", "--out", "out"]
+    assert "Strongest for all" in call(*attack, *small)
+    assert (workplace / "out" / "pattern.json").is_file()
+    assert sorted(path.name for path in run.iterdir()) == ["calibration", "record", "recordings"]
+    assert len(load_recordings(run / "recordings").recordings[0].frames) == 3
+    assert json.loads((run / "calibration" / "report.json").read_text())["calls"] == 3
+
+
+def test_a_second_call_goes_on_where_the_first_ended(run, call):
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
+    assert "1 drives" in call(*RECORD)
+    assert "3 simulator calls" in call("calibrate", "runs", "--method", "pose")
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_what_has_been_calibrated_is_not_mixed_with_another_method(run, call):
+    said = call("calibrate", "runs", "--method", "published", code=2)
+    assert "was calibrated by pose; remove it to calibrate again by published" in said
+
+
+def test_a_recording_is_not_mixed_with_another(run, call):
+    said = call(*RECORD, "--weather", "rainy-noon", code=2)
+    assert "holds a recording with weather 'clear-noon', now it is 'rainy-noon'" in said
+    assert load_drives(run / "record").settings.weather == "clear-noon"
+
+
+MISTAKES = {
+    "unknown scenario": (["record", "straight-4"], "did you mean 'straight-04'?"),
+    "unknown weather": (["record", "left-03", "--weather", "dry"], "--weather is 'dry'"),
+    "unknown scheme": (["record", "left-03", "--scheme", "grup"], "did you mean group?"),
+    "two ways": (["record", "left-03", "--noise-deg", "1", "2", "--deviation-m", "1"], "choose one way"),
+    "even T": (["record", "left-03", "--trajectories", "2"], "T is 2 trajectories"),
+    "no run": (["calibrate", "."], "holds no run with a folder named record"),
+    "unknown method": (["calibrate", "runs", "--method", "two-paints"], "did you mean two-paint?"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_clear_line(call, name):
+    options, message = MISTAKES[name]
+    said = call(*options, code=2)
+    assert message in said
+    assert said.count("\n") == 1

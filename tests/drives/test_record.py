@@ -1,0 +1,139 @@
+"""Recording in the town: what is kept, how far drives go astray, and going on after an interruption."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from roadproof.datatypes import Control, Weather
+from roadproof.drives import Swerve, Trajectories, Window, load_drives, record
+from roadproof.errors import OutputError, RecordingError
+from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
+from roadproof.recordings import Push
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.training.expert import expert
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+from roadproof.simulators.town.simulator import TownSimulator
+
+LEFT = find_scenario("left-03", builtin_scenarios())
+WANTED = Trajectories(count=3, perturbation=Swerve((1.2,)))
+ASKED = {"trajectories": WANTED, "window": Window(frames=5), "weather": Weather.CLOUDY_NOON, "seed": 4}
+
+
+@pytest.fixture(scope="module")
+def town():
+    with TownSimulator() as simulator:
+        yield simulator
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("run") / "record"
+
+
+@pytest.fixture(scope="module")
+def drives(town, folder):
+    return record(town, expert, LEFT, folder=folder, **ASKED)
+
+
+def test_the_drives_go_as_far_astray_as_was_asked_and_to_their_side(drives):
+    assert [drive.push for drive in drives.drives] == [Push.CLEAN, Push.RIGHT, Push.LEFT]
+    clean, right, left = drives.drives
+    assert clean.deviation_m == 0.0
+    assert 1.0 < right.deviation_m < 1.3
+    assert -1.3 < left.deviation_m < -1.0
+    assert right.right_m.min() > -0.05
+    assert left.right_m.max() < 0.05
+    # Measured without the recorder's own path: least distance to the clean positions.
+    apart = np.hypot(*(getattr(right.episode, n)[:, None] - getattr(clean.episode, n) for n in ("x_m", "y_m")))
+    assert 1.0 < apart.min(1).max() < 1.35
+
+
+def test_the_kept_frames_show_the_canvas(drives):
+    for drive in drives.drives:
+        assert drive.frames.shape == (5, 88, 200, 3)
+        assert (np.diff(drive.frame_number) > 0).all()
+        for state in drive.states:
+            canvas = LEFT.canvas
+            assert np.hypot(state.x_m - canvas.x_m, state.y_m - canvas.y_m) < 25.0 + canvas.length_m / 2
+            # Some point of the canvas lies inside the crop.
+            grid = np.stack(np.meshgrid(np.linspace(0, 399, 21), np.linspace(0, 399, 21)), -1).reshape(-1, 2)
+            view = homography_from_pose(CIL_CAMERA, state, canvas)
+            x, y = apply_homography(view, grid)[(grid @ view[2, :2] + view[2, 2]) > 0].T
+            assert ((x > 0) & (x < 800) & (y > 115) & (y < 510)).any()
+
+
+def test_what_the_driver_answered_is_kept_not_what_was_done(drives):
+    clean, right, _ = drives.drives
+    np.testing.assert_array_equal(clean.steer, clean.episode.steer[clean.frame_number])
+    done = right.episode.steer[right.frame_number]
+    assert np.abs(right.steer - done).max() > 0.02
+    # Pushed to the right, the expert wants back to the left.
+    assert right.steer[-1] < clean.steer[-1]
+
+
+def test_finished_drives_are_not_driven_again(drives, folder, town):
+    (folder / "left" / "drive.npz").unlink()
+    (folder / "left" / "episode.npz").unlink()
+    (folder / "left").rmdir()
+    with pytest.raises(RecordingError, match="lacks the drive left; give the same `roadproof record` again"):
+        load_drives(folder)
+    driven = []
+
+    def watched(world):
+        driven.append(world)
+        return expert(world)
+
+    again = record(town, watched, LEFT, folder=folder, **ASKED)
+    assert len(driven) == 1
+    loaded = load_drives(folder)
+    assert loaded.settings == again.settings == drives.settings
+    for one, two, three in zip(drives.drives, again.drives, loaded.drives, strict=True):
+        assert one.name == two.name == three.name
+        for name in ("frames", "frame_number", "steer", "right_m"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+            np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+        np.testing.assert_array_equal(one.episode.x_m, three.episode.x_m)
+    assert sorted(path.name for path in folder.iterdir()) == ["clean", "left", "record.json", "right"]
+
+
+def test_a_folder_with_other_settings_is_refused(drives, folder, town):
+    with pytest.raises(RecordingError, match="holds a recording with weather 'cloudy-noon', now it is 'rainy-noon'"):
+        record(town, expert, LEFT, folder=folder, **(ASKED | {"weather": Weather.RAINY_NOON}))
+
+
+def test_damage_is_named(drives, folder, tmp_path):
+    import shutil
+
+    copy = shutil.copytree(folder, tmp_path / "record")
+    path = copy / "clean" / "drive.npz"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:200])
+    with pytest.raises(RecordingError, match=r"clean.drive\.npz is damaged"):
+        load_drives(copy)
+    path.write_bytes(whole)
+    (copy / "record.json").write_text((copy / "record.json").read_text().replace('"seed": 4', '"seed": "four"'))
+    with pytest.raises(RecordingError, match=r"record\.json is incomplete or damaged"):
+        load_drives(copy)
+    with pytest.raises(RecordingError, match=r"has no record\.json"):
+        load_drives(tmp_path)
+
+
+def test_a_driver_that_never_sees_the_canvas_is_refused(town):
+    short = dataclasses.replace(LEFT, time_limit_s=0.5)
+    with pytest.raises(RecordingError, match="drive clean of left-03 never sees 60 pixels of the canvas within 2 m"):
+        record(town, expert, short, window=Window(horizon_m=2.0))
+
+
+def test_a_driver_that_answers_nan_is_refused(town):
+    from roadproof.errors import SimulatorError
+
+    with pytest.raises(SimulatorError, match="control steer is nan"):
+        record(town, lambda _: lambda _: Control(float("nan")), LEFT)
+
+
+def test_a_folder_that_cannot_be_written_is_named(town, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        record(town, expert, LEFT, folder=tmp_path / "file" / "record")

@@ -1,0 +1,247 @@
+"""The report of whole, partial and hostile runs, and as a browser shows it."""
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from browser import opened
+from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.report.page import write_report
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from runs import CRASH, read_result, write_attack, write_evaluation, write_film, write_run
+
+SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
+HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)>"&'{{7*7}}$\\frac{1}{2}$"""
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and the text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+def report_of(folder):
+    return Page(write_report(folder).read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    evaluation = write_run(folder, events=CRASH)
+    write_report(folder)
+    return folder, evaluation
+
+
+def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
+    page = Page((run[0] / "report.html").read_text())
+    assert tuple(each["id"] for each in page.all("section")) == SECTIONS
+    assert {each["href"] for each in page.all("a")} >= {f"#{name}" for name in SECTIONS}
+    text = page.text
+    for words in (
+        "Fails over the paint",
+        "collision static (tree 7)",
+        "rainy noon",
+        "20 cars and 20 people",
+        "use more restarts",
+        "perturbed less than asked",
+        "1.40 m left",
+        "45: too few points",
+        "0.21 (0.43)",
+    ):
+        assert words in text
+    assert "#e5cc1a" in text, "the paint's own colour"
+
+
+def test_the_numbers_shown_are_those_of_the_evaluation(run):
+    folder, evaluation = run
+    content = read_result(folder)
+    assert [trial["deviation_m"] for trial in content["closed_loop"]["trials"]] == [
+        trial.deviation_m for trial in evaluation.trials
+    ]
+    assert content["surrogate"]["shift"] == 0.31
+    calls = {each["stage"]: each["simulator_calls"] for each in content["cost"]}
+    assert calls == {"record": 4, "calibrate": 6, "attack": 0, "evaluate": 12}
+    assert not {"shift", "by_group"} & set(content["closed_loop"])
+    text = Page((folder / "report.html").read_text()).text
+    for row in evaluation.rows():
+        assert f"{row.deviation_m.value:.2f}" in text
+        assert f"{row.points.value:.1f}" in text
+    # Four drives of eight penalty points each, by hand: wrong lane 2 and a tree 6; none on the bare road.
+    assert "costs 8.0 ± 0.0 penalty points instead of 0.0 ± 0.0" in text
+
+
+def test_the_page_needs_nothing_from_outside(run):
+    page = Page((run[0] / "report.html").read_text())
+    assert not page.all("script")
+    assert not page.all("link") or all(each["href"].startswith("data:") for each in page.all("link"))
+    for tag in ("img", "video", "source", "image"):
+        for each in page.all(tag):
+            for key in ("src", "poster", "href", "xlink:href"):
+                assert each.get(key, "data:").startswith(("data:", "#"))
+    assert "default-src 'none'" in page.all("meta")[2]["content"]
+
+
+def test_pictures_have_words_and_tables_have_headers(run):
+    page = Page((run[0] / "report.html").read_text())
+    assert all(each.get("alt") for each in page.all("img"))
+    drawn = page.all("svg")
+    assert len(drawn) == 4
+    assert all(each["role"] == "img" and each["aria-label"] for each in drawn)
+    assert all(each.get("scope") in ("col", "row") for each in page.all("th"))
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids)), "no id twice, those inside the charts included"
+    for each in page.all("use"):
+        assert each["xlink:href"][1:] in ids
+
+
+def test_the_same_run_gives_the_same_page(run):
+    before = (run[0] / "report.html").read_bytes()
+    write_report(run[0])
+    assert (run[0] / "report.html").read_bytes() == before
+
+
+def test_hostile_names_are_shown_and_do_nothing(tmp_path):
+    scenario = dataclasses.replace(find_scenario("left-03", builtin_scenarios()), name=HOSTILE)
+    write_run(tmp_path, scenario=scenario, controller=f"module:{HOSTILE}")
+    (tmp_path / "commands.txt").write_text(f"roadproof evaluate {HOSTILE}\n")
+    text = (write_report(tmp_path)).read_text(encoding="utf-8")
+    page = Page(text)
+    assert HOSTILE in page.text, "shown as it is"
+    assert not page.all("script")
+    assert not [each for each in page.all("img") if "onerror" in each or each["src"] == "x"]
+
+
+@pytest.mark.parametrize("stage", ["attack", "evaluation", "record"])
+def test_a_run_that_has_come_only_so_far_says_what_is_missing(tmp_path, stage):
+    whole = tmp_path / "whole"
+    write_run(whole)
+    (tmp_path / "part").mkdir()
+    (whole / stage).rename(tmp_path / "part" / stage)
+    page = report_of(tmp_path / "part")
+    assert tuple(each["id"] for each in page.all("section")) == SECTIONS
+    content = read_result(tmp_path / "part")
+    expected = {"attack": "predicted", "evaluation": "fails", "record": "recorded"}
+    assert content["verdict"]["key"] in (expected[stage], "swayed")
+    assert ("closed_loop" in content) == (stage == "evaluation")
+    assert (content["surrogate"] is not None) == (stage == "attack")
+    assert "roadproof evaluate" in page.text
+
+
+VERDICTS = {
+    "fails": {"events": CRASH},
+    "swayed": {"aside_m": 0.9},
+    "holds": {"aside_m": 0.02},
+    "unfit": {"events": CRASH, "clean_events": CRASH[:1]},
+}
+
+
+@pytest.mark.parametrize("key", VERDICTS)
+def test_the_verdict_follows_from_the_drives(tmp_path, key):
+    write_evaluation(tmp_path / "evaluation", runs=0, **VERDICTS[key])
+    report_of(tmp_path)
+    assert read_result(tmp_path)["verdict"]["key"] == key
+
+
+def test_another_simulators_map_leaves_the_road_out_of_the_picture(tmp_path):
+    evaluation = write_evaluation(tmp_path / "evaluation", runs=0)
+    with_road = len(write_report(tmp_path).read_text())
+    toml = tmp_path / "evaluation" / "scenario.toml"
+    toml.write_text(toml.read_text().replace(f'"{evaluation.scenario.map_name}"', '"Town10HD"'))
+    page = write_report(tmp_path).read_text()
+    assert len(page) < with_road
+    assert "From above" in page
+
+
+def test_what_cannot_be_reported_is_refused(tmp_path):
+    with pytest.raises(RoadproofError, match="no folder"):
+        write_report(tmp_path / "nowhere")
+    with pytest.raises(RoadproofError, match="nothing to report yet"):
+        write_report(tmp_path)
+    write_attack(tmp_path / "attack")
+    (tmp_path / "evaluation").mkdir()
+    (tmp_path / "evaluation" / "evaluation.json").write_text("{}")
+    with pytest.raises(EpisodeError, match=r"evaluation\.json has format None"):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def luminance(colour):
+    channels = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return float(np.dot([0.2126, 0.7152, 0.0722], linear))
+
+
+def contrast(one, two):
+    high, low = sorted((luminance(one), luminance(two)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_text_has_the_contrast_that_wcag_asks_for(run):
+    style = (run[0] / "report.html").read_text()
+    by_theme = [
+        dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block)) for block in re.findall(r":root \{.*?\}", style, re.S)
+    ]
+    assert contrast("#000000", "#ffffff") == pytest.approx(21.0)
+    for theme in by_theme[:2]:
+        for ground in ("paper", "card"):
+            for ink in ("ink", "muted", "clean", "painted", "predicted", "third", "fourth", "bad", "good"):
+                assert contrast(theme[ink], theme[ground]) >= 4.5, (ink, ground)
+        for kind in ("bad", "mid", "good"):
+            assert contrast(theme[kind], theme[f"{kind}-soft"]) >= 4.5, kind
+
+
+@pytest.mark.slow
+def test_a_browser_shows_everything_and_has_nothing_to_complain_about(tmp_path):
+    evaluation = write_run(tmp_path, events=CRASH)
+    write_film(tmp_path / "evaluation")
+    with opened(write_report(tmp_path)) as (page, complaints):
+        for width, theme in ((1280, "light"), (390, "dark")):
+            page.set_viewport_size({"width": width, "height": 900})
+            page.emulate_media(color_scheme=theme)
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "nothing sticks out to the side"
+            assert page.evaluate("[...document.querySelectorAll('svg text')].every(t => t.getBBox().height >= 8)")
+        pictures = page.evaluate("[...document.images].map(each => each.complete && each.naturalWidth > 0)")
+        assert len(pictures) == 1 + 2 * 6
+        assert all(pictures)
+        charts = page.evaluate("[...document.querySelectorAll('svg')].map(each => each.getBoundingClientRect().height)")
+        assert len(charts) == 4
+        assert min(charts) > 150
+        rows = page.evaluate("document.querySelectorAll('#closed-loop tbody tr').length")
+        assert rows == len(evaluation.rows()) == 6
+        page.wait_for_function("document.querySelector('video').readyState >= 2", timeout=60_000)
+        page.evaluate("document.querySelector('video').currentTime = 0.8")
+        page.wait_for_function("!document.querySelector('video').seeking", timeout=60_000)
+        film = page.evaluate(
+            "(v => [v.error, v.videoWidth, v.duration, v.currentTime])(document.querySelector('video'))"
+        )
+        assert film == [None, 1280, pytest.approx(1.2, abs=0.1), pytest.approx(0.8)]
+        assert complaints == []
+
+
+@pytest.mark.slow
+def test_a_browser_does_not_run_hostile_names(tmp_path):
+    scenario = dataclasses.replace(find_scenario("left-03", builtin_scenarios()), name=HOSTILE)
+    write_run(tmp_path, scenario=scenario, controller=HOSTILE)
+    with opened(write_report(tmp_path)) as (page, complaints):
+        assert page.inner_text("h1") == HOSTILE
+        assert page.evaluate("document.scripts.length") == 0
+        assert complaints == []

@@ -1,0 +1,21 @@
+import pytest
+
+from roadproof.errors import ScenarioError, SimulatorError
+from roadproof.scenarios import builtin_scenarios
+from roadproof.simulators.loading import open_simulator
+
+
+def test_the_town_is_opened_by_its_name_and_closed_again():
+    pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+    with open_simulator("town") as simulator:
+        assert simulator.road_map("town").lanes
+        with pytest.raises(ScenarioError, match="no map 'elsewhere'"):
+            simulator.road_map("elsewhere")
+    with pytest.raises(SimulatorError, match="closed"):
+        simulator.reset(builtin_scenarios()[0])
+
+
+@pytest.mark.parametrize("spec", ["", "Town", "towm"])
+def test_an_unknown_simulator_is_refused(spec):
+    with pytest.raises(SimulatorError, match="unknown, expected town"), open_simulator(spec):
+        pass

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from roadproof.datatypes import Weather
+from roadproof.errors import RoadproofError, StudyError
+from roadproof.scenarios import builtin_scenarios
+from roadproof.study.plan import load_study
+
+TEXT = """
+format = "roadproof-study"
+version = 1
+controller = "cil"
+scenarios = ["left-0[12]", "straight-03"]
+figures = ["1-b", 1, 5]
+seeds = [0, 1]
+weathers = ["clear-noon", "rainy-noon"]
+
+[traffic]
+runs = 4
+
+[[method]]
+name = "GradOpt"
+search = "gradopt"
+trajectories = 1
+
+[[method]]
+name = "BO"
+search = "published-bo"
+calls = 100
+random_calls = 40
+"""
+
+
+def written(tmp_path, text):
+    path = tmp_path / "study.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_study_says_what_it_compares(tmp_path):
+    study = load_study(written(tmp_path, TEXT))
+    assert [scenario.name for scenario in study.scenarios] == ["left-01", "left-02", "straight-03"]
+    assert study.figures == ("1-b", 1, 5)
+    assert study.weathers == (Weather.CLEAR_NOON, Weather.RAINY_NOON)
+    assert (study.traffic.cars, study.traffic.runs) == (20, 4)
+    assert (study.methods[0].trajectories, study.methods[1].calls) == (1, 100)
+    assert len(study.jobs) == 3 * 3 * 2 * 2
+
+
+def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
+    study = load_study(written(tmp_path, TEXT))
+    keys = [job.key for job in study.jobs]
+    assert len(set(keys)) == len(keys)
+    assert keys == [job.key for job in load_study(written(tmp_path, TEXT)).jobs]
+    job = study.jobs[0]
+    for change in (
+        {"controller": "pilotnet"},
+        {"seed": 7},
+        {"weathers": (Weather.CLEAR_NOON,)},
+        {"traffic": None},
+        {"method": dataclasses.replace(job.method, iterations=1)},
+        {"scenario": dataclasses.replace(job.scenario, time_limit_s=1.0)},
+    ):
+        assert dataclasses.replace(job, **change).key != job.key
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("version = 1", "version = 2", "expected format"),
+        ("seeds =", "seed =", "did you mean 'seeds'"),
+        ("figures = [", "figures = [0, ", "figures has 0"),
+        ('"straight-03"', '"straigt-03"', "did you mean 'straight-03'"),
+        ("rainy-noon", "foggy", "weathers is 'foggy'"),
+        ('search = "gradopt"', 'search = "magic"', "search is 'magic'"),
+        ('search = "gradopt"\n', "", "method lacks search"),
+        ("trajectories = 1", "trajectories = 2", "trajectories is 2"),
+        ("trajectories = 1", 'trajectories = "1"', "expected a number"),
+        ('name = "BO"', 'name = "GradOpt"', "same name"),
+        ("runs = 4", "runs = 0", "runs is 0"),
+        ("[traffic]", "[traffic", "not valid TOML"),
+        ('controller = "cil"\n', "", "controller is missing"),
+        ("seeds = [0, 1]", 'scenario_file = "../own.toml"', "leaves the study's folder"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, before, after, message):
+    assert before in TEXT
+    with pytest.raises(RoadproofError, match=message) as caught:
+        load_study(written(tmp_path, TEXT.replace(before, after, 1)))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_study_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(StudyError, match="cannot read"):
+        load_study(tmp_path / "none.toml")
+
+
+def test_every_built_in_scenario_can_be_chosen(tmp_path):
+    study = load_study(written(tmp_path, TEXT.replace('["left-0[12]", "straight-03"]', '["*"]')))
+    assert study.scenarios == builtin_scenarios()

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadproof.errors import StudyError
+from roadproof.study.plan import load_study
+from roadproof.study.rows import read_table
+from roadproof.study.run import run_study
+from study_work import counts, dies_for_two_figures, fails_for_bo
+
+
+def test_every_job_gives_its_rows(small_study, tmp_path):
+    told = []
+    frame = run_study(small_study, tmp_path, counts, workers=2, on_job=lambda done, job, _: told.append((done, job)))
+    assert [done for done, _ in told] == list(range(1, 5))
+    assert len(frame) == 8
+    assert set(frame["figures"]) == {"1-b", "2"}
+    assert frame["error"].isna().all()
+    assert read_table(tmp_path).equals(frame)
+    assert all((tmp_path / "jobs" / job.key / "pattern.json").read_bytes() == b"{}" for job in small_study.jobs)
+
+
+def test_what_is_done_is_not_done_again(small_study, tmp_path):
+    first = run_study(small_study, tmp_path, counts)
+    lost = small_study.jobs[3]
+    (tmp_path / "jobs" / lost.key / "rows.json").unlink()
+    assert run_study(small_study, tmp_path, counts).equals(first)
+    runs = {job.key: (tmp_path / "work" / job.key / "runs").read_text().count("run") for job in small_study.jobs}
+    assert runs.pop(lost.key) == 2
+    assert set(runs.values()) == {1}
+
+
+def test_a_job_that_fails_is_a_row_that_says_why_and_is_tried_again(small_study, tmp_path):
+    frame = run_study(small_study, tmp_path, fails_for_bo, workers=2)
+    bad = frame[frame["error"].notna()]
+    assert set(bad["method"]) == {"BO"}
+    assert set(bad["error"]) == {"ValueError: no luck"}
+    assert len(frame) == 2 + 4
+    again = run_study(small_study, tmp_path, counts, workers=2)
+    assert len(again) == 8
+    assert again["error"].isna().all()
+
+
+def test_a_process_that_dies_takes_its_job_and_no_other(small_study, tmp_path):
+    frame = run_study(small_study, tmp_path, dies_for_two_figures, workers=2)
+    bad = frame[frame["error"].notna()]
+    assert set(bad["figures"]) == {"2"}
+    assert "its process died" in bad["error"].iloc[0]
+    assert len(frame) == 2 + 4
+    assert len(run_study(small_study, tmp_path, dies_for_two_figures)) == 8
+
+
+PLAN = """
+format = "roadproof-study"
+version = 1
+controller = "cil"
+scenarios = ["left-01"]
+figures = [1, 2]
+method = [{ name = "GradOpt", search = "gradopt" }, { name = "BO", search = "published-bo" }]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("work", [counts, dies_for_two_figures])
+def test_a_cluster_gives_the_same_rows_also_when_a_worker_dies(work, tmp_path):
+    pytest.importorskip("ray", reason="ray is not installed")
+    (tmp_path / "plan.toml").write_text(PLAN)
+    (tmp_path / "node").mkdir()
+    script = Path(__file__).parents[1] / "study_on_ray.py"
+    arguments = [sys.executable, script, tmp_path / "plan.toml", tmp_path / "there", tmp_path / "node", work.__name__]
+    patient = os.environ | {"RAY_raylet_start_wait_time_s": "240"}
+    ran = subprocess.run(list(map(str, arguments)), capture_output=True, text=True, timeout=300, env=patient)
+    assert ran.returncode == 0, ran.stderr
+    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", counts)
+    # A worker that died costs its job one more try, and nobody else anything.
+    assert read_table(tmp_path / "there").equals(here)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"workers": 0}, "workers is 0")],
+)
+def test_arguments_that_make_no_sense_are_named(small_study, tmp_path, options, message):
+    with pytest.raises(StudyError, match=message):
+        run_study(small_study, tmp_path, counts, **options)

@@ -1,0 +1,158 @@
+"""Training learns what the pictures say, goes on where it stopped to the bit, and weighs what it is told to weigh."""
+
+import numpy as np
+import pytest
+import torch
+
+from roadproof.controllers import CIL, ConditionalPilotNet
+from roadproof.controllers.cil import SPEED_SCALE_MPS, CILOutput
+from roadproof.errors import TrainingError
+from roadproof.training.augmentation import Augmentation
+from roadproof.training.dataset import SHARES, Batch, Dataset
+from roadproof.training.imitation import (
+    LossWeights,
+    TrainingPlan,
+    imitate,
+    imitation_loss,
+    scale_dropout,
+    steering_error,
+)
+
+
+def drives(count=240, seed=0):
+    """A bright post stands where to steer to; the command says on which side to pass it."""
+    generator = np.random.default_rng(seed)
+    frames = generator.integers(60, 90, (count, 88, 200, 3)).astype(np.uint8)
+    where = generator.integers(20, 180, count)
+    command = generator.choice([2, 3, 4, 5], count).astype(np.int8)
+    for frame, x in zip(frames, where, strict=True):
+        frame[:, x - 8 : x + 8] = 240
+    steer = (where - 100) / 160 + np.select([command == 3, command == 4], [-0.3, 0.3], 0.0)
+    expert = np.stack([steer, np.full(count, 0.5), np.zeros(count)], 1).astype(np.float32)
+    return Dataset(frames, generator.uniform(0, 8, count).astype(np.float32), command, expert)
+
+
+def tiny(seed=0):
+    return CIL(width=0.06, seed=seed)
+
+
+PLAN = TrainingPlan(samples=32 * 60, batch=32, seed=1, learning_rate=4e-3, dropout=0.0, averaging=0.9)
+
+
+@pytest.mark.parametrize(("network", "left"), [(tiny, 0.45), (ConditionalPilotNet, 0.75)])
+def test_a_network_learns_to_steer_by_picture_and_command(network, left):
+    data, unseen = drives(), drives(80, seed=9)
+    untrained = steering_error(network().eval(), unseen)
+    told = []
+    learnt = imitate(network(), data, PLAN, every=20, on_progress=told.append)
+    assert steering_error(learnt, unseen) < left * untrained
+    assert [at.step for at in told] == [20, 40, 60]
+    assert told[-1].loss < 0.5 * told[0].loss
+    assert not learnt.training
+
+
+def test_an_interrupted_training_goes_on_to_the_bit(tmp_path):
+    data, plan = drives(60), TrainingPlan(samples=8 * 40, batch=8, seed=3, dropout=1.0)
+    whole = imitate(tiny(), data, plan, every=2)
+
+    class CutError(Exception):
+        pass
+
+    def cut(at):
+        if at.step == 30:
+            raise CutError
+
+    with pytest.raises(CutError):
+        imitate(tiny(), data, plan, every=2, checkpoint=tmp_path / "a.ckpt", on_progress=cut)
+    steps = []
+    resumed = imitate(
+        tiny(), data, plan, every=2, checkpoint=tmp_path / "a.ckpt", on_progress=lambda at: steps.append(at.step)
+    )
+    assert steps[0] == 22
+    for name, tensor in whole.state_dict().items():
+        torch.testing.assert_close(resumed.state_dict()[name], tensor, rtol=0, atol=0)
+
+
+def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(tmp_path):
+    data, plan = drives(20), TrainingPlan(samples=16, batch=8)
+    imitate(tiny(), data, plan, checkpoint=tmp_path / "a.ckpt", every=1)
+    with pytest.raises(TrainingError, match="other settings"):
+        imitate(tiny(), data, TrainingPlan(samples=16, batch=8, seed=9), checkpoint=tmp_path / "a.ckpt")
+    with pytest.raises(TrainingError, match="damaged or of another network"):
+        imitate(CIL(width=0.1), data, plan, checkpoint=tmp_path / "a.ckpt")
+    (tmp_path / "a.ckpt").write_bytes(b"nothing")
+    with pytest.raises(TrainingError, match="damaged"):
+        imitate(tiny(), data, plan, checkpoint=tmp_path / "a.ckpt")
+
+
+def test_training_leaves_the_global_random_state_alone():
+    before = torch.get_rng_state()
+    imitate(tiny(), drives(20), TrainingPlan(samples=16, batch=8))
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_the_loss_is_hubers_weighted():
+    answer = CILOutput(torch.tensor([[0.05, 0.0, 0.5]]), torch.tensor([0.3]))
+    batch = Batch(torch.zeros(1, 3, 2, 2), torch.tensor([0.1 * SPEED_SCALE_MPS]), torch.tensor([2]), torch.zeros(1, 3))
+    weights = LossWeights(steer=2.0, throttle=7.0, brake=3.0, speed=5.0)
+    # Below 0.1: x² / 0.2; above: x − 0.05.
+    expected = 2.0 * 0.05**2 / 0.2 + 3.0 * (0.5 - 0.05) + 5.0 * (0.2 - 0.05)
+    assert float(imitation_loss(answer, batch, weights)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_rate_rises_and_falls():
+    plan = TrainingPlan(samples=1000 * 10, batch=10, learning_rate=2.0, warm_up=0.1)
+    rates = [plan.rate(step) for step in range(plan.steps)]
+    assert rates[0] == pytest.approx(0.02)
+    assert max(rates) == pytest.approx(2.0, rel=0.03)
+    assert int(np.argmax(rates)) == pytest.approx(100, abs=2)
+    assert rates[-1] == pytest.approx(0.01, rel=0.1)
+
+
+def test_commands_are_drawn_in_their_shares_whatever_was_recorded():
+    data = drives(400)
+    command = np.where(np.arange(400) < 300, 2, np.where(np.arange(400) < 380, 3, np.where(np.arange(400) < 395, 4, 5)))
+    data = Dataset(data.frames, data.speed_mps, command.astype(np.int8), data.expert)
+    weights = data.weights().numpy()
+    for asked, share in SHARES.items():
+        assert weights[command == int(asked)].sum() == pytest.approx(share)
+
+
+def test_frames_reach_the_network_as_they_were_recorded():
+    data = drives(6)
+    batch = data.batch(torch.tensor([4, 1]))
+    assert batch.frames.shape == (2, 3, 88, 200)
+    np.testing.assert_allclose(batch.frames[1, :, 20, 30] * 255, data.frames[1, 20, 30], atol=1e-4)
+    np.testing.assert_array_equal(batch.expert, data.expert[[4, 1]])
+    assert batch.command.tolist() == data.command[[4, 1]].tolist()
+
+
+def test_dropout_is_scaled():
+    network = tiny()
+    before = [m.p for m in network.modules() if isinstance(m, torch.nn.Dropout)]
+    scale_dropout(network, 0.5)
+    after = [m.p for m in network.modules() if isinstance(m, torch.nn.Dropout)]
+    assert after == pytest.approx([0.5 * p for p in before])
+    assert max(before) == 0.5
+
+
+@pytest.mark.parametrize(
+    "changes", [{"samples": 3}, {"batch": 0}, {"learning_rate": 0.0}, {"averaging": 1.5}, {"dropout": -1.0}]
+)
+def test_plans_that_make_no_sense_are_refused(changes):
+    with pytest.raises(TrainingError):
+        TrainingPlan(**({"samples": 1000} | changes))
+
+
+def test_nothing_recorded_is_refused():
+    with pytest.raises(TrainingError, match="collect some first"):
+        Dataset.load([])
+
+
+def test_augmentation_is_part_of_the_plan():
+    none = Augmentation(**dict.fromkeys(Augmentation.__slots__, 0.0))
+    data = drives(20)
+    one = imitate(tiny(), data, TrainingPlan(samples=16, batch=8))
+    other = imitate(tiny(), data, TrainingPlan(samples=16, batch=8, augmentation=none))
+    name = "convolutions.0.conv.weight"
+    assert not torch.equal(one.state_dict()[name], other.state_dict()[name])

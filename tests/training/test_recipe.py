@@ -1,0 +1,71 @@
+"""The whole recipe, tiny: every stage leaves its files, nothing is done twice, and another recipe is refused."""
+
+import json
+
+import pytest
+
+from roadproof.controllers import CIL, ConditionalPilotNet, load_controller
+from roadproof.errors import TrainingError
+from roadproof.training.recipe import Recipe, follow, gather
+
+pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+
+TINY = Recipe(width=0.05, seed=4, drives=1, samples=256, rounds=1, round_drives=1, round_samples=256)
+
+
+def test_a_recipe_is_followed_stage_by_stage_and_only_once(tmp_path):
+    told = []
+    weights = follow(TINY, tmp_path, on_stage=lambda title, *_: told.append(title))
+    assert list(dict.fromkeys(told)) == [
+        "Driving (expert)",
+        "Learning from the expert",
+        "Round 1, the network drives",
+        "Round 1, learning",
+    ]
+    files = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file())
+    assert files == [
+        "cil.safetensors",
+        "drives/expert/drive-00000.npz",
+        "drives/round-1/drive-00000.npz",
+        "network-0.safetensors",
+        "network-1.safetensors",
+        "recipe.json",
+    ]
+    assert isinstance(load_controller(weights), CIL)
+    assert weights.stat().st_size < 0.55 * (tmp_path / "network-1.safetensors").stat().st_size
+    told.clear()
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    again = follow(TINY, tmp_path, on_stage=lambda title, *_: told.append(title))
+    assert (told, again) == ([], weights)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == before
+
+
+def test_drives_can_be_collected_alone_and_learnt_from_later(tmp_path):
+    recipe = Recipe(network="pilotnet", drives=1, painted_drives=1, samples=128, rounds=0)
+    shards = gather(recipe, tmp_path)
+    assert [path.parent.name for path in shards] == ["expert", "painted"]
+    assert isinstance(load_controller(follow(recipe, tmp_path)), ConditionalPilotNet)
+
+
+def test_a_folder_of_another_recipe_is_refused(tmp_path):
+    (tmp_path / "recipe.json").write_text(
+        json.dumps({"format": "roadproof-recipe", "version": 1, "recipe": {"network": "cil", "drives": 7}})
+    )
+    with pytest.raises(TrainingError, match="was begun with drives = 7, now it is 1"):
+        follow(TINY, tmp_path)
+
+
+def test_a_recipe_may_start_from_weights(tmp_path):
+    from roadproof.controllers import save_controller
+
+    save_controller(CIL(width=0.05, seed=11), tmp_path / "start.safetensors")
+    network = Recipe(start=str(tmp_path / "start.safetensors")).fresh()
+    assert isinstance(network, CIL)
+    assert network.width == 0.05
+    assert not network.is_folded
+
+
+@pytest.mark.parametrize("changes", [{"network": "resnet"}, {"rounds": -1}, {"painted_drives": -2}])
+def test_recipes_that_make_no_sense_are_refused(changes):
+    with pytest.raises(TrainingError, match=next(iter(changes))):
+        Recipe(**changes)
