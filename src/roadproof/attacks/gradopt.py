@@ -172,7 +172,7 @@ def _starts(
     schedule: Schedule,
     restarts: int,
     seed: int,
-    on_step: Callable[[int, float], None],
+    on_step: Callable[[int, float], object],
 ) -> Float[Tensor, "g r k n"]:
     """Random points, or what is left of them after the heats."""
     places = [*(heat.starts for heat in schedule.heats), restarts]
