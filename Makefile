@@ -15,14 +15,13 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[blackbox,onnx,ray,study,town,video]' --group dev
 	touch $(STAMP)
 
-# Recorded drives are attacked; without any, the built-in town is driven.
+# The whole loop on one scenario of the built-in town; given recorded drives of your own, they are attacked instead.
 demo: $(STAMP)
 ifdef RECORDINGS
-	@test -n "$(CONTROLLER)" || { echo "make demo RECORDINGS=... also needs CONTROLLER=..., e.g. CONTROLLER=pilotnet:pilotnet.safetensors" >&2; exit 2; }
+	@test -n "$(CONTROLLER)" || { echo "make demo RECORDINGS=... also needs CONTROLLER=..., e.g. CONTROLLER=cil" >&2; exit 2; }
 	$(BIN)/roadproof attack "$(RECORDINGS)" --controller "$(CONTROLLER)" --out "$(OUT)"
 else
-	$(BIN)/roadproof drive --scenario left-03 --cars 20 --pedestrians 20 --out "$(OUT)"
-	@echo "To attack recorded drives: make demo RECORDINGS=path/to/a/set CONTROLLER=pilotnet:path/to/pilotnet.safetensors"
+	$(BIN)/roadproof demo --out "$(OUT)"
 endif
 
 test: $(STAMP)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from roadproof.attacks import AttackResult, Schedule
+from roadproof.attacks import AttackResult, Candidate, Schedule
 from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
@@ -109,6 +109,7 @@ def write_attack(folder):
         group="clean+left",
         surrogate_shift=0.31,
         by_group={"clean+right": 0.21, "clean+left": 0.31},
+        candidates=(Candidate(PATTERN, "clean+left", 0.31),),
         history=np.stack([np.stack([steps, 0.8 * steps], -1), np.stack([1.1 * steps, steps], -1)], 1),
         stopped="all iterations done",
         cost=Cost(controller_frames=4800, seconds=31.0),

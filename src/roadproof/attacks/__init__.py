@@ -6,6 +6,7 @@ from roadproof.attacks.checks import Check as Check
 from roadproof.attacks.gradopt import Heat as Heat
 from roadproof.attacks.gradopt import Schedule as Schedule
 from roadproof.attacks.result import AttackResult as AttackResult
+from roadproof.attacks.result import Candidate as Candidate
 from roadproof.attacks.result import Cost as Cost
 from roadproof.attacks.show import ShownDrive as ShownDrive
 from roadproof.attacks.show import show_pattern as show_pattern

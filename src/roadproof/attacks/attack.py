@@ -10,9 +10,9 @@ from typing import Literal, get_args
 import torch
 
 from roadproof.attacks.checks import check_search
-from roadproof.attacks.gradopt import Schedule, gradopt
+from roadproof.attacks.gradopt import Schedule, Search, gradopt
 from roadproof.attacks.published import PublishedSurrogate
-from roadproof.attacks.result import AttackResult, Cost
+from roadproof.attacks.result import AttackResult, Candidate, Cost
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
@@ -36,7 +36,7 @@ def attack(
     gradient: Gradient = "exact",
     random_patterns: int = 0,
     checkpoint: Path | None = None,
-    on_step: Callable[[int, float], None] = lambda _iteration, _best: None,
+    on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
     """Find the pattern that shifts a controller's steering most on recorded drives.
 
@@ -73,13 +73,13 @@ def attack(
     )
     cost = Cost(controller_frames=surrogate.frames_evaluated, seconds=time.perf_counter() - start)
     checks = check_search(surrogate, space, search, random_patterns=random_patterns, seed=seed)
-    winner, restart = divmod(int(search.best.argmax()), restarts)
-    pattern = space.pattern(search.best_unit[winner, restart].cpu())
+    candidates = _candidates(search, space, groups)
     return AttackResult(
-        pattern=pattern,
-        group=str(groups[winner]),
-        surrogate_shift=float(search.best[winner, restart]),
+        pattern=candidates[0].pattern,
+        group=candidates[0].group,
+        surrogate_shift=candidates[0].surrogate_shift,
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
+        candidates=candidates,
         history=search.history.double().numpy(),
         stopped=search.stopped,
         cost=cost,
@@ -88,4 +88,18 @@ def attack(
         schedule=schedule,
         restarts=restarts,
         seed=seed,
+    )
+
+
+def _candidates(search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
+    """Every start's best, the strongest first."""
+    restarts = search.best.shape[1]
+    order: list[int] = search.best.flatten().argsort(descending=True).tolist()
+    return tuple(
+        Candidate(
+            space.pattern(search.best_unit[index // restarts, index % restarts].cpu()),
+            str(groups[index // restarts]),
+            float(search.best[index // restarts, index % restarts]),
+        )
+        for index in order
     )

@@ -69,7 +69,7 @@ def blackbox_search(
     seed: int = 0,
     at_once: int = 1,
     checkpoint: Path | None = None,
-    on_step: Callable[[int, float], None] = lambda _calls, _best: None,
+    on_step: Callable[[int, float], object] = lambda _calls, _best: None,
 ) -> Trials:
     """Find the point of a search space with the largest value, without gradients.
 

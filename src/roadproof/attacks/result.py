@@ -35,6 +35,21 @@ class Cost:
     seconds: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """Where one start of the search came to.
+
+    Args:
+        pattern: its best.
+        group: the drives it was found on.
+        surrogate_shift: its mean steering shift a frame towards that group's side.
+    """
+
+    pattern: Pattern
+    group: str
+    surrogate_shift: float
+
+
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class AttackResult:
     """The pattern an attack found on recorded drives, and how it was found.
@@ -46,6 +61,8 @@ class AttackResult:
         group: the group it was found for, e.g. "clean+right".
         surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
         by_group: the best mean shift of every group.
+        candidates: every start's best, the strongest first; the surrogate ranks only coarsely, so that driving over
+            the first few finds a stronger one than the first.
         history: mean shift at every iteration after the heats, (iterations, groups, restarts).
         stopped: why the search ended.
         cost: what it took.
@@ -60,6 +77,7 @@ class AttackResult:
     group: str
     surrogate_shift: float
     by_group: dict[str, float]
+    candidates: tuple[Candidate, ...]
     history: Float[np.ndarray, "i g r"]
     stopped: str
     cost: Cost
@@ -70,17 +88,20 @@ class AttackResult:
     seed: int
 
     def save(self, folder: Path) -> None:
-        """Write pattern.json, pattern.png and result.json.
+        """Write pattern.json, pattern.png, candidates/ and result.json.
 
         Raises:
             OutputError: the folder cannot be written.
         """
         save_pattern(self.pattern, folder / "pattern.json")
+        for rank, candidate in enumerate(self.candidates, 1):
+            save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
         content = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "kind": "surrogate: composited frames, not driving",
             **{name: getattr(self, name) for name in ("group", "surrogate_shift", "by_group", "stopped")},
+            "candidates": [[each.group, each.surrogate_shift] for each in self.candidates],
             "cost": asdict(self.cost),
             "checks": [asdict(check) for check in self.checks],
             "space": asdict(self.space),
@@ -102,6 +123,10 @@ class AttackResult:
         try:
             return AttackResult(
                 pattern=load_pattern(folder / "pattern.json"),
+                candidates=tuple(
+                    Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), str(group), float(shift))
+                    for rank, (group, shift) in enumerate(fields["candidates"], 1)
+                ),
                 cost=Cost(**fields["cost"]),
                 checks=tuple(Check(**check) for check in fields["checks"]),
                 space=_space(fields["space"]),
@@ -118,7 +143,8 @@ class AttackResult:
 
 def _schedule(stored: dict[str, Any]) -> Schedule:
     heats = tuple(Heat(**heat) for heat in stored.get("heats", ()))
-    return Schedule(**stored | {"drops": tuple(stored["drops"]), "heats": heats})
+    fields: dict[str, Any] = {**stored, "drops": tuple(stored["drops"]), "heats": heats}
+    return Schedule(**fields)
 
 
 def _space(stored: dict[str, Any]) -> SearchSpace:

@@ -17,6 +17,7 @@ from roadproof.cli.calibrate import calibrate
 from roadproof.cli.carla import carla
 from roadproof.cli.check_controller import check_controller
 from roadproof.cli.controllers import controllers
+from roadproof.cli.demo import demo
 from roadproof.cli.drive import drive
 from roadproof.cli.evaluate import evaluate
 from roadproof.cli.record import record
@@ -31,7 +32,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-for verb in (record, calibrate, attack, evaluate, report, drive, scenarios, controllers, check_controller, train):
+VERBS = (demo, record, calibrate, attack, evaluate, report, drive, scenarios, controllers, check_controller, train)
+for verb in VERBS:
     app.command()(verb)
 app.add_typer(carla, name="carla")
 

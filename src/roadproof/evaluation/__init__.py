@@ -10,3 +10,5 @@ from roadproof.evaluation.fidelity import rendered_frames as rendered_frames
 from roadproof.evaluation.result import Evaluation as Evaluation
 from roadproof.evaluation.result import Row as Row
 from roadproof.evaluation.result import Trial as Trial
+from roadproof.evaluation.selection import Selection as Selection
+from roadproof.evaluation.selection import select_by_driving as select_by_driving

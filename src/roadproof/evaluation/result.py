@@ -205,7 +205,7 @@ class Evaluation:
             return Evaluation(
                 scenario=load_scenarios(folder / "scenario.toml")[0],
                 weathers=tuple(Weather(name) for name in content["weathers"]),
-                trials=tuple(_trial(each) for each in content["trials"]),
+                trials=tuple(trial_from_json(each) for each in content["trials"]),
                 seconds=float(content["seconds"]),
                 **{
                     name: content[name]
@@ -254,8 +254,12 @@ def judge(
 
 
 def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:
+    # Alone, one pattern has one drive a weather, and the weathers asked for are no sample of all there are.
+    drawn = traffic or pattern != ATTACK
+
     def mean(value: Callable[[Trial], float]) -> Mean:
-        return mean_95([value(trial) for trial in trials])
+        found = mean_95([value(trial) for trial in trials])
+        return found if drawn else replace(found, low=None, high=None)
 
     first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
     return Row(
@@ -272,7 +276,13 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
     )
 
 
-def _trial(stored: dict[str, Any]) -> Trial:
+def trial_from_json(stored: dict[str, Any]) -> Trial:
+    """A trial as `dataclasses.asdict` and JSON leave it.
+
+    Raises:
+        EpisodeError: the name of an episode is not a plain one.
+        KeyError, TypeError, ValueError: something is missing or wrong.
+    """
     for name in (stored["clean"], stored["painted"]):
         if Path(name).name != name or not str(name).endswith(".npz"):
             raise EpisodeError(f"episode {name!r} is not a plain file name")

@@ -25,21 +25,9 @@ class Layer(IntEnum):
     RAIN = 30
 
 
-def _bin(layer: Layer) -> str:
-    """What lies flat comes first, in order; then what stands, the nearest first, as hidden pixels cost little."""
-    if layer < Layer.SOLID:
-        return "background"
-    if layer > Layer.SMALL:
-        return "fixed"
-    bins = core.CullBinManager.get_global_ptr()
-    if bins.find_bin("standing") < 0:
-        bins.add_bin("standing", core.CullBinManager.BT_front_to_back, 20)
-    return "standing"
-
-
 def dress(path: Path, layer: Layer) -> None:
     """Set how a node is drawn from its layer."""
-    path.set_bin(_bin(layer), int(layer))
+    path.set_bin("fixed", int(layer))
     if layer in (Layer.GROUND, Layer.PAINT, Layer.CANVAS, Layer.SHADE, Layer.PAVEMENT_SHADE, Layer.RAIN):
         path.set_depth_test(False)
         path.set_depth_write(layer is Layer.GROUND)

@@ -1,0 +1,101 @@
+"""`roadproof demo`: the whole loop for one scenario, from nothing to the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from roadproof.controllers import Controller
+    from roadproof.simulators.protocol import Simulator
+    from roadproof.stress_test import StressTest
+
+
+def demo(
+    scenario: Annotated[
+        str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")
+    ] = "straight-05",
+    scenarios: Annotated[
+        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
+    ] = None,
+    controller: Annotated[
+        str,
+        typer.Option(
+            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
+            "pilotnet:FILE or module:factory."
+        ),
+    ] = "cil",
+    budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
+    figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
+    seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
+    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
+        "out/demo"
+    ),
+) -> None:
+    """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.cli.options import choice
+    from roadproof.cli.progress import stages
+    from roadproof.controllers import load_controller
+    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.search_space import SearchSpace
+    from roadproof.simulators.loading import open_simulator
+    from roadproof.stress_test import BUDGETS, stress_test
+
+    tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
+    spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
+    space = SearchSpace(figures=figures)
+    who = load_controller(controller, device=device)
+    with open_simulator(simulator) as world:
+        with stages() as show:
+            result = stress_test(
+                world,
+                who,
+                tested,
+                out,
+                budget=spent,
+                space=space,
+                seed=seed,
+                controller_name=controller,
+                device=device,
+                on_progress=show,
+            )
+        _film(world, who, result, out)
+    _report(result, out)
+
+
+def _film(world: Simulator, controller: Controller, result: StressTest, out: Path) -> None:
+    """The clean and the painted drive side by side; composited frames beside the rendered ones."""
+    from roadproof.evaluation import compare_with_rendered, rendered_frames
+    from roadproof.evaluation.result import episodes, load_paint
+    from roadproof.recordings import load_recordings
+    from roadproof.report.film import film_trial
+
+    place, evaluation = out / "evaluation", result.evaluation
+    film_trial(world, evaluation, load_paint(place), place)
+    pattern = result.attack.pattern if result.selection is None else result.selection.pattern
+    recordings = load_recordings(out / "recordings")
+    clean = recordings.recordings[0]
+    (driven,) = episodes(place, [evaluation.shown().clean])
+    rendered = rendered_frames(world, evaluation.scenario, driven, pattern, clean.frame_number)
+    compare_with_rendered(pattern, recordings, controller, rendered, drive=clean.name).save(place / "fidelity.npz")
+
+
+def _report(result: StressTest, out: Path) -> None:
+    from rich.console import Console
+
+    from roadproof.report.page import write_report
+    from roadproof.report.run import read_run
+    from roadproof.report.verdict import verdict
+
+    page = write_report(out)
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    say(verdict(read_run(out)).sentence)
+    for stage, cost in result.cost.items():
+        drives = f", {cost.simulator_calls} drives" if cost.simulator_calls else ""
+        say(f"  {stage:10} {cost.seconds:4.0f} s{drives}")
+    say(f"The report is {page}, its numbers are in {page.with_name('result.json')}")

@@ -1,0 +1,192 @@
+"""Choosing among what a search found by driving over it: the surrogate ranks only coarsely.
+
+SELECTION/selection.json      every candidate driven, with what came of it
+SELECTION/pattern.json, .png  the one that was chosen
+SELECTION/episodes/*.npz      the drives: clean, and one for each candidate
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from roadproof.attacks import Candidate
+from roadproof.controllers import Controller
+from roadproof.datatypes import Weather
+from roadproof.errors import RoadproofError
+from roadproof.evaluation.result import Trial, judge, trial_from_json
+from roadproof.files import read_json, write_atomically
+from roadproof.patterns import Pattern, load_pattern, save_pattern
+from roadproof.rollout import Driver, Episode, rollout
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import Simulator
+
+FORMAT = "roadproof-selection"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Driven:
+    """One candidate and the drive over it, closed loop.
+
+    Args:
+        group: what it was found on.
+        rank: its place by the surrogate, 1 the strongest.
+        trial: what came of the drive.
+    """
+
+    group: str
+    rank: int
+    trial: Trial
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Selection:
+    """The candidate that deviated most when driven.
+
+    Args:
+        pattern: it.
+        driven: every candidate driven, in the surrogate's order.
+        chosen: index of it among them.
+        simulator_calls: drives, the clean one included.
+    """
+
+    pattern: Pattern
+    driven: tuple[Driven, ...]
+    chosen: int
+    simulator_calls: int
+
+    @property
+    def deviation_m(self) -> float:
+        """Of the chosen one."""
+        return self.driven[self.chosen].trial.deviation_m
+
+    def save(self, folder: Path) -> None:
+        """Write the choice beside the drives.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        save_pattern(self.pattern, folder / "pattern.json")
+        content = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "kind": "closed loop",
+            "driven": [asdict(each) for each in self.driven],
+            "chosen": self.chosen,
+            "simulator_calls": self.simulator_calls,
+        }
+        write_atomically(folder / "selection.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+
+    @staticmethod
+    def load(folder: Path) -> Selection:
+        """Read what `save` wrote.
+
+        Raises:
+            RoadproofError: a file is missing or damaged.
+        """
+        path = folder / "selection.json"
+        content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
+        try:
+            driven = tuple(
+                Driven(group=each["group"], rank=each["rank"], trial=trial_from_json(each["trial"]))
+                for each in content["driven"]
+            )
+            chosen = int(content["chosen"])
+            calls = int(content["simulator_calls"])
+            if not 0 <= chosen < len(driven):
+                raise ValueError(f"chosen is {chosen} of {len(driven)}")
+        except (KeyError, TypeError, ValueError) as error:
+            raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove {folder}") from None
+        return Selection(
+            pattern=load_pattern(folder / "pattern.json"), driven=driven, chosen=chosen, simulator_calls=calls
+        )
+
+
+def select_by_driving(
+    simulator: Simulator,
+    controller: Controller,
+    scenario: Scenario,
+    candidates: Sequence[Candidate],
+    *,
+    best: int,
+    weather: Weather = Weather.CLEAR_NOON,
+    folder: Path,
+    on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
+) -> Selection:
+    """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
+
+    Args:
+        simulator: an open simulator.
+        controller: that was attacked.
+        scenario: where.
+        candidates: the strongest first, as in `AttackResult.candidates`.
+        best: how many are driven; every group gets its share, since the surrogate does not know which side gives way.
+        weather: of the drives.
+        folder: keeps every drive and the choice; what it holds is not done again.
+        on_drive: told after each drive how many are done, and the largest deviation so far.
+
+    Raises:
+        RoadproofError: there is nothing to drive, or the folder is damaged.
+        SimulatorError, ControllerError: as `rollout` does.
+        OutputError: the folder cannot be written.
+    """
+    if (folder / "selection.json").exists():
+        return Selection.load(folder)
+    chosen = first_of_each_group(candidates, best)
+    if not chosen:
+        raise RoadproofError(f"{len(candidates)} candidates and {best} of them to drive; expected at least one")
+    drive = _Drives(simulator, controller, scenario, weather, folder)
+    clean = drive("clean", None)
+    on_drive(1, 0.0)
+    driven: list[Driven] = []
+    for done, (rank, candidate) in enumerate(chosen, 2):
+        name = f"candidate-{rank}"
+        trial = judge(
+            clean,
+            drive(name, candidate.pattern),
+            scenario.canvas,
+            pattern=name,
+            clean_file="clean.npz",
+            painted_file=f"{name}.npz",
+        )
+        driven.append(Driven(group=candidate.group, rank=rank, trial=trial))
+        on_drive(done, max(each.trial.deviation_m for each in driven))
+    winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
+    selection = Selection(
+        pattern=chosen[winner][1].pattern, driven=tuple(driven), chosen=winner, simulator_calls=1 + len(driven)
+    )
+    selection.save(folder)
+    return selection
+
+
+def first_of_each_group(candidates: Sequence[Candidate], count: int) -> list[tuple[int, Candidate]]:
+    """The strongest of each group, then the second strongest, until there are `count`; with their ranks."""
+    seen: dict[str, int] = {}
+    placed: list[tuple[int, int, Candidate]] = []
+    for rank, candidate in enumerate(candidates, 1):
+        seen[candidate.group] = seen.get(candidate.group, 0) + 1
+        placed.append((seen[candidate.group], rank, candidate))
+    kept = sorted(placed, key=lambda each: each[:2])[:count]
+    return sorted(((rank, candidate) for _, rank, candidate in kept), key=lambda each: each[0])
+
+
+@dataclass(frozen=True, slots=True)
+class _Drives:
+    """Drives a scenario over patterns; what is in the folder already is read."""
+
+    simulator: Simulator
+    driver: Controller | Driver[Simulator]
+    scenario: Scenario
+    weather: Weather
+    folder: Path
+
+    def __call__(self, name: str, pattern: Pattern | None) -> Episode:
+        path = self.folder / "episodes" / f"{name}.npz"
+        if path.exists():
+            return Episode.load(path)
+        episode = rollout(self.simulator, self.driver, self.scenario, weather=self.weather, pattern=pattern)
+        episode.save(path)
+        return episode
