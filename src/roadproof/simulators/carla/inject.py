@@ -57,7 +57,10 @@ def painted(scene: Scene, image_from_canvas: Homography, pattern: PatternImage) 
     if not len(rows):
         return scene.picture
     paint = _averaged(np.linalg.inv(image_from_canvas), rows, columns, pattern)
-    light = _light(scene)[rows, columns]
+    # Only the neighbourhood of the paint tells its light.
+    top, left = max(int(rows.min()) - LIGHT_RADIUS_PX, 0), max(int(columns.min()) - LIGHT_RADIUS_PX, 0)
+    near = (slice(top, int(rows.max()) + LIGHT_RADIUS_PX + 1), slice(left, int(columns.max()) + LIGHT_RADIUS_PX + 1))
+    light = _light(scene.picture[near], scene.asphalt[near])[rows - top, columns - left]
     clean = scene.picture[rows, columns].astype(np.float64)
     seen = clean * (1.0 - paint[:, 3:]) + paint[:, :3] * light
     result = scene.picture.copy()
@@ -101,10 +104,10 @@ def _averaged(
     return (premultiplied[row, column] * inside[..., None]).mean(axis=1, dtype=np.float64)
 
 
-def _light(scene: Scene) -> Float[np.ndarray, "h w 3"]:
+def _light(picture: UInt8[np.ndarray, "h w 3"], asphalt: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """How bright white paint would be: the asphalt around each pixel over asphalt in full light, at most 1."""
-    weight = scene.asphalt[..., None].astype(np.float64)
-    total = _boxed(np.concatenate([scene.picture * weight, weight], axis=-1))
+    weight = asphalt[..., None].astype(np.float64)
+    total = _boxed(np.concatenate([picture * weight, weight], axis=-1))
     everywhere = total[..., :3].sum((0, 1)) / max(float(total[..., 3].sum()), 1e-9)
     seen = np.where(total[..., 3:] > 1e-9, total[..., :3] / np.maximum(total[..., 3:], 1e-9), everywhere)
     return np.clip(seen / (255 * ASPHALT_LEVEL), 0.0, 1.0)
