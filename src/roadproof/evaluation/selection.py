@@ -44,7 +44,7 @@ class Driven:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Selection:
-    """The candidate that deviated most when driven.
+    """The candidate that was worst when driven.
 
     Args:
         pattern: it.
@@ -116,7 +116,9 @@ def select_by_driving(
     folder: Path,
     on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
 ) -> Selection:
-    """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
+    """Drive over the strongest candidates of every group, once each, and keep the worst.
+
+    More infraction points are worse; among equals, more deviation.
 
     Args:
         simulator: an open simulator.
@@ -154,7 +156,7 @@ def select_by_driving(
         )
         driven.append(Driven(group=candidate.group, rank=rank, trial=trial))
         on_drive(done, max(each.trial.deviation_m for each in driven))
-    winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
+    winner = max(range(len(driven)), key=lambda index: _badness(driven[index].trial))
     selection = Selection(
         pattern=chosen[winner][1].pattern, driven=tuple(driven), chosen=winner, simulator_calls=1 + len(driven)
     )
@@ -171,6 +173,10 @@ def first_of_each_group(candidates: Sequence[Candidate], count: int) -> list[tup
         placed.append((seen[candidate.group], rank, candidate))
     kept = sorted(placed, key=lambda each: each[:2])[:count]
     return sorted(((rank, candidate) for _, rank, candidate in kept), key=lambda each: each[0])
+
+
+def _badness(trial: Trial) -> tuple[float, float]:
+    return trial.points, trial.deviation_m
 
 
 @dataclass(frozen=True, slots=True)
