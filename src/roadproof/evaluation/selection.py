@@ -58,11 +58,6 @@ class Selection:
     chosen: int
     simulator_calls: int
 
-    @property
-    def deviation_m(self) -> float:
-        """Of the chosen one."""
-        return self.driven[self.chosen].trial.deviation_m
-
     def save(self, folder: Path) -> None:
         """Write the choice beside the drives.
 
