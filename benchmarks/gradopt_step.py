@@ -4,7 +4,9 @@
 
 A step composites the frames, shows them to the controller and goes back to the pattern's parameters. The bare
 controller's forward and backward pass to the same frames is the physical limit: ratio 1. The published way renders
-1 + 8 K whole sets of frames for one gradient. All three are measured in turn, in one run, on the same frames.
+1 + 8 K whole sets of frames for one gradient. All three are measured in turn, in one run, on the same frames. Beside
+the clock stands processor time, which others on the machine disturb less; with one thread its ratio is the one to trust
+where the machine is busy.
 """
 
 import argparse
@@ -59,15 +61,15 @@ def placed(controller: torch.nn.Module, device: str, dtype: torch.dtype) -> torc
     return controller.to(device=device, dtype=dtype, memory_format=torch.channels_last)
 
 
-def milliseconds(function: Callable[[], object], device: str) -> float:
-    """One call, the device's own queue included."""
+def milliseconds(function: Callable[[], object], device: str) -> tuple[float, float]:
+    """One call, the device's own queue included: by the clock, and of the processor over all threads."""
     if device != "cpu":
         torch.cuda.synchronize()
-    start = time.perf_counter()
+    start, processor = time.perf_counter(), time.process_time()
     function()
     if device != "cpu":
         torch.cuda.synchronize()
-    return (time.perf_counter() - start) * 1e3
+    return (time.perf_counter() - start) * 1e3, (time.process_time() - processor) * 1e3
 
 
 def measure(
@@ -98,13 +100,15 @@ def measure(
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
     times: dict[str, list[float]] = {key: [] for key in runs}
+    cpu_times: dict[str, list[float]] = {key: [] for key in runs}
     for repeat in range(repeats + 2):
         for key, function in runs.items():
             if key == "published" and repeat >= 4:
                 continue
-            elapsed = milliseconds(function, device)
+            elapsed, processor = milliseconds(function, device)
             if repeat >= (1 if key == "published" else 2):
                 times[key].append(elapsed)
+                cpu_times[key].append(processor)
     median = {key: statistics.median(values) for key, values in times.items()}
     peak = torch.cuda.max_memory_allocated() / 2**20 if device != "cpu" else _peak_mb()
     return {
@@ -118,11 +122,16 @@ def measure(
         "step_ms_range": [round(min(times["step"]), 2), round(max(times["step"]), 2)],
         "bare_ms": round(median["bare"], 2),
         "bare_ms_range": [round(min(times["bare"]), 2), round(max(times["bare"]), 2)],
-        "ratio": round(statistics.median(s / b for s, b in zip(times["step"], times["bare"], strict=True)), 3),
+        "ratio": _median_ratio(times),
+        "cpu_ratio": _median_ratio(cpu_times) if device == "cpu" else None,
         "published_step_ms": round(median["published"], 1) if published else None,
         "published_over_ours": round(median["published"] / median["step"], 2) if published else None,
         "peak_mb": round(peak),
     }
+
+
+def _median_ratio(times: dict[str, list[float]]) -> float:
+    return round(statistics.median(s / b for s, b in zip(times["step"], times["bare"], strict=True)), 3)
 
 
 def _peak_mb() -> float:

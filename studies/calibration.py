@@ -11,7 +11,7 @@ three ways, and composites made with each are compared with replays over the sam
                 of its answers to painted and clean frames: what there is to predict
 All but the reprojection error of a method are over the frames that every method keeps. The town's poses are exact,
 which other simulators' need not be: two more rows take poses that are off by 0.5° and 10 cm, as they are and mended by
-the outline.
+what is seen.
 
 Replays are kept in FOLDER; an interrupted study goes on there, and writes what it has after every scenario.
 """
@@ -28,7 +28,7 @@ import torch
 
 import roadproof
 from roadproof.calibration import METHODS, Calibrated, Method, calibrate
-from roadproof.calibration.outline import fit_outline, moved
+from roadproof.calibration.outline import moved
 from roadproof.calibration.replays import Replays
 from roadproof.calibration.report import Spread, stated_errors_px
 from roadproof.calibration.two_paint import look_at_paints
@@ -112,17 +112,16 @@ def compare(
 
 
 def from_poses_that_are_off(replays: Replays, drives: Drives) -> dict[str, Spread | None]:
-    """Reprojection errors of disturbed poses, and of the same mended by the outline."""
+    """Reprojection errors of disturbed poses, and of the same mended by what is seen."""
     settings = drives.settings
     before: list[np.ndarray] = []
     after: list[np.ndarray] = []
     for drive in drives.drives:
-        paints = look_at_paints(replays, drive)
         exact = np.stack([homography_from_pose(settings.camera, s, settings.scenario.canvas) for s in drive.states])
         prior = moved(exact, np.tile(OFF, (len(exact), 1)), settings.camera)
-        fit = fit_outline(prior, paints.visible, settings.camera, settings.view)
+        paints = look_at_paints(replays, drive, prior, settings.camera, settings.view, refine=True)
         before.append(stated_errors_px(prior, exact, settings.camera))
-        after.append(stated_errors_px(fit.image_from_canvas, exact, settings.camera))
+        after.append(stated_errors_px(paints.image_from_canvas, exact, settings.camera))
     parts = {"pose, off": before, "two-paint, from poses that are off": after}
     return {name: Spread.of(np.concatenate(errors)) for name, errors in parts.items()}
 

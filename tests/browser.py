@@ -51,3 +51,12 @@ def opened(page: Path, *, width=1280, height=900, dark=False):
 def _note_request(request, page, complaints):
     if not request.url.startswith(("data:", page.as_uri())):
         complaints.append(f"request: {request.url[:200]}")
+
+
+def until(page, condition, seconds=60):
+    """Wait for a condition; the page's own security policy keeps Playwright from polling it inside the page."""
+    for _ in range(10 * seconds):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(f"not within {seconds} s: {condition}")

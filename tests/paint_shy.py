@@ -1,8 +1,11 @@
 """Drivers for tests that really react to paint; importable by other processes."""
 
+import dataclasses
+
 import torch
 
-from roadproof.datatypes import Control
+from roadproof.datatypes import Control, VehicleState
+from roadproof.scenarios import builtin_scenarios, find_scenario
 
 
 class PaintShy:
@@ -25,3 +28,10 @@ class PaintShy:
 
 def paint_shy():
     return PaintShy()
+
+
+def just_before_the_canvas(time_limit_s):
+    """The scenario left-03 from 17 m before its canvas on, at 22 km/h."""
+    start = VehicleState(x_m=291.75, y_m=222.0, z_m=0.0, yaw_rad=1.571, speed_mps=6.0)
+    left = find_scenario("left-03", builtin_scenarios())
+    return dataclasses.replace(left, name="short", start=start, time_limit_s=time_limit_s)

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from roadproof.attacks import Schedule
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
@@ -14,7 +15,7 @@ from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.stress_test import BUDGETS, STAGES, Budget, stress_test
 
-TINY = Budget(frames=4, restarts=2, iterations=3, select=2, weathers=(Weather.CLEAR_NOON,), runs=0)
+TINY = Budget(frames=4, schedule=Schedule.stretched(3), restarts=2, select=2, weathers=(Weather.CLEAR_NOON,), runs=0)
 STAGE_OF_WORD = {
     "Recording": "record",
     "Calibrating": "calibrate",
@@ -90,5 +91,5 @@ def check_folder(folder, result):
 
 def test_budgets_say_what_they_spend():
     assert BUDGETS["paper"].trajectories == 3
-    assert BUDGETS["paper"].restarts * BUDGETS["paper"].iterations == 1000
+    assert BUDGETS["paper"].restarts * BUDGETS["paper"].schedule.iterations == 1000
     assert dataclasses.replace(TINY, deviations_m=(0.7, 1.5)).trajectories == 5

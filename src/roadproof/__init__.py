@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from roadproof.controllers import load_controller as load_controller
     from roadproof.coverage import Shape as Shape
     from roadproof.errors import RoadproofError as RoadproofError
+    from roadproof.evaluation import Evaluation as Evaluation
+    from roadproof.evaluation import evaluate as evaluate
     from roadproof.geometry import CameraModel as CameraModel
     from roadproof.geometry import CanvasPlacement as CanvasPlacement
     from roadproof.geometry import CropResize as CropResize
@@ -48,6 +50,7 @@ _ROOMS = {
     "controllers": ("Controller", "check_controller", "load_controller"),
     "coverage": ("Shape",),
     "errors": ("RoadproofError",),
+    "evaluation": ("Evaluation", "evaluate"),
     "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
     "objectives": ("Group",),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),

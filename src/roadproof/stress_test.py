@@ -16,7 +16,7 @@ import json
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -51,8 +51,8 @@ class Budget:
         deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each.
         frames: kept of every recorded drive.
         calibration: how the drives are calibrated.
-        restarts: starts of the search, for each side.
-        iterations: steps of every start.
+        schedule: steps of the search.
+        restarts: starts of it, for each side; of those that came through the heats, where there are some.
         select: candidates driven once each, of which the strongest is kept; 0 believes the surrogate.
         weathers: of the evaluation; everything before is done in the first.
         runs: drives with traffic in each weather.
@@ -61,8 +61,8 @@ class Budget:
     deviations_m: tuple[float, ...] = (1.5,)
     frames: int = 24
     calibration: Method = Method.TWO_PAINT
+    schedule: Schedule = field(default_factory=Schedule)
     restarts: int = 4
-    iterations: int = 250
     select: int = 6
     weathers: tuple[Weather, ...] = PAPER_WEATHERS
     runs: int = 10
@@ -73,7 +73,7 @@ class Budget:
         return 1 + 2 * len(self.deviations_m)
 
 
-QUICK = Budget(frames=14, iterations=40, runs=0, weathers=PAPER_WEATHERS)
+QUICK = Budget(frames=14, schedule=Schedule.in_heats(30), runs=0)
 """Minutes on a laptop: fewer frames and steps, driven alone."""
 
 PAPER = Budget(calibration=Method.PUBLISHED)
@@ -231,7 +231,7 @@ def _calibrate(run: _Run, drives: Drives) -> tuple[RecordingSet, int]:
 
 
 def _attack(run: _Run, recordings: RecordingSet) -> AttackResult:
-    place, steps = run.folder / "attack", run.budget.iterations
+    place, steps = run.folder / "attack", run.budget.schedule.steps
     if (place / "result.json").exists():
         return AttackResult.load(place)
     result = attack(
@@ -239,7 +239,7 @@ def _attack(run: _Run, recordings: RecordingSet) -> AttackResult:
         run.controller,
         run.space,
         groups=groups_of(recordings),
-        schedule=Schedule.stretched(steps),
+        schedule=run.budget.schedule,
         restarts=run.budget.restarts,
         seed=run.seed,
         device=run.device,

@@ -51,7 +51,7 @@ def test_two_paints_find_the_canvas_within_half_a_pixel_for_nine_calls(two_paint
     assert report.calls == 9
     assert report.method == "two-paint"
     for drive in report.drives:
-        assert drive.stated_px.mean < 0.75
+        assert drive.stated_px.mean < 0.5
         assert drive.residual_px.mean < 1.0
 
 
@@ -94,12 +94,12 @@ def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(tow
 def test_poses_alone_are_exact_in_the_town_and_take_no_calls_of_their_own(town, drives, two_paint, folder):
     driven = len(list(folder.iterdir()))
     found = calibrate(town, drives, Method.POSE, folder=folder)
-    assert len(list(folder.iterdir())) == driven, "white and black are those of the two-paint calibration"
+    assert len(list(folder.iterdir())) == driven, "light and dark are those of the two-paint calibration"
     assert max(drive.stated_px.p95 for drive in found.report.drives) < 0.01
 
 
 def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, drives, two_paint, folder):
-    (folder / "clean-white.npz").write_bytes(b"cut")
+    (folder / "clean-light.npz").write_bytes(b"cut")
     shown = []
     steps = []
     step = town.step
@@ -112,7 +112,8 @@ def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, d
 
     again = calibrate(Counted(), drives, folder=folder, on_call=shown.append)
     assert shown == list(range(7))
-    assert 0 < steps.count("step") <= int(drives.drives[0].frame_number[-1]) + 1
+    # One replay, and what the type checks of the tests look at.
+    assert 0 < steps.count("step") < 2 * int(drives.drives[0].frame_number[-1])
     for one, two in zip(two_paint.recordings.recordings, again.recordings.recordings, strict=True):
         np.testing.assert_array_equal(one.image_from_canvas, two.image_from_canvas)
         assert torch.equal(one.maps.gain, two.maps.gain)
@@ -156,7 +157,7 @@ def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, drives, m
 
 
 def test_a_canvas_that_never_shows_is_refused(town, drives, monkeypatch):
-    """As if something stood before all of it: white and black look alike."""
+    """As if something stood before all of it: light and dark look alike."""
     monkeypatch.setattr(
         "roadproof.calibration.replays.rollout",
         lambda sim, who, scenario, **how: rollout(sim, who, scenario, **how | {"pattern": None}),

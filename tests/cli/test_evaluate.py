@@ -1,6 +1,5 @@
 """`roadproof evaluate` and `roadproof report` as their users call them."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -10,11 +9,12 @@ import pytest
 import torch
 from PIL import Image
 
+from paint_shy import just_before_the_canvas
 from roadproof.cli import main
 from roadproof.coverage import Shape
 from roadproof.evaluation import Evaluation
 from roadproof.patterns import Pattern, save_pattern
-from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
+from roadproof.scenarios import save_scenarios
 
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
@@ -26,8 +26,7 @@ ONE_DRIVE = ["--weathers", "clear-noon", "--runs", "0", "--controller", "paint_s
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("workplace")
-    left = find_scenario("left-03", builtin_scenarios())
-    save_scenarios([dataclasses.replace(left, name="short", time_limit_s=1.5)], folder / "own.toml")
+    save_scenarios([just_before_the_canvas(1.5)], folder / "own.toml")
     pattern = Pattern(
         (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]])
     )

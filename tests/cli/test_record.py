@@ -89,7 +89,7 @@ def test_a_recording_is_not_mixed_with_another(run, call):
 
 
 MISTAKES = {
-    "unknown scenario": (["record", "straight-4"], "did you mean 'straight-04'?"),
+    "unknown scenario": (["record", "left-3"], "did you mean 'left-03'?"),
     "unknown weather": (["record", "left-03", "--weather", "dry"], "--weather is 'dry'"),
     "unknown scheme": (["record", "left-03", "--scheme", "grup"], "did you mean group?"),
     "two ways": (["record", "left-03", "--noise-deg", "1", "2", "--deviation-m", "1"], "choose one way"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from paint_shy import PaintShy
+from paint_shy import PaintShy, just_before_the_canvas
 from roadproof.coverage import Shape
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.evaluation import Fidelity, compare_with_rendered, is_drive_of, rendered_frames
@@ -14,12 +14,11 @@ from roadproof.patterns import Pattern
 from roadproof.photometry import ColourTransform, pixel_maps_from_two_paints
 from roadproof.recordings import Push, Recording, RecordingSet
 from roadproof.rollout import rollout
-from roadproof.scenarios import builtin_scenarios, find_scenario
 
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
 from roadproof.simulators.town.simulator import TownSimulator
 
-SHORT = dataclasses.replace(find_scenario("left-03", builtin_scenarios()), time_limit_s=1.0)
+SHORT = just_before_the_canvas(1.0)
 PATTERN = Pattern(
     (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 200.0, 300.0, 20.0]]), torch.tensor([[0.9, 0.1, 0.8]])
 )
@@ -63,7 +62,7 @@ def test_composites_of_a_calibrated_drive_are_close_to_renders_and_say_what_the_
     assert found.agreement.frames == len(STEPS)
     assert found.agreement.paint_error < 4.0
     assert found.agreement.elsewhere_error < 1.0
-    assert found.agreement.rendered_shift > 0.02
+    assert found.agreement.rendered_shift > 0.01
     assert found.agreement.predicted_shift == pytest.approx(found.agreement.rendered_shift, rel=0.1)
     # Against the clean frames the error in the paint is the paint itself.
     assert np.abs(found.clean.astype(float) - rendered).max() > 50
@@ -101,4 +100,4 @@ def test_frames_that_do_not_belong_together_are_refused(drive):
     with pytest.raises(RecordingError, match="no drive 'left', expected one of clean"):
         compare_with_rendered(PATTERN, recordings, PaintShy(), rendered, drive="left")
     with pytest.raises(RecordingError, match="frames up to 99 are asked of a drive of 21 steps"):
-        rendered_frames(None, SHORT, drive[0], PATTERN, np.array([99]))
+        rendered_frames(TownSimulator(), SHORT, drive[0], PATTERN, np.array([99]))

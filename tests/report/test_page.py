@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from browser import opened
+from browser import opened, until
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
@@ -65,7 +65,7 @@ def test_a_whole_run_has_every_section_and_leaves_nothing_out(run):
         "perturbed less than asked",
         "1.40 m left",
         "45: too few points",
-        "0.21 (0.43)",
+        "0.20 (0.40)",
     ):
         assert words in text
     assert "#e5cc1a" in text, "the paint's own colour"
@@ -227,9 +227,9 @@ def test_a_browser_shows_everything_and_has_nothing_to_complain_about(tmp_path):
         assert min(charts) > 150
         rows = page.evaluate("document.querySelectorAll('#closed-loop tbody tr').length")
         assert rows == len(evaluation.rows()) == 6
-        page.wait_for_function("document.querySelector('video').readyState >= 2", timeout=60_000)
+        until(page, "document.querySelector('video').readyState >= 2")
         page.evaluate("document.querySelector('video').currentTime = 0.8")
-        page.wait_for_function("!document.querySelector('video').seeking", timeout=60_000)
+        until(page, "!document.querySelector('video').seeking")
         film = page.evaluate(
             "(v => [v.error, v.videoWidth, v.duration, v.currentTime])(document.querySelector('video'))"
         )

@@ -15,6 +15,21 @@ def test_the_town_is_opened_by_its_name_and_closed_again():
         simulator.reset(builtin_scenarios()[0])
 
 
+@pytest.mark.parametrize(
+    ("spec", "complaint"),
+    [
+        ("carla://", "no address"),
+        ("carla://host:port", "no address"),
+        ("carla://host:99999", "no address"),
+        ("carla://host:2000/Town01", "no address"),
+        ("carla:host", "unknown"),
+    ],
+)
+def test_what_is_no_address_is_refused(spec, complaint):
+    with pytest.raises(SimulatorError, match=complaint), open_simulator(spec):
+        pass
+
+
 @pytest.mark.parametrize("spec", ["", "Town", "towm"])
 def test_an_unknown_simulator_is_refused(spec):
     with pytest.raises(SimulatorError, match="unknown, expected town"), open_simulator(spec):

@@ -86,10 +86,10 @@ class Schedule:
         """What finds most for its cost (measured): heats on few frames, then a short search on all of them."""
         return Schedule(
             iterations=iterations,
-            learning_rate=0.2,
-            drops=(iterations * 3 // 5, iterations * 17 // 20),
+            drops=(iterations // 2, iterations * 4 // 5),
+            factor=0.3,
             patience=patience,
-            heats=(Heat(starts=32, iterations=20, every=4), Heat(starts=12, iterations=25, every=2)),
+            heats=(Heat(starts=24, iterations=30, every=4), Heat(starts=8, iterations=30, every=2)),
         )
 
     @property
@@ -172,7 +172,7 @@ def _starts(
     schedule: Schedule,
     restarts: int,
     seed: int,
-    on_step: Callable[[int, float], None],
+    on_step: Callable[[int, float], object],
 ) -> Float[Tensor, "g r k n"]:
     """Random points, or what is left of them after the heats."""
     places = [*(heat.starts for heat in schedule.heats), restarts]

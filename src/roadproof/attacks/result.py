@@ -143,7 +143,8 @@ class AttackResult:
 
 def _schedule(stored: dict[str, Any]) -> Schedule:
     heats = tuple(Heat(**heat) for heat in stored.get("heats", ()))
-    return Schedule(**stored | {"drops": tuple(stored["drops"]), "heats": heats})
+    fields: dict[str, Any] = {**stored, "drops": tuple(stored["drops"]), "heats": heats}
+    return Schedule(**fields)
 
 
 def _space(stored: dict[str, Any]) -> SearchSpace:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.calibration.outline import fit_outline, outline_errors_px
 from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
 from roadproof.calibration.replays import Replays
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
@@ -102,11 +101,8 @@ def calibrate(
         maps: list[PixelMaps | None] = [None] * len(geometry)
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
-        paints = [look_at_paints(replays, drive) for drive in drives.drives]
-        geometry = [
-            _from_paints(drives, drive, paint, refine=method is Method.TWO_PAINT)
-            for drive, paint in zip(drives.drives, paints, strict=True)
-        ]
+        paints = [_look(replays, drives, drive, refine=method is Method.TWO_PAINT) for drive in drives.drives]
+        geometry = [_from_paints(paint) for paint in paints]
         maps = [at_frames(paint.maps, list(g.found)) for paint, g in zip(paints, geometry, strict=True)]
         colour, residual = ColourTransform(AffineResponse.identity()), None
     for drive, found in zip(drives.drives, geometry, strict=True):
@@ -135,17 +131,16 @@ def _from_points(replays: Replays, drive: Drive) -> _Geometry:
     return _Geometry(found, dropped, residuals)
 
 
-def _from_paints(drives: Drives, drive: Drive, paints: Paints, *, refine: bool) -> _Geometry:
-    settings = drives.settings
-    homographies = np.stack([homography_from_pose(settings.camera, s, settings.scenario.canvas) for s in drive.states])
-    if refine:
-        fit = fit_outline(homographies, paints.visible, settings.camera, settings.view)
-        homographies, errors = fit.image_from_canvas, fit.outline_px
-    else:
-        errors = outline_errors_px(homographies, paints.visible, settings.camera, settings.view)
-    found = {k: homographies[k] for k in range(len(homographies)) if k not in paints.dropped}
-    kept = errors[list(found)]
-    return _Geometry(found, paints.dropped, kept[np.isfinite(kept)])
+def _look(replays: Replays, drives: Drives, drive: Drive, *, refine: bool) -> Paints:
+    camera, view, canvas = drives.settings.camera, drives.settings.view, drives.settings.scenario.canvas
+    poses = np.stack([homography_from_pose(camera, state, canvas) for state in drive.states])
+    return look_at_paints(replays, drive, poses, camera, view, refine=refine)
+
+
+def _from_paints(paints: Paints) -> _Geometry:
+    found = {k: homography for k, homography in enumerate(paints.image_from_canvas) if k not in paints.dropped}
+    errors = paints.outline_px[list(found)]
+    return _Geometry(found, paints.dropped, errors[np.isfinite(errors)])
 
 
 def _check(drive: Drive, geometry: _Geometry) -> None:

@@ -1,17 +1,19 @@
-"""Homographies from the outline of the canvas, starting from the pose.
+"""Homographies from what two paints show of the canvas, starting from the pose.
 
     symbol   meaning                                                                      shape
     H        image_from_canvas                                                            (F, 3, 3)
     K        camera intrinsics
     ω, τ     small rotation (rad) and translation (m) of the camera in its own axes       (F, 3) each
-    m        measured share of each pixel through which the canvas is seen                (F, H, W)
-    M        the share that a homography predicts: coverage of the canvas by footprints
+    D        difference of the light and the dark frame                                   (F, H, W)
+    p        the contrast that a homography predicts: share of the canvas in a footprint, less what the squares take
+    g        gain of the paint near a pixel, so that D = g p
 
-A pose gives H; H(ω, τ) = K (exp[ω]× K⁻¹H + τ e₃ᵀ) is the view of a camera moved a little. What is looked for are the
-ω, τ whose predicted shares agree with the measured ones, in robust least squares, from coarse to fine: both are blurred
-at first, so that an outline that is off by several pixels is still felt. The canvas' far edge alone, when the others
-leave the picture, cannot tell where the car is; so (ω, τ) of a frame is a correction common to the drive plus little of
-its own, both with a prior: what frames far from the canvas show carries over to the near ones.
+The light frame shows the canvas all white, the dark one black with grey squares, a checkerboard: the squares give edges
+inside the canvas, which are seen also where its outline has left the picture, and leave every pixel at least half of
+its contrast. A pose gives H; H(ω, τ) = K (exp[ω]× K⁻¹H + τ e₃ᵀ) is the view of a camera moved a little. What is looked
+for are the ω, τ for which D / g = p, in robust least squares, from coarse to fine: both sides are blurred at first, so
+that edges that are off by several pixels are still felt. (ω, τ) of a frame is a correction common to the drive plus
+little of its own, both with a prior: what some frames show carries over to the others.
 """
 
 from __future__ import annotations
@@ -22,11 +24,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from roadproof.coverage import FOOTPRINT_VARIANCE
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 
+SQUARES = 4
+"""Along each side of the canvas in the dark frames."""
+GREY = 128 / 255
+"""Of the squares."""
 _BLURS_PX = (6, 3, 0)
 _STEPS = (4, 4, 5)
 # Of a pixel's share. Pixels along an edge err together, so this is more than one of them errs: measured in the town,
@@ -34,6 +40,8 @@ _STEPS = (4, 4, 5)
 _NOISE = 0.3
 _ROBUST = 3.0
 _REACH_PX = 3
+_GAIN_PX = 5
+_SEEN = 6 / 255
 _DELTA = 1e-5
 
 
@@ -62,12 +70,12 @@ class PoseDoubt:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineFit:
-    """Homographies fitted to the outline.
+    """Homographies fitted to the edges of canvas and squares.
 
     Args:
         image_from_canvas: one a frame.
-        outline_px: mean distance of the predicted from the measured outline, camera px, a frame; NaN where no outline
-            is in view.
+        outline_px: mean distance of the predicted from the measured edges, camera px, a frame; NaN where none is in
+            view.
     """
 
     image_from_canvas: Float[np.ndarray, "f 3 3"]
@@ -76,17 +84,17 @@ class OutlineFit:
 
 def fit_outline(
     prior: Float[np.ndarray, "f 3 3"],
-    visible: Float[np.ndarray, "f h w"],
+    contrast: Float[np.ndarray, "f h w"],
     camera: CameraModel,
     view: CropResize,
     *,
     doubt: PoseDoubt | None = None,
 ) -> OutlineFit:
-    """Move homographies until the canvas covers what was seen of it.
+    """Move homographies until canvas and squares lie where they are seen.
 
     Args:
         prior: homographies from the pose.
-        visible: share of each pixel of the controller's input through which the canvas is seen, in [0, 1].
+        contrast: D, light less dark frames at the controller's input, mean over channels, 1 being white less black.
         camera: the pinhole.
         view: how the input is made from its picture.
         doubt: how far the pose may be off.
@@ -94,21 +102,39 @@ def fit_outline(
     common, own = (PoseDoubt() if doubt is None else doubt).precisions
     moves = np.zeros((len(prior), 6))
     for blur, steps in zip(_BLURS_PX, _STEPS, strict=True):
-        problem = _Outline(prior, visible, camera, view, blur)
+        problem = _Outline(prior, contrast, camera, view, blur, moves)
         for _ in range(steps):
             moves = problem.step(moves, common, own)
-    finest = _Outline(prior, visible, camera, view, 0)
+    finest = _Outline(prior, contrast, camera, view, 0, moves)
     return OutlineFit(moved(prior, moves, camera), finest.outline_px(moves))
 
 
 def outline_errors_px(
     image_from_canvas: Float[np.ndarray, "f 3 3"],
-    visible: Float[np.ndarray, "f h w"],
+    contrast: Float[np.ndarray, "f h w"],
     camera: CameraModel,
     view: CropResize,
 ) -> Float[np.ndarray, " f"]:
-    """Mean distance of predicted from measured outline, camera px, a frame; NaN where no outline is in view."""
-    return _Outline(image_from_canvas, visible, camera, view, 0).outline_px(np.zeros((len(visible), 6)))
+    """Mean distance of predicted from measured edges, camera px, a frame; NaN where none is in view."""
+    unmoved = np.zeros((len(contrast), 6))
+    return _Outline(image_from_canvas, contrast, camera, view, 0, unmoved).outline_px(unmoved)
+
+
+def predicted_contrast(
+    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
+) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, "f h w"]]:
+    """Share of the canvas in every pixel's footprint, and that less what the squares take: p."""
+    canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
+    row, column = np.divmod(np.arange(view.height_px * view.width_px), view.width_px)
+    pixel = np.stack([column, row, np.ones_like(row)], -1).astype(np.float64)
+    frames, count = len(image_from_canvas), len(pixel)
+    share, paint = _canvas_shares(
+        np.repeat(canvas_from_input, count, 0),
+        np.tile(pixel, (frames, 1)),
+        FOOTPRINT_VARIANCE[view.resampling],
+    )
+    shape = (frames, view.height_px, view.width_px)
+    return share.reshape(shape), paint.reshape(shape)
 
 
 def moved(
@@ -143,14 +169,16 @@ class _Outline:
     def __init__(
         self,
         prior: Float[np.ndarray, "f 3 3"],
-        visible: Float[np.ndarray, "f h w"],
+        contrast: Float[np.ndarray, "f h w"],
         camera: CameraModel,
         view: CropResize,
         blur_px: int,
+        moves: Float[np.ndarray, "f 6"],
     ) -> None:
         self._prior, self._camera, self._view = prior, camera, view
         self._variance = FOOTPRINT_VARIANCE[view.resampling] + blur_px**2
-        blurred, whole = _blurred(visible, blur_px)
+        _, expected = predicted_contrast(moved(prior, moves, camera), view)
+        blurred, whole = _blurred(_over_gain(contrast, expected), blur_px)
         self._frame, row, column = np.nonzero(whole & _near_edge(blurred))
         self._pixel = np.stack([column, row, np.ones_like(row)], -1).astype(np.float64)
         self._measured = blurred[self._frame, row, column]
@@ -191,16 +219,42 @@ class _Outline:
         self, canvas_from_input: Float[np.ndarray, "f 3 3"], pixel: Float[np.ndarray, "p 3"]
     ) -> Float[np.ndarray, " p"]:
         """Share of each footprint that lies on the canvas (`coverage`, for one rectangle that is not turned)."""
-        inverse = canvas_from_input[self._frame]
-        mapped = np.einsum("pij,pj->pi", inverse, pixel)
-        ahead = mapped[:, 2] > 1e-9
-        depth = np.where(ahead, mapped[:, 2], 1.0)[:, None]
-        at = mapped[:, :2] / depth
-        jacobian = (inverse[:, :2, :2] - at[:, :, None] * inverse[:, 2:, :2]) / depth[..., None]
-        reach = np.sqrt(self._variance * np.square(jacobian).sum(-1) + 1e-9)
-        middle, half = (CANVAS_SIZE_PX - 1) / 2, CANVAS_SIZE_PX / 2
-        shares = _tent((half - (at - middle)) / reach) + _tent((half + (at - middle)) / reach)
-        return np.where(ahead, shares.prod(-1), 0.0)
+        return _canvas_shares(canvas_from_input[self._frame], pixel, self._variance)[1]
+
+
+def _canvas_shares(
+    canvas_from_input: Float[np.ndarray, "p 3 3"], pixel: Float[np.ndarray, "p 3"], variance: float
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Share of each footprint on the canvas, and p.
+
+    Along either axis a checkerboard is a square wave, and it is their product: squares are where it is positive.
+    """
+    mapped = np.einsum("pij,pj->pi", canvas_from_input, pixel)
+    ahead = mapped[:, 2] > 1e-9
+    depth = np.where(ahead, mapped[:, 2], 1.0)[:, None]
+    at = mapped[:, :2] / depth
+    jacobian = (canvas_from_input[:, :2, :2] - at[:, :, None] * canvas_from_input[:, 2:, :2]) / depth[..., None]
+    reach = np.sqrt(variance * np.square(jacobian).sum(-1) + 1e-9)
+    edges = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, SQUARES + 1)
+    steps = [_tent((at - edge) / reach) for edge in edges]
+    share = (steps[0] - steps[-1]).prod(-1)
+    sides = [(-1.0) ** k * (steps[k] - steps[k + 1]) for k in range(SQUARES)]
+    wave = np.sum(sides, 0).prod(-1)
+    grey = 0.5 * (share + wave)
+    return np.where(ahead, share, 0.0), np.where(ahead, share - GREY * grey, 0.0)
+
+
+def _over_gain(
+    contrast: Float[np.ndarray, "f h w"], expected: Float[np.ndarray, "f h w"]
+) -> Float[np.ndarray, "f h w"]:
+    """D / g with the g that suits a pixel's neighbourhood best; 0 where nothing is expected or seen."""
+    size = 2 * _GAIN_PX + 1
+    fit, power = (
+        avg_pool2d(torch.tensor(values)[:, None], size, 1, _GAIN_PX)[:, 0].numpy()
+        for values in (contrast * expected, expected**2)
+    )
+    known = (power > 1e-3) & (fit > _SEEN * power)
+    return np.where(known, np.clip(contrast / np.where(known, fit / np.maximum(power, 1e-9), 1.0), 0.0, 1.5), 0.0)
 
 
 _SIDES = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
@@ -213,26 +267,26 @@ def _tent(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 
 def _blurred(
-    visible: Float[np.ndarray, "f h w"], blur_px: int
+    contrast: Float[np.ndarray, "f h w"], blur_px: int
 ) -> tuple[Float[np.ndarray, "f h w"], Bool[np.ndarray, "f h w"]]:
-    """Shares averaged over a tent of this half-width, and where that did not need pixels beyond the picture."""
+    """Contrast averaged over a tent of this half-width, and where that did not need pixels beyond the picture."""
     if blur_px == 0:
-        return visible, np.ones(visible.shape, bool)
-    shares = torch.tensor(visible)[:, None]
+        return contrast, np.ones(contrast.shape, bool)
+    shares = torch.tensor(contrast)[:, None]
     for _ in range(2):
         # Two boxes make a tent.
         shares = avg_pool2d(shares, 2 * (blur_px // 2) + 1, 1, blur_px // 2)
-    whole = np.zeros(visible.shape, bool)
+    whole = np.zeros(contrast.shape, bool)
     whole[:, blur_px:-blur_px, blur_px:-blur_px] = True
     return shares[:, 0].numpy(), whole
 
 
-def _near_edge(shares: Float[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Pixels within reach of a place where shares change."""
-    shown = torch.tensor(shares)[:, None]
+def _near_edge(contrast: Float[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+    """Pixels within reach of a place where the contrast changes."""
+    shown = torch.tensor(contrast)[:, None]
     size = 2 * _REACH_PX + 1
-    mean = avg_pool2d(shown, size, 1, _REACH_PX, count_include_pad=False)[:, 0].numpy()
-    return (mean > 0.01) & (mean < 0.99)
+    most, least = max_pool2d(shown, size, 1, _REACH_PX), -max_pool2d(-shown, size, 1, _REACH_PX)
+    return (most - least)[:, 0].numpy() > 0.25
 
 
 def _arrow_step(
@@ -251,5 +305,5 @@ def _arrow_step(
     # Of frame f: c costs ½ cᵀ(O − O (N+O)⁻¹ O) c − cᵀ O (N+O)⁻¹ target.
     curvature = common + (own - own @ inverse @ own).sum(0)
     pull = np.einsum("ij,fjk,fk->i", own, inverse, target)
-    shared: Float[np.ndarray, " 6"] = np.linalg.solve(curvature, pull)
+    shared = np.asarray(np.linalg.solve(curvature, pull), np.float64)
     return np.einsum("fij,fj->fi", inverse, target + own @ shared)

@@ -1,4 +1,4 @@
-"""Two replays a drive, the canvas all white and all black: how paint looks in every pixel, and where it ends."""
+"""Two replays a drive, the canvas white, then black with grey squares: how paint looks in every pixel, and where."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from roadproof.calibration.outline import GREY, SQUARES, fit_outline, outline_errors_px, predicted_contrast
 from roadproof.calibration.replays import Replays, uniform
 from roadproof.drives import Drive
 from roadproof.errors import CalibrationError, ColourError
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
+from roadproof.simulators.protocol import PatternImage
 
 LEAST_PX = 20
 
@@ -22,28 +25,62 @@ class Paints:
 
     Args:
         maps: gain, offset and visibility.
+        image_from_canvas: one homography a frame.
+        outline_px: how far each misses the edges seen, camera px; NaN where none is in view.
         dropped: which frames show too little of the canvas, and why.
     """
 
     maps: PixelMaps
+    image_from_canvas: Float[np.ndarray, "f 3 3"]
+    outline_px: Float[np.ndarray, " f"]
     dropped: dict[int, str]
 
-    @property
-    def visible(self) -> Float[np.ndarray, "f h w"]:
-        """Share of each pixel through which the canvas is seen."""
-        return self.maps.visible.double().numpy()
+
+def dark_target() -> PatternImage:
+    """Black, with grey squares like the black ones of a chessboard."""
+    target = uniform(0, 0, 0)
+    rows, columns = np.indices((CANVAS_SIZE_PX, CANVAS_SIZE_PX)) * SQUARES // CANVAS_SIZE_PX
+    target[(rows + columns) % 2 == 0, :3] = round(255 * GREY)
+    return target
 
 
-def look_at_paints(replays: Replays, drive: Drive) -> Paints:
-    """Replay a drive over a white and a black canvas.
+def look_at_paints(
+    replays: Replays,
+    drive: Drive,
+    prior: Float[np.ndarray, "f 3 3"],
+    camera: CameraModel,
+    view: CropResize,
+    *,
+    refine: bool,
+) -> Paints:
+    """Replay a drive over a light and a dark canvas.
+
+    Args:
+        replays: of the recorded drives.
+        drive: one of them.
+        prior: homographies from its poses.
+        camera: on the car.
+        view: how the controller's input is made from its picture.
+        refine: whether homographies are corrected by what is seen.
 
     Raises:
         CalibrationError: the two look alike, saturate, or a replay goes astray.
     """
-    light = replays.frames(drive, "white", uniform(255, 255, 255))
-    dark = replays.frames(drive, "black", uniform(0, 0, 0))
+    light = replays.frames(drive, "light", uniform(255, 255, 255))
+    dark = replays.frames(drive, "dark", dark_target())
+    difference = light.astype(np.float64) - dark
+    contrast = difference.mean(-1) / 255
+    if refine:
+        fit = fit_outline(prior, contrast, camera, view)
+        found, errors = fit.image_from_canvas, fit.outline_px
+    else:
+        found, errors = prior, outline_errors_px(prior, contrast, camera, view)
+    # What the dark frame would be without its squares: they took the known share 1 − p / s of the difference.
+    share, expected = predicted_contrast(found, view)
+    whole = np.where(share > 0.01, share / np.maximum(expected, 1e-6), 1.0).clip(1.0, 1.0 / (1.0 - GREY))
+    black = np.clip(np.round(light - difference * whole[..., None]), 0, 255).astype(np.uint8)
     try:
-        maps = pixel_maps_from_two_paints(torch.tensor(light), torch.tensor(dark))
+        maps = pixel_maps_from_two_paints(torch.tensor(light), torch.tensor(black))
     except ColourError as error:
         raise CalibrationError(f"drive {drive.name}: {error}") from None
     seen_px = maps.visible.sum((1, 2))
@@ -52,7 +89,7 @@ def look_at_paints(replays: Replays, drive: Drive) -> Paints:
         for k in range(len(seen_px))
         if seen_px[k] < LEAST_PX
     }
-    return Paints(maps, dropped)
+    return Paints(maps, found, errors, dropped)
 
 
 def at_frames(maps: PixelMaps, kept: list[int]) -> PixelMaps:

@@ -14,6 +14,7 @@ from rich.console import Console
 from roadproof import __version__
 from roadproof.cli.attack import attack
 from roadproof.cli.calibrate import calibrate
+from roadproof.cli.carla import carla
 from roadproof.cli.check_controller import check_controller
 from roadproof.cli.controllers import controllers
 from roadproof.cli.demo import demo
@@ -34,6 +35,7 @@ app = typer.Typer(
 VERBS = (demo, record, calibrate, attack, evaluate, report, drive, scenarios, controllers, check_controller, train)
 for verb in VERBS:
     app.command()(verb)
+app.add_typer(carla, name="carla")
 
 
 def _version(wanted: bool | None) -> None:

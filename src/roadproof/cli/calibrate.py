@@ -18,8 +18,8 @@ def calibrate(
     method: Annotated[
         str,
         typer.Option(
-            help="two-paint: canvas white and black, homographies from its outline; pose: the same colours, "
-            "homographies from the poses; published: coloured points and 22 colours."
+            help="two-paint: canvas white, then black with grey squares, homographies from their edges; pose: the same "
+            "colours, homographies from the poses; published: coloured points and 22 colours."
         ),
     ] = "two-paint",
     simulator: Annotated[str, typer.Option(help="Where the drives were recorded: town.")] = "town",

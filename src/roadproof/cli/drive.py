@@ -38,7 +38,7 @@ def drive(
     cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
     pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
     seed: Annotated[int, typer.Option(help="Of the other cars and the people.")] = 0,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),
 ) -> None:

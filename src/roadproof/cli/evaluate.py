@@ -44,7 +44,7 @@ def evaluate(
     ] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
     processes: Annotated[int, typer.Option(help="Drives made at once.")] = 1,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
     seed: Annotated[int, typer.Option(help="Of the first run with traffic; the others count on.")] = 0,
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(

@@ -45,7 +45,7 @@ def record(
     horizon_m: Annotated[float, typer.Option(help="Keep frames from so far before the canvas.")] = 25.0,
     frames: Annotated[int, typer.Option(help="Keep at most so many a drive.")] = 24,
     seed: Annotated[int, typer.Option(help="Of the perturbations.")] = 0,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
 ) -> None:

@@ -89,7 +89,8 @@ def _pieces(boxes: Tensor, runs: Runs) -> Iterator[tuple[slice, Runs]]:
 
 def _edge_rows(boxes: Float[Tensor, "b k 5"]) -> Float[Tensor, "b k 6 6"]:
     """The rows that give w/2 − u, l/2 − v, w/2 + u, l/2 + v, σ²(e_u), σ²(e_v) from the features of a footprint."""
-    axes, variances = axis_rows(boxes).split(2, -2)
+    rows = axis_rows(boxes)
+    axes, variances = rows[..., :2, :], rows[..., 2:, :]
     half = torch.nn.functional.pad(boxes[..., 2:4, None] / 2, (2, 3))
     return torch.cat([half - axes, half + axes, variances], -2)
 
@@ -108,7 +109,7 @@ class _Edges:
         self.place = figure * len(runs) + run
         self.counts = cast("list[int]", (crossed.sum(-1) * RUN).tolist())
         self.features = runs.features.index_select(1, run).flatten(1)
-        parts = zip(rows.flatten(0, 1), self.features.split(self.counts, 1), strict=True)
+        parts = zip(rows.flatten(0, 1), _split(self.features, self.counts), strict=True)
         values = torch.cat([row @ part for row, part in parts], 1)
         self.sharpness = values[4:].clamp_min_(MIN_VARIANCE).rsqrt_()
         self.t = values[:4].view(2, 2, -1).mul_(self.sharpness).clamp_(-1.0, 1.0)
@@ -130,8 +131,12 @@ class _Edges:
         torch.mul(1 - self.t.abs(), scaled, out=distance)
         torch.mul(distance[0], self.t[0], out=variance).addcmul_(distance[1], self.t[1])
         variance.mul_(self.sharpness).mul_(-0.5)
-        parts = zip(values.split(self.counts, 1), self.features.split(self.counts, 1), strict=True)
+        parts = zip(_split(values, self.counts), _split(self.features, self.counts), strict=True)
         return torch.stack([part @ features.T for part, features in parts]).view(self.shape)
+
+
+def _split(values: Tensor, counts: list[int]) -> tuple[Tensor, ...]:
+    return cast("tuple[Tensor, ...]", values.split(counts, 1))
 
 
 def _shown_through(masks: Tensor) -> Tensor:

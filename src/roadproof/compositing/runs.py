@@ -66,7 +66,8 @@ class Runs:
         Args:
             rows: that give the distances to the four edges, first those across and along the figure to one side.
         """
-        depth = (rows[:, :4, :3] @ self.centre).unflatten(1, (2, 2)).amin(1)
+        distance = rows[:, :4, :3] @ self.centre
+        depth = torch.minimum(distance[:, :2], distance[:, 2:])
         reach = rows[:, :2, :2].abs() @ self.reach
         inside = (depth - reach).amin(1) > 0
         return inside, ((depth + reach).amin(1) > 0).logical_and_(~inside)

@@ -254,8 +254,12 @@ def judge(
 
 
 def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:
+    # Alone, one pattern has one drive a weather, and the weathers asked for are no sample of all there are.
+    drawn = traffic or pattern != ATTACK
+
     def mean(value: Callable[[Trial], float]) -> Mean:
-        return mean_95([value(trial) for trial in trials])
+        found = mean_95([value(trial) for trial in trials])
+        return found if drawn else replace(found, low=None, high=None)
 
     first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
     return Row(

@@ -79,7 +79,7 @@ def svg_of(figure: Figure, name: str, description: str) -> Markup:
         r'(<svg\b[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg\b[^>]*?) height="[^"]*"', r"\1", text, count=1)
     )
     text = re.sub(r"(\bid=\"|url\(#|xlink:href=\"#)", rf"\g<1>{name}-", text)
-    text = re.sub(r"font: ([0-9.]+px)[^;\"]*", r"font: \1 var(--sans)", text)
+    text = re.sub(r"(font: [0-9.]+px|font-family:) '[^;\"]*", r"\1 var(--sans)", text)
     for variable, colour in VARIABLES.items():
         text = text.replace(colour, f"var(--{variable})")
     return Markup(text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1))  # noqa: S704

@@ -30,6 +30,7 @@ VIEW = (640, 480)
 CAPTION_PX = 96
 STRIP_COLUMNS = 6
 STRIP_SIZE = (400, 300)
+STRIP_HORIZON_M = 14.0
 EVENT_SHOWN_S = 3.0
 INK, PAPER, FAINT, CLEAN, PAINTED = (30, 33, 38), (250, 249, 246), (110, 114, 120), (36, 92, 168), (184, 58, 26)
 
@@ -87,7 +88,7 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     bare = _pictures(simulator, evaluation.scenario, clean, None)
     driven = _pictures(simulator, evaluation.scenario, painted, paint)
     beside = lateral_m(path_of(clean), path_of(painted))
-    seen = passage(path_of(clean), evaluation.scenario.canvas)
+    seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
     last = min(len(clean), len(painted)) - 1
     first, end = min(seen.start, last), min(seen.stop - 1, last)
     steps: list[int] = sorted({round(first + (end - first) * k / (STRIP_COLUMNS - 1)) for k in range(STRIP_COLUMNS)})
@@ -168,14 +169,14 @@ class _Pages:
         pen = ImageDraw.Draw(page)
         for column, (episode, pictures, title, colour) in enumerate(self._sides):
             left, k = column * VIEW[0], min(step, len(pictures) - 1)
-            page.paste(_opened(pictures[k]), (left, 0))
-            pen.rectangle((left, VIEW[1], left + VIEW[0], VIEW[1] + 5), fill=colour)
-            pen.text((left + 20, VIEW[1] + 18), title, colour, self._fonts[0])
+            page.paste(_opened(pictures[k]), (left, CAPTION_PX))
+            pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=colour)
+            pen.text((left + 20, 12), title, colour, self._fonts[0])
             beside = (
-                f"{abs(self._beside[k]):.2f} m {'left' if self._beside[k] > 0 else 'right'} of it" if column else ""
+                f"{abs(self._beside[k]):.2f} m to the {'left' if self._beside[k] > 0 else 'right'}" if column else ""
             )
             words = f"{3.6 * episode.speed_mps[k]:.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
-            pen.text((left + 20, VIEW[1] + 56), words, INK, self._fonts[1])
+            pen.text((left + 20, 50), words, INK, self._fonts[1])
             self._tell(pen, episode, float(episode.time_s[k]), left + VIEW[0] - 20)
         pen.line((VIEW[0], 0, VIEW[0], page.height), PAPER, 3)
         return page
@@ -186,14 +187,14 @@ class _Pages:
         words = str(fresh[-1].kind).replace("-", " ") if fresh else ""
         if now_s >= episode.time_s[-1]:
             words = words or str(episode.ending)
-        pen.text((right, VIEW[1] + 20), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")
+        pen.text((right, 14), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")
 
 
 def _encode(av: Any, path: Path, pages: _Pages, rate: Fraction) -> None:  # noqa: ANN401
     """H.264, coarser until the film is small enough."""
     for quality in (26, 30, 34, 38):
         with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-            options = {"crf": str(quality), "threads": "1", "preset": "medium"}
+            options = {"crf": str(quality), "threads": "1", "preset": "veryfast"}
             stream = container.add_stream("libx264", rate=rate, options=options)
             stream.width, stream.height, stream.pix_fmt = 2 * VIEW[0], VIEW[1] + CAPTION_PX, "yuv420p"
             for step in range(len(pages)):

@@ -360,7 +360,7 @@ def _costs(run: Run) -> list[Fields]:
 
 
 def _aside(left_m: float) -> str:
-    return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "0"
+    return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "on its path"
 
 
 def _words(weather: str) -> str:

@@ -1,10 +1,11 @@
-"""Which simulator is meant: "town" is the embedded one."""
+"""Which simulator is meant: "town" is the embedded one, "carla://HOST:PORT" a CARLA server."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Protocol
+from urllib.parse import urlsplit
 
 from roadproof.errors import SimulatorError
 from roadproof.simulators.protocol import Simulator
@@ -12,7 +13,8 @@ from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.routes import Route
 
-SPECS = "town"
+SPECS = "town or carla://HOST:PORT"
+CARLA_PORT = 2000
 
 
 class MappedSimulator(Simulator, Protocol):
@@ -57,4 +59,24 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
         with TownSimulator() as town:
             yield town
         return
+    if spec.startswith("carla://"):
+        host, port = _address(spec)
+        # CARLA's client is an extra.
+        from roadproof.simulators.carla.simulator import CarlaSimulator
+
+        with CarlaSimulator(host, port) as server:
+            yield server
+        return
     raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")
+
+
+def _address(spec: str) -> tuple[str, int]:
+    """Host and port of carla://HOST:PORT; a port left out is CARLA's own."""
+    try:
+        parts = urlsplit(spec)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise SimulatorError(f"simulator {spec!r} is no address ({error}), expected carla://HOST:PORT") from None
+    if not host or parts.path or parts.query or parts.fragment or parts.username:
+        raise SimulatorError(f"simulator {spec!r} is no address, expected carla://HOST:PORT")
+    return host, CARLA_PORT if port is None else port

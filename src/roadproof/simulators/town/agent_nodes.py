@@ -57,15 +57,21 @@ class AgentNodes:
         """Where they are now; nothing is done before they are looked at."""
         self._cars, self._people = cars, people
 
-    def see(self, state: VehicleState) -> None:
-        """Put everybody in view of the camera of a vehicle where they are, and leave out the rest."""
+    def see(self, state: VehicleState, *, everybody: bool = False) -> None:
+        """Put everybody in view of the camera of a vehicle where they are, and leave out the rest.
+
+        Args:
+            state: of the vehicle.
+            everybody: leave out nobody; for other cameras than the vehicle's own.
+        """
         for agents, figures, on_foot in (
             (self._cars, self._nodes[0], False),
             (self._people, self._nodes[1], True),
         ):
             if not figures:
                 continue
-            chosen = np.flatnonzero(in_view(self._camera, state, np.stack([agents.x_m, agents.y_m], axis=1)))
+            seen = in_view(self._camera, state, np.stack([agents.x_m, agents.y_m], axis=1))
+            chosen = np.flatnonzero(seen | everybody)
             for hidden in set(range(len(figures))) - set(chosen.tolist()):
                 figures[hidden].hide()
             if not len(chosen):

@@ -26,11 +26,16 @@ def load_map(name: str) -> RoadMap:
         ScenarioError: there is no such map, or it cannot be read.
     """
     if name in BUILTIN_MAPS:
-        return RoadMap.from_opendrive(Path(__file__).parent / "assets" / f"{name}.xodr")
+        return RoadMap.from_opendrive(builtin_map_file(name))
     if not name.endswith(".xodr"):
         known = ", ".join(BUILTIN_MAPS)
         raise ScenarioError(f"the town simulator has no map {name!r}, expected {known} or the path of an .xodr file")
     return RoadMap.from_opendrive(Path(name))
+
+
+def builtin_map_file(name: str) -> Path:
+    """The OpenDRIVE file of a built-in map."""
+    return Path(__file__).parent / "assets" / f"{name}.xodr"
 
 
 def scenario_route(scenario: Scenario, road_map: RoadMap) -> Route:

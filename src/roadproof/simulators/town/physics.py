@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Control, VehicleState
+from roadproof.simulators.town.body import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.scenery import Solid
 
-LENGTH_M, WIDTH_M, HEIGHT_M = 4.5, 1.9, 1.45
-WHEELBASE_M, TRACK_M, WHEEL_RADIUS_M = 2.8, 1.6, 0.33
+WHEEL_RADIUS_M = 0.33
 MASS_KG = 1500.0
 MAX_STEER_RAD = 0.65
 STEER_RATE_RAD_S = 2.5
@@ -33,14 +32,6 @@ CAR_HALF_M = (2.25, 0.93)
 TOUCH_M = 0.02
 TOUCHABLE_M = 40.0
 BLOCK_M = 30.0
-
-
-@dataclass(frozen=True, slots=True)
-class Contact:
-    """The car touches something: what kind of thing, and which one."""
-
-    kind: str
-    name: str
 
 
 class Physics:
@@ -69,13 +60,8 @@ class Physics:
         self._parts: dict[str, list[Contact]] = {}
         self._surround(start.x_m, start.y_m)
         self._cars: list[Path] = []
-        for i, pose in enumerate(cars):
-            node = self._box(f"car-{i}", CAR_HALF_M, HEIGHT_M)
-            node.set_kinematic(True)
-            self._kinds[node.get_name()] = Contact("vehicle", f"car {i}")
-            self._cars.append(self._place(node))
-            self._stand(self._cars[-1], pose, HEIGHT_M)
-        self._stands = np.array([(pose.x_m, pose.y_m) for pose in cars]).reshape(-1, 2)
+        self._stands = np.zeros((0, 2))
+        self.replace_cars(cars)
         self._chassis, self._path, self._vehicle = self._make_car(start)
         self._steer_rad = 0.0
         self._settle(start)
@@ -89,6 +75,20 @@ class Physics:
         self._surround(position.x, position.y)
         self._drive(control)
         self._advance(count)
+
+    def replace_cars(self, cars: Sequence[Pose]) -> None:
+        """Put others in the place of the other cars; afterwards `move_cars` moves as many."""
+        for path in self._cars:
+            self._world.remove(path.node())
+            path.remove_node()
+        self._cars.clear()
+        for i, pose in enumerate(cars):
+            node = self._box(f"car-{i}", CAR_HALF_M, HEIGHT_M)
+            node.set_kinematic(True)
+            self._kinds[node.get_name()] = Contact("vehicle", f"car {i}")
+            self._cars.append(self._place(node))
+            self._stand(self._cars[-1], pose, HEIGHT_M)
+        self._stands = np.array([(pose.x_m, pose.y_m) for pose in cars]).reshape(-1, 2)
 
     def move_cars(self, places: Float[np.ndarray, "n 3"]) -> None:
         """Put the other cars where they are now: x, y, yaw. What is far off and stays so is not moved: nobody sees."""

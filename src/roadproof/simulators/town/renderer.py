@@ -55,16 +55,13 @@ class Renderer:
         self._land = Land(self._ground, self._streets, self._textures)
         self._stage = ground_stage()
         self._screens: dict[int, Screen] = {}
+        self._views: dict[CameraModel, Screen] = {}
         self._weather: Weather | None = None
         self._lit: LitGround
         self._lit_nodes: Path = None
         self._shown_from: tuple[int, int] | None = None
         self._districts: dict[tuple[int, int, bool], Path] = {}
-        whole = CropResize(
-            left_px=0, top_px=0, right_px=camera.width_px, bottom_px=camera.height_px,
-            width_px=camera.width_px, height_px=camera.height_px,
-        )  # fmt: skip
-        self._crops = ((crop, 2), (whole, 2))
+        self._crops = ((crop, 2), (whole(camera), 2))
         self._canvas = CanvasNode(self._root, camera, self._crops)
         self._agents = AgentNodes(self._root, roads, camera, self._textures["shade"])
         self._follow = self._root.attach_new_node("follow")
@@ -111,11 +108,21 @@ class Renderer:
         """The full camera picture, rendered at twice its resolution."""
         return self._shoot(PICTURE, state, tick)
 
+    def view(self, camera: CameraModel, state: VehicleState, tick: int = 0) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture of any camera, for worlds without a canvas."""
+        if camera not in self._views:
+            self._views[camera] = Screen(self._pipe, self._root, camera, whole(camera), 2)
+        screen = self._views[camera]
+        self._aim(screen, state, tick)
+        self._agents.see(state, everybody=True)
+        return screen.shoot()
+
     def close(self) -> None:
         """Give everything back."""
-        for screen in self._screens.values():
+        for screen in (*self._screens.values(), *self._views.values()):
             screen.close()
         self._screens.clear()
+        self._views.clear()
         self._root.remove_node()
 
     def _shoot(self, which: int, state: VehicleState, tick: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -201,3 +208,11 @@ class Renderer:
                 drop.set_texture(texture)
                 dress(drop, Layer.RAIN)
                 self._drops.append(drop)
+
+
+def whole(camera: CameraModel) -> CropResize:
+    """All of a camera's picture."""
+    return CropResize(
+        left_px=0, top_px=0, right_px=camera.width_px, bottom_px=camera.height_px,
+        width_px=camera.width_px, height_px=camera.height_px,
+    )  # fmt: skip

@@ -1,0 +1,95 @@
+"""`roadproof carla`: the town for CARLA's clients, and what is good to know about a CARLA server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from roadproof.simulators.checks import Check
+
+carla = typer.Typer(no_args_is_help=True, add_completion=False, help="CARLA: serve the town as one, examine a server.")
+
+Host = Annotated[str, typer.Option(help="Address of the server.")]
+Port = Annotated[int, typer.Option(help="Port of its calls; sensor data goes through the next.")]
+
+
+@carla.command()
+def serve(
+    port: Port = 2000,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    map_file: Annotated[
+        list[Path] | None, typer.Option("--map", help="OpenDRIVE file to offer besides town and second.")
+    ] = None,
+    first: Annotated[
+        str | None, typer.Option(help="Map at the start; else the first of --map, or town.", show_default=False)
+    ] = None,
+) -> None:
+    """Serve the embedded town to unmodified CARLA 0.9.16 clients, without a GPU."""
+    # Panda3D and msgpack are extras.
+    from roadproof.simulators.carla_server.server import serve as run
+
+    maps = map_file or []
+    chosen = first or (maps[0].stem if maps else "town")
+    typer.echo(f"Building {chosen} …")
+    run(
+        host=host,
+        port=port,
+        maps=maps,
+        first=chosen,
+        ready=lambda: typer.echo(f"Serving CARLA's protocol on {host}:{port} and {port + 1}; end with Ctrl+C"),
+    )
+
+
+@carla.command()
+def doctor(host: Host = "127.0.0.1", port: Port = 2000) -> None:
+    """Examine a CARLA server: one page of what works on it and what does not."""
+    # CARLA's client is an extra.
+    from roadproof.simulators.carla.doctor import examine
+    from roadproof.simulators.carla.simulator import CarlaSimulator
+
+    typer.echo(f"CARLA server at {host}:{port}")
+
+    def told(check: Check) -> None:
+        typer.echo(f"{'ok  ' if check.passed else 'BAD '} {check.name}: {check.detail}")
+
+    if not examine(CarlaSimulator(host, port), told).passed:
+        raise typer.Exit(1)
+
+
+@carla.command()
+def scenario(
+    start: Annotated[int, typer.Argument(help="Number of the spawn point where the drive starts.")],
+    goal: Annotated[int, typer.Argument(help="Number of the spawn point it leads to.")],
+    out: Annotated[Path, typer.Option(help="TOML file to write.")] = Path("carla.toml"),
+    canvas_at_m: Annotated[float, typer.Option(help="From the start to the middle of the canvas.")] = 25.0,
+    name: Annotated[str | None, typer.Option(help="Of the scenario; else MAP-START-GOAL.", show_default=False)] = None,
+    map_name: Annotated[
+        str | None, typer.Option("--map", help="Map of the server; else the one it has loaded.", show_default=False)
+    ] = None,
+    host: Host = "127.0.0.1",
+    port: Port = 2000,
+) -> None:
+    """Add a scenario between two spawn points of a CARLA server's map to a list."""
+    # CARLA's client is an extra.
+    from roadproof.errors import ScenarioError
+    from roadproof.scenarios import load_scenarios, save_scenarios
+    from roadproof.simulators.carla.doctor import spawn_places
+    from roadproof.simulators.carla.places import scenario_between
+    from roadproof.simulators.carla.simulator import CarlaSimulator
+
+    with CarlaSimulator(host, port) as simulator:
+        where = map_name or simulator.session.map_name()
+        roads = simulator.road_map(where)
+        places = spawn_places(simulator.session)
+    for number in (start, goal):
+        if not 0 <= number < len(places):
+            raise ScenarioError(f"{where} has no spawn point {number}, expected 0 to {len(places) - 1}")
+    made = scenario_between(
+        roads, where, places[start], places[goal], canvas_at_m=canvas_at_m, name=name or f"{where}-{start}-{goal}"
+    )
+    listed = list(load_scenarios(out)) if out.exists() else []
+    save_scenarios([*(known for known in listed if known.name != made.name), made], out)
+    typer.echo(f"{made.name}, {made.kind}, in {out}")

@@ -1,0 +1,84 @@
+"""The cameras on the car: pictures are waited for until they are those of the tick."""
+
+from __future__ import annotations
+
+import queue
+import time
+
+from roadproof.errors import SimulatorError
+from roadproof.geometry import CameraModel
+from roadproof.simulators.carla.session import Session, carla
+
+FIRST_TICKS = 100
+FIRST_WAIT_S = 0.5
+# As far as the server has them: a picture shows one moment.
+STILL = {"motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0", "lens_flare_intensity": "0.0"}
+
+
+class Camera:
+    """One camera on the car.
+
+    Args:
+        session: keeps it until the end of the drive.
+        kind: rgb, depth or semantic_segmentation.
+        model: size, field of view and place.
+        ego: what it is fixed to.
+    """
+
+    def __init__(self, session: Session, kind: str, model: CameraModel, ego: carla.Actor) -> None:
+        self._session, self._kind = session, kind
+        self._name = f"the {kind} camera of the CARLA server at {session.where}"
+        self._arrived: queue.SimpleQueue[carla.Image] = queue.SimpleQueue()
+        blueprint = session.world.get_blueprint_library().find(f"sensor.camera.{kind}")
+        size = {"image_size_x": str(model.width_px), "image_size_y": str(model.height_px), "fov": str(model.fov_deg)}
+        for name, value in (size | STILL).items():
+            if blueprint.has_attribute(name):
+                blueprint.set_attribute(name, value)
+        place = carla.Transform(
+            carla.Location(x=model.forward_m, y=-model.left_m, z=model.up_m), carla.Rotation(pitch=model.pitch_deg)
+        )
+        sensor = session.ask(f"a {kind} camera", lambda: session.world.spawn_actor(blueprint, place, attach_to=ego))
+        assert isinstance(sensor, carla.Sensor)
+        session.keep(sensor)
+        sensor.listen(self._arrived.put)
+
+    def begin(self) -> None:
+        """Tick until pictures come: those before the stream was open are lost.
+
+        Raises:
+            SimulatorError: none comes.
+        """
+        for _ in range(FIRST_TICKS):
+            frame = self._session.tick()
+            try:
+                if self._arrived.get(timeout=FIRST_WAIT_S).frame <= frame:
+                    return
+            except queue.Empty:
+                continue
+        raise SimulatorError(
+            f"{self._name} sent nothing in {FIRST_TICKS} ticks; "
+            "check that it renders (no -nullrhi) and that the port after its own is open too"
+        )
+
+    def picture(self, frame: int) -> carla.Image:
+        """The picture of a tick; older ones, which come late or twice, are dropped.
+
+        Raises:
+            SimulatorError: it does not come in time.
+        """
+        until = time.monotonic() + self._session.patience_s
+        while (left := until - time.monotonic()) > 0:
+            try:
+                image = self._arrived.get(timeout=left)
+            except queue.Empty:
+                break
+            if image.frame == frame:
+                return image
+            if image.frame > frame:
+                raise SimulatorError(
+                    f"{self._name} sent frame {image.frame} but never {frame}; check that no other client ticks it"
+                )
+        raise SimulatorError(
+            f"{self._name} sent no picture of frame {frame} "
+            f"within {self._session.patience_s:g} s; check the server's load and the network"
+        )

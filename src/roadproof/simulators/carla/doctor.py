@@ -1,0 +1,207 @@
+"""What works on a CARLA server, and what does not: one page for its owner."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadproof.datatypes import Control, Observation, VehicleState
+from roadproof.errors import RoadproofError
+from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.scenarios import Scenario
+from roadproof.simulators.carla.inject import ASPHALT_LEVEL
+from roadproof.simulators.carla.places import scenario_between, straight_stretch
+from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.carla.simulator import CarlaSimulator
+from roadproof.simulators.checks import Check, check_simulator
+
+STRETCH_M, CANVAS_AT_M = 60.0, 30.0
+STEPS = 20
+AHEAD = Control(0.0, throttle=0.6)
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What `examine` found, in order."""
+
+    where: str
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Everything works."""
+        return all(check.passed for check in self.checks)
+
+    def __str__(self) -> str:
+        lines = [f"{'ok  ' if check.passed else 'BAD '} {check.name}: {check.detail}" for check in self.checks]
+        bad = sum(not check.passed for check in self.checks)
+        verdict = "everything works" if not bad else f"{bad} of {len(self.checks)} do not work"
+        return "\n".join([f"CARLA server at {self.where}", *lines, verdict])
+
+
+def examine(simulator: CarlaSimulator, told: Callable[[Check], object] = lambda _: None) -> Findings:
+    """Drive a server, not yet connected, over a straight stretch of the map it has loaded.
+
+    Args:
+        simulator: not yet entered.
+        told: of each finding as it is made.
+
+    Returns:
+        Findings on connection, map, pictures, speed, repeatability, road, paint, traffic and clean-up. Whatever goes
+        wrong is a finding; only what cannot be done without it is left out.
+    """
+    checks: list[Check] = []
+
+    def found(name: str, look: Callable[[], str]) -> bool:
+        try:
+            check = Check(name, True, look())
+        except _Bad as bad:
+            check = Check(name, False, str(bad))
+        except RoadproofError as error:
+            check = Check(name, False, str(error))
+        checks.append(check)
+        told(check)
+        return check.passed
+
+    patient = _Patient(simulator)
+    try:
+        if found("connection", patient.connection) and found("map", patient.map):
+            for name, look in (
+                ("pictures", patient.pictures),
+                ("speed", patient.speed),
+                ("repeatability", patient.repeatability),
+                ("road", patient.road),
+                ("paint", patient.paint),
+                ("traffic", patient.traffic),
+            ):
+                found(name, look)
+    finally:
+        simulator.__exit__(None, None, None)
+    if patient.connected:
+        found("clean-up", patient.clean_up)
+    return Findings(simulator.where, tuple(checks))
+
+
+class _Bad(Exception):  # noqa: N818 - a finding, not an error
+    """Something does not work; the message says what was seen."""
+
+
+class _Patient:
+    """The server under examination; each method returns what it saw or raises `_Bad`."""
+
+    def __init__(self, simulator: CarlaSimulator) -> None:
+        self._simulator = simulator
+        self._scenario: Scenario | None = None
+        self._before: set[int] = set()
+        self.connected = False
+
+    @property
+    def scenario(self) -> Scenario:
+        assert self._scenario is not None
+        return self._scenario
+
+    def connection(self) -> str:
+        self._simulator.__enter__()
+        self.connected = True
+        session = self._simulator.session
+        session.tick()
+        self._before = {actor.id for actor in session.ask("its actors", session.world.get_actors)}
+        return f"version {session.version}, {len(self._before)} actors there already"
+
+    def map(self) -> str:
+        session = self._simulator.session
+        name = session.map_name()
+        places = spawn_places(session)
+        roads = self._simulator.road_map(name)
+        start, goal = straight_stretch(roads, places, STRETCH_M)
+        self._scenario = scenario_between(roads, name, start, goal, canvas_at_m=CANVAS_AT_M, name="doctor")
+        return f"{name}, {len(places)} spawn points; driven from ({start.x_m:.0f}, {start.y_m:.0f})"
+
+    def pictures(self) -> str:
+        report = check_simulator(
+            self._simulator, self.scenario, steps=STEPS, only=("observation", "picture", "start", "clock", "units")
+        )
+        for check in report.checks:
+            if not check.passed:
+                raise _Bad(f"{check.name}: {check.detail}")
+        return "frames fit their pictures; start, clock and units are right"
+
+    def speed(self) -> str:
+        self._simulator.reset(self.scenario)
+        begin = time.perf_counter()
+        for _ in range(STEPS):
+            self._simulator.step(AHEAD)
+        rate = STEPS / (time.perf_counter() - begin)
+        return f"{rate:.1f} steps/s at {self._simulator.camera.width_px}×{self._simulator.camera.height_px}"
+
+    def repeatability(self) -> str:
+        """The noise floor: what two drives differ by that should be the same."""
+        one, two = (self._drive() for _ in range(2))
+        levels = max(float(np.abs(a.frame.astype(int) - b.frame).mean()) for a, b in zip(one, two, strict=True))
+        metres = max(_apart(a.state, b.state) for a, b in zip(one, two, strict=True))
+        return f"two equal drives of {STEPS} steps differ by up to {metres:.3f} m and {levels:.2f} levels a frame"
+
+    def road(self) -> str:
+        """Whether the canvas lies in the road, and how bright that is."""
+        self._near(np.zeros((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), np.uint8))
+        scene = self._simulator.scene()
+        here = (
+            scene.asphalt
+            & (np.abs(scene.height_m) < 1.0)
+            & (np.arange(len(scene.asphalt)) > 0.6 * len(scene.asphalt))[:, None]
+        )
+        if here.sum() < 100:
+            raise _Bad("the semantic camera sees no road ahead; paint will not show. Is the server 0.9.14 or newer?")
+        height, level = float(np.median(scene.height_m[here])), float(scene.picture[here].mean()) / 255
+        if abs(height) > 0.1:
+            raise _Bad(f"the road is {height:+.2f} m from the plane of the canvas; paint will not show")
+        return f"{height:+.3f} m from the plane of the canvas, level {level:.2f} (full light: {ASPHALT_LEVEL})"
+
+    def paint(self) -> str:
+        only = ("homography", "paint", "transparency", "colours")
+        report = check_simulator(self._simulator, self.scenario, steps=STEPS, only=only)
+        for check in report.checks:
+            if not check.passed:
+                raise _Bad(f"{check.name}: {check.detail}")
+        return f"{self._simulator.paint}: {report.checks[1].detail}; {report.checks[3].detail}"
+
+    def traffic(self) -> str:
+        self._simulator.reset(self.scenario, cars=8, pedestrians=8, seed=1)
+        for _ in range(STEPS):
+            self._simulator.step(Control(0.0, brake=1.0))
+        moved = float(np.mean(self._simulator.cars.travelled_m))
+        return f"8 cars and 8 people spawned and moved; cars by {moved:.1f} m in {STEPS * self._simulator.dt_s:.1f} s"
+
+    def clean_up(self) -> str:
+        with self._simulator as again:
+            again.session.tick()
+            session = again.session
+            left = {actor.id for actor in session.ask("its actors", session.world.get_actors)} - self._before
+        if left:
+            raise _Bad(f"{len(left)} actors are left")
+        return "nothing is left, settings are put back"
+
+    def _drive(self) -> list[Observation]:
+        seen = [self._simulator.reset(self.scenario)]
+        return seen + [self._simulator.step(AHEAD) for _ in range(STEPS)]
+
+    def _near(self, pattern: np.ndarray) -> Observation:
+        return self._simulator.reset(self.scenario, pattern=pattern, full_pictures=True)
+
+
+def spawn_places(session: Session) -> list[VehicleState]:
+    """The server's spawn points in the town's world, in its order."""
+    points = session.ask("its map", session.world.get_map).get_spawn_points()
+    return [_place(point) for point in points]
+
+
+def _place(point: carla.Transform) -> VehicleState:
+    return VehicleState(point.location.x, -point.location.y, point.location.z, -math.radians(point.rotation.yaw), 0.0)
+
+
+def _apart(a: VehicleState, b: VehicleState) -> float:
+    return math.dist((a.x_m, a.y_m), (b.x_m, b.y_m))

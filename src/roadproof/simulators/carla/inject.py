@@ -1,0 +1,124 @@
+"""Paint put into a camera's picture, with the depth and the kinds of things that the same camera sees.
+
+A pixel shows the canvas where the scene's point is road and lies in the plane of the canvas, so whatever stands before
+the canvas hides it. The pattern is averaged over the pixel. Its light is that of the bare road around the pixel: paint
+of level p is seen as p · (road seen there) / (level of asphalt in full light).
+
+    symbol   meaning                                    shape
+    H        image_from_canvas, canvas px → camera px   (3, 3)
+    P        pixels that may show the canvas            count
+    S        places in each pixel that are looked up    count
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from roadproof.geometry import CANVAS_SIZE_PX, Homography
+from roadproof.simulators.protocol import PatternImage
+
+ASPHALT_LEVEL = 0.42
+"""Display level of asphalt in full light, as a share of white; that of the embedded town."""
+
+# A road's footprint is long along the road, which is down the picture.
+SAMPLES_ACROSS, SAMPLES_DOWN = 4, 12
+LIGHT_RADIUS_PX = 6
+PLANE_M = 0.12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What one camera sees at one moment.
+
+    Args:
+        picture: (h, w, 3) RGB.
+        height_m: of the scene's point above the plane of the canvas, (h, w).
+        road: asphalt or a line on it.
+        asphalt: asphalt alone.
+    """
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    height_m: Float[np.ndarray, "h w"]
+    road: Bool[np.ndarray, "h w"]
+    asphalt: Bool[np.ndarray, "h w"]
+
+
+def painted(scene: Scene, image_from_canvas: Homography, pattern: PatternImage) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with the pattern on the road.
+
+    Convention:
+        Pixel centres at integers; `image_from_canvas` has a positive third coordinate in front of the camera.
+    """
+    free = scene.road & (np.abs(scene.height_m) < PLANE_M)
+    rows, columns = np.nonzero(free & _may_show(image_from_canvas, scene.road.shape))
+    if not len(rows):
+        return scene.picture
+    paint = _averaged(np.linalg.inv(image_from_canvas), rows, columns, pattern)
+    # Only the neighbourhood of the paint tells its light.
+    top, left = max(int(rows.min()) - LIGHT_RADIUS_PX, 0), max(int(columns.min()) - LIGHT_RADIUS_PX, 0)
+    near = (slice(top, int(rows.max()) + LIGHT_RADIUS_PX + 1), slice(left, int(columns.max()) + LIGHT_RADIUS_PX + 1))
+    light = _light(scene.picture[near], scene.asphalt[near])[rows - top, columns - left]
+    clean = scene.picture[rows, columns].astype(np.float64)
+    seen = clean * (1.0 - paint[:, 3:]) + paint[:, :3] * light
+    result = scene.picture.copy()
+    result[rows, columns] = np.clip(seen + 0.5, 0, 255).astype(np.uint8)
+    return result
+
+
+def _may_show(image_from_canvas: Homography, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of which some part lies on the canvas, and a few beside them."""
+    rows, columns = np.mgrid[: shape[0] + 1, : shape[1] + 1] - 0.5
+    x, y, ahead = _mapped(np.linalg.inv(image_from_canvas), columns, rows)
+    low, high = -0.5, CANVAS_SIZE_PX - 0.5
+    corner = (ahead > 0) & (x > low) & (x < high) & (y > low) & (y < high)
+    touched = corner[1:] | corner[:-1]
+    return touched[:, 1:] | touched[:, :-1]
+
+
+def _mapped(
+    canvas_from_image: Homography, columns: Float[np.ndarray, "..."], rows: Float[np.ndarray, "..."]
+) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+    """Canvas x, y of picture points, and a number that is positive in front of the camera."""
+    x, y, w = (a * columns + b * rows + c for a, b, c in canvas_from_image)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return x / w, y / w, w
+
+
+def _averaged(
+    canvas_from_image: Homography, rows: np.ndarray, columns: np.ndarray, pattern: PatternImage
+) -> Float[np.ndarray, "p 4"]:
+    """Mean of the pattern over each pixel, colours in levels and multiplied with alpha; alpha in [0, 1]."""
+    across = (np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS - 0.5
+    down = (np.arange(SAMPLES_DOWN) + 0.5) / SAMPLES_DOWN - 0.5
+    dx, dy = (axis.ravel() for axis in np.meshgrid(across, down))
+    x, y, ahead = _mapped(canvas_from_image, columns[:, None] + dx, rows[:, None] + dy)
+    inside = (ahead > 0) & (np.abs(x - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2)
+    inside &= np.abs(y - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2
+    column, row = (np.where(inside, np.rint(v), 0).astype(np.intp).clip(0, CANVAS_SIZE_PX - 1) for v in (x, y))
+    levels = pattern.astype(np.float32)
+    alpha = levels[..., 3:] / 255
+    premultiplied = np.concatenate([levels[..., :3] * alpha, alpha], axis=-1)
+    return (premultiplied[row, column] * inside[..., None]).mean(axis=1, dtype=np.float64)
+
+
+def _light(picture: UInt8[np.ndarray, "h w 3"], asphalt: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+    """How bright white paint would be: the asphalt around each pixel over asphalt in full light, at most 1."""
+    weight = asphalt[..., None].astype(np.float64)
+    total = _boxed(np.concatenate([picture * weight, weight], axis=-1))
+    everywhere = total[..., :3].sum((0, 1)) / max(float(total[..., 3].sum()), 1e-9)
+    seen = np.where(total[..., 3:] > 1e-9, total[..., :3] / np.maximum(total[..., 3:], 1e-9), everywhere)
+    return np.clip(seen / (255 * ASPHALT_LEVEL), 0.0, 1.0)
+
+
+def _boxed(planes: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    """Sums over a square around each pixel."""
+    side = 2 * LIGHT_RADIUS_PX + 1
+    sums = planes
+    for axis in (0, 1):
+        pads = [(LIGHT_RADIUS_PX + 1, LIGHT_RADIUS_PX) if k == axis else (0, 0) for k in range(3)]
+        run = np.cumsum(np.pad(sums, pads), axis=axis)
+        sums = run[side:] - run[:-side] if axis == 0 else run[:, side:] - run[:, :-side]
+    return sums

@@ -1,0 +1,107 @@
+"""Scenarios on a CARLA server's map, from the numbers of its spawn points."""
+
+from __future__ import annotations
+
+import math
+
+from roadproof.datatypes import VehicleState
+from roadproof.errors import ScenarioError
+from roadproof.geometry import CanvasPlacement
+from roadproof.scenarios import Kind, Scenario
+from roadproof.simulators.town.maps import check_canvas
+from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.simulators.town.routes import Route
+
+CANVAS_LENGTH_M = 9.5
+EDGE_M = 0.2
+TURN_RAD = math.radians(35.0)
+CRUISE_MPS, SLACK_S = 4.0, 20.0
+
+
+def scenario_between(
+    roads: RoadMap,
+    map_name: str,
+    start: VehicleState,
+    goal: VehicleState,
+    *,
+    canvas_at_m: float,
+    name: str,
+) -> Scenario:
+    """A drive from one place to another with a canvas on the way, as wide as the road allows.
+
+    Args:
+        roads: the map.
+        map_name: its name on the server.
+        start: along a lane.
+        goal: on a lane.
+        canvas_at_m: from the start to the middle of the canvas.
+        name: of the scenario.
+
+    Raises:
+        ScenarioError: no way leads there, or the canvas does not fit on it.
+    """
+    route = roads.route(start, (goal.x_m, goal.y_m))
+    if not CANVAS_LENGTH_M / 2 < canvas_at_m < route.length_m - CANVAS_LENGTH_M / 2:
+        raise ScenarioError(
+            f"the canvas is asked for {canvas_at_m:.0f} m from the start, expected it on the route of "
+            f"{route.length_m:.0f} m"
+        )
+    return Scenario(
+        name=name,
+        kind=_kind(route),
+        map_name=map_name,
+        start=VehicleState(start.x_m, start.y_m, route.at(0.0)[2], start.yaw_rad, 0.0),
+        goal_m=(goal.x_m, goal.y_m),
+        canvas=_canvas(roads, route, canvas_at_m),
+        time_limit_s=float(math.ceil(route.length_m / CRUISE_MPS + SLACK_S)),
+    )
+
+
+def straight_stretch(roads: RoadMap, places: list[VehicleState], length_m: float) -> tuple[VehicleState, VehicleState]:
+    """The first of some places from which a lane leads straight on so far outside of junctions, and its end.
+
+    Raises:
+        ScenarioError: there is none.
+    """
+    for start in places:
+        here = roads.nearest_lane(start.x_m, start.y_m, start.yaw_rad)
+        lane = roads.lanes[here.lane]
+        end_m = here.arclength_m + length_m
+        if lane.junction is not None or end_m > lane.length_m or abs(here.lateral_m) > 0.5:
+            continue
+        k, n = (int(lane.stations_m.searchsorted(s)) for s in (here.arclength_m, end_m))
+        turned = lane.headings_rad[k : n + 1]
+        if float(turned.max() - turned.min()) < 0.02:
+            x, y, z = (float(value) for value in lane.centre[min(n, len(lane.centre) - 1)])
+            return start, VehicleState(x, y, z, float(turned[-1]), 0.0)
+    raise ScenarioError(f"no spawn point of the map has {length_m:.0f} m of straight road before it; load another map")
+
+
+def _kind(route: Route) -> Kind:
+    turned = float(route.headings_rad[-1] - route.headings_rad[0])
+    return "left" if turned > TURN_RAD else "right" if turned < -TURN_RAD else "straight"
+
+
+def _canvas(roads: RoadMap, route: Route, at_m: float) -> CanvasPlacement:
+    """Over both lanes of the road where they are there, else over the own one."""
+    x, y, z, heading = route.at(at_m)
+    lane = roads.lanes[roads.nearest_lane(x, y, heading).lane]
+    half = lane.width_m / 2
+    problem: ScenarioError | None = None
+    for left_m, width_m in ((half, 2 * lane.width_m - 2 * EDGE_M), (0.0, lane.width_m - 2 * EDGE_M)):
+        canvas = CanvasPlacement(
+            x_m=x - left_m * math.sin(heading),
+            y_m=y + left_m * math.cos(heading),
+            z_m=z,
+            yaw_rad=heading,
+            width_m=width_m,
+            length_m=CANVAS_LENGTH_M,
+        )
+        try:
+            check_canvas(canvas, roads)
+        except ScenarioError as error:
+            problem = error
+            continue
+        return canvas
+    assert problem is not None
+    raise problem

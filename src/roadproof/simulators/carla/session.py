@@ -1,0 +1,182 @@
+"""One connection to a CARLA server: every call has a time limit, and what is changed is put back.
+
+A call that finds no answer ends the session: the server may have stepped or not, so nothing that follows would mean
+anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from roadproof.errors import ScenarioError, SimulatorError
+from roadproof.simulators.town.roadmap import RoadMap
+
+try:
+    import carla
+except ImportError as error:  # pragma: no cover - the extra is installed where this is tested
+    raise SimulatorError("CARLA needs its client, which is not installed: pip install 'roadproof[carla]'") from error
+
+FAREWELL_S = 2.0
+
+Result = TypeVar("Result")
+
+
+class Session:
+    """A connection in synchronous mode.
+
+    Args:
+        host: of the server.
+        port: of its calls.
+        dt_s: simulated seconds a step.
+        patience_s: longest wait for a call, and for a picture.
+        loading_s: longest wait where a map is loaded or the weather changes.
+
+    Raises:
+        SimulatorError: nobody answers there, or it is a server of another version.
+    """
+
+    def __init__(self, host: str, port: int, *, dt_s: float, patience_s: float, loading_s: float) -> None:
+        self.where, self.patience_s, self._loading_s = f"{host}:{port}", patience_s, loading_s
+        self._lost = False
+        self._actors: list[carla.Actor] = []
+        self._maps: dict[str, RoadMap] = {}
+        self.client = carla.Client(host, port, worker_threads=1)
+        self.client.set_timeout(patience_s)
+        self._check_version()
+        self.world = self.ask("its world", self.client.get_world)
+        self._found = self.ask("its settings", self.world.get_settings)
+        self._dt_s = dt_s
+        try:
+            self._synchronise()
+        except SimulatorError:
+            self.close()
+            raise
+
+    def ask(self, what: str, call: Callable[[], Result]) -> Result:
+        """The answer to a call.
+
+        Raises:
+            SimulatorError: there was none in time, or the server refused.
+        """
+        if self._lost:
+            raise SimulatorError(f"the connection to the CARLA server at {self.where} is lost; open it again")
+        try:
+            return call()
+        except RuntimeError as error:
+            text = " ".join(str(error).split())
+            if "time-out" not in text:
+                raise SimulatorError(f"the CARLA server at {self.where} refused {what}: {text}") from None
+            self._lost = True
+            raise SimulatorError(
+                f"the CARLA server at {self.where} did not answer for {what} in time; check that it runs, that host "
+                "and port are right, and that no other client holds it in synchronous mode"
+            ) from None
+
+    def patiently(self, what: str, call: Callable[[], Result]) -> Result:
+        """The answer to a call that may take as long as loading a map."""
+        self.client.set_timeout(self._loading_s)
+        try:
+            return self.ask(what, call)
+        finally:
+            self.client.set_timeout(self.patience_s)
+
+    def tick(self) -> int:
+        """Take a step; its frame."""
+        return self.ask("a tick", self.world.tick)
+
+    def map_name(self) -> str:
+        """The name of the map that is loaded, without its path."""
+        return Path(self.ask("its map", self.world.get_map).name).name
+
+    def road_map(self, name: str) -> RoadMap:
+        """The map of this name, loaded if another one is; read from the server's own OpenDRIVE.
+
+        Raises:
+            ScenarioError: the server has no such map, or it cannot be read.
+        """
+        if self.map_name() != name:
+            self._load(name)
+        if name not in self._maps:
+            text = self.ask("its map", self.world.get_map).to_opendrive()
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "map.xodr"
+                path.write_text(text, encoding="utf-8")
+                self._maps[name] = RoadMap.from_opendrive(path)
+        return self._maps[name]
+
+    def keep(self, actor: carla.Actor) -> None:
+        """Destroy an actor at the end of the drive."""
+        self._actors.append(actor)
+
+    def batch(self, what: str, commands: Sequence[carla.command.Command], *, tick: bool = False) -> list[int]:
+        """Send commands; the ids of the actors.
+
+        Raises:
+            SimulatorError: one of them is refused.
+        """
+        answers = self.ask(what, lambda: self.client.apply_batch_sync(list(commands), tick))
+        for answer in answers:
+            if answer.error:
+                raise SimulatorError(f"the CARLA server at {self.where} refused {what}: {answer.error}")
+        return [answer.actor_id for answer in answers]
+
+    def clear(self) -> None:
+        """Destroy the actors of the last drive."""
+        commands = self._farewells()
+        if commands:
+            self.batch("the end of a drive", commands)
+
+    def close(self) -> None:
+        """Destroy what is left and put the settings back.
+
+        A server that does not answer is told so too, without a wait: it does as told if it ever goes on.
+        """
+        self._lost, lost = False, self._lost
+        commands = self._farewells()
+        with contextlib.suppress(SimulatorError):
+            if lost:
+                self.client.set_timeout(FAREWELL_S)
+                self.client.apply_batch(commands)
+            elif commands:
+                self.batch("the end of a drive", commands)
+        with contextlib.suppress(SimulatorError):
+            self.ask("its settings", lambda: self.world.apply_settings(self._found))
+        self._lost = True
+
+    def _farewells(self) -> list[carla.command.Command]:
+        """Commands that destroy all actors; sensors no longer listen."""
+        actors, self._actors = self._actors, []
+        for actor in actors:
+            if isinstance(actor, carla.Sensor) and actor.is_listening:
+                actor.stop()
+        return [carla.command.DestroyActor(actor.id) for actor in reversed(actors)]
+
+    def _load(self, name: str) -> None:
+        maps = [Path(path).name for path in self.ask("its maps", self.client.get_available_maps)]
+        if name not in maps:
+            raise ScenarioError(
+                f"the CARLA server at {self.where} has no map {name!r}, expected one of {', '.join(sorted(maps))}"
+            )
+        self.clear()
+        self.world = self.patiently(f"the map {name}", lambda: self.client.load_world(name, False))
+        self._synchronise()
+
+    def _synchronise(self) -> None:
+        settings = self.ask("its settings", self.world.get_settings)
+        settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt_s
+        settings.no_rendering_mode = False
+        self.ask("synchronous mode", lambda: self.world.apply_settings(settings))
+
+    def _check_version(self) -> None:
+        own = importlib.metadata.version("carla")
+        theirs = self.version = self.ask("its version", self.client.get_server_version)
+        if theirs.split("-")[0].split(".")[:3] != own.split("-")[0].split(".")[:3]:
+            raise SimulatorError(
+                f"the CARLA server at {self.where} is version {theirs}, its client here is {own}; install the "
+                f"client of the server: pip install carla=={theirs.split('-')[0]}"
+            )

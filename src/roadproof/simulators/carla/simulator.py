@@ -1,0 +1,337 @@
+"""A CARLA server behind `roadproof.simulators.protocol`.
+
+Route, commands, traffic and what counts as leaving the lane come from the town's own code, over the server's OpenDRIVE
+map, so that the same scenario means the same on both. The server gives the car's motion, collisions and pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import TracebackType
+
+import numpy as np
+
+from roadproof.datatypes import Control, Observation, VehicleState, Weather
+from roadproof.errors import SimulatorError
+from roadproof.geometry import CANVAS_SIZE_PX, CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, Homography
+from roadproof.scenarios import Scenario
+from roadproof.simulators.carla.actors import Crowd, carla_transform, spawn_driven, vehicle_state
+from roadproof.simulators.carla.cameras import Camera
+from roadproof.simulators.carla.collisions import Collisions
+from roadproof.simulators.carla.inject import Scene, painted
+from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.carla.views import image_from_world, levels
+from roadproof.simulators.carla.views import scene as seen_by
+from roadproof.simulators.carla.weather import carla_weather
+from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.town.agents import NOBODY, Agents
+from roadproof.simulators.town.judge import Judge
+from roadproof.simulators.town.maps import scenario_route
+from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.simulators.town.routes import Route
+from roadproof.simulators.town.traffic import Traffic
+
+GOAL_M = 2.0
+SETTLE_TICKS = 10
+STOP = Control(0.0, brake=1.0)
+
+
+@dataclass(slots=True, eq=False)
+class _Drive:
+    """One drive under way."""
+
+    scenario: Scenario
+    route: Route
+    judge: Judge
+    ego: carla.Vehicle
+    crowd: Crowd | None
+    cameras: dict[str, Camera]
+    collisions: Collisions
+    pattern: PatternImage | None
+    full_pictures: bool
+    state: VehicleState
+    image_from_canvas: Homography = field(default_factory=lambda: np.eye(3))
+    images: dict[str, carla.Image] = field(default_factory=dict[str, carla.Image])
+    steps: int = 0
+    arclength_m: float = 0.0
+
+
+class CarlaSimulator:
+    """A CARLA server, driven in synchronous mode.
+
+    A pattern is painted into the pictures, where the depth and semantic cameras see free road (`paint`).
+
+    Args:
+        host: of the server.
+        port: of its calls; sensor data comes through the next.
+        camera: the camera on the car.
+        input: how the controller's frame is cut from its picture.
+        dt_s: seconds per step.
+        patience_s: longest wait for a call or a picture.
+        loading_s: longest wait where a map is loaded or the weather changes.
+
+    Attributes:
+        paint: how patterns come onto the road: "inject", into the pictures.
+    """
+
+    paint = "inject"
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 2000,
+        *,
+        camera: CameraModel = CIL_CAMERA,
+        input: CropResize = CIL_INPUT,  # noqa: A002
+        dt_s: float = 0.05,
+        patience_s: float = 20.0,
+        loading_s: float = 300.0,
+    ) -> None:
+        """Nothing is connected before the simulator is entered.
+
+        Raises:
+            SimulatorError: the crop leaves the camera picture.
+        """
+        if input.right_px > camera.width_px or input.bottom_px > camera.height_px:
+            raise SimulatorError(
+                f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
+                f"{camera.width_px}×{camera.height_px} pixels"
+            )
+        self._camera, self._input, self._dt_s = camera, input, dt_s
+        self._host, self._port, self._patience_s, self._loading_s = host, port, patience_s, loading_s
+        self._session: Session | None = None
+        self._drive: _Drive | None = None
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera on the car; full pictures have its size."""
+        return self._camera
+
+    @property
+    def input(self) -> CropResize:
+        """How the controller's frame is cut from the camera picture."""
+        return self._input
+
+    @property
+    def dt_s(self) -> float:
+        """Simulated seconds per step."""
+        return self._dt_s
+
+    @property
+    def route(self) -> Route:
+        """The way of the current drive.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().route
+
+    @property
+    def cars(self) -> Agents:
+        """The other cars as they are now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        crowd = self._running().crowd
+        return NOBODY if crowd is None else crowd.traffic.cars
+
+    @property
+    def pedestrians(self) -> Agents:
+        """The people as they are now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        crowd = self._running().crowd
+        return NOBODY if crowd is None else crowd.traffic.pedestrians
+
+    @property
+    def where(self) -> str:
+        """HOST:PORT of the server."""
+        return f"{self._host}:{self._port}"
+
+    @property
+    def session(self) -> Session:
+        """The connection.
+
+        Raises:
+            SimulatorError: there is none.
+        """
+        if self._session is None:
+            raise SimulatorError("the simulator is closed; use it in a with-block")
+        return self._session
+
+    def scene(self) -> Scene:
+        """What the cameras saw last, before paint.
+
+        Raises:
+            SimulatorError: there was no reset with a pattern, so that there is but one camera.
+        """
+        drive = self._running()
+        if drive.pattern is None:
+            raise SimulatorError("depth and kinds are seen in drives with a pattern only; reset with one")
+        return seen_by(self._camera, drive.images, drive.scenario.canvas.z_m)
+
+    def road_map(self, name: str) -> RoadMap:
+        """The map a scenario names, loaded on the server.
+
+        Raises:
+            SimulatorError: the server does not answer.
+            ScenarioError: it has no such map.
+        """
+        return self.session.road_map(name)
+
+    def __enter__(self) -> CarlaSimulator:
+        self._session = Session(
+            self._host, self._port, dt_s=self._dt_s, patience_s=self._patience_s, loading_s=self._loading_s
+        )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._drive = None
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def reset(
+        self,
+        scenario: Scenario,
+        *,
+        weather: Weather = Weather.CLEAR_NOON,
+        pattern: PatternImage | None = None,
+        cars: int = 0,
+        pedestrians: int = 0,
+        seed: int = 0,
+        full_pictures: bool = False,
+    ) -> Observation:
+        """Begin a drive; see `roadproof.simulators.protocol.Simulator.reset`.
+
+        Raises:
+            SimulatorError: the simulator is not open, the server does not answer or refuses, or an argument does not
+                fit.
+            ScenarioError: the scenario does not fit the server's map.
+        """
+        session = self.session
+        weather = Weather(weather)
+        _check_pattern(pattern)
+        roads = session.road_map(scenario.map_name)
+        route = scenario_route(scenario, roads)
+        traffic = None
+        if cars != 0 or pedestrians != 0:
+            traffic = Traffic(roads, cars=cars, pedestrians=pedestrians, seed=seed, ego=scenario.start)
+        self._drive = None
+        session.clear()
+        _set_weather(session, weather)
+        ego = spawn_driven(session, scenario.start)
+        crowd = None if traffic is None else Crowd(session, traffic)
+        for _ in range(SETTLE_TICKS):
+            self._order(session, ego, STOP)
+            session.tick()
+        kinds = ("rgb",) if pattern is None else ("rgb", "depth", "semantic_segmentation")
+        collisions = Collisions(session, ego)
+        cameras = {kind: Camera(session, kind, self._camera, ego) for kind in kinds}
+        for camera in cameras.values():
+            camera.begin()
+        self._drive = _Drive(
+            scenario, route, Judge(roads), ego, crowd, cameras, collisions, pattern, full_pictures, scenario.start
+        )
+        return self._observe(self._drive, self._start(session, self._drive))
+
+    def step(self, control: Control) -> Observation:
+        """Drive on for `dt_s`; values of the control outside their range are clipped.
+
+        Raises:
+            SimulatorError: there was no reset, or the server does not answer in time.
+        """
+        session, drive = self.session, self._running()
+        if drive.crowd is not None:
+            drive.crowd.traffic.step(self._dt_s, drive.state)
+        self._order(session, drive.ego, control.clipped(), drive.crowd)
+        frame = session.tick()
+        drive.steps += 1
+        return self._observe(drive, frame)
+
+    def image_from_canvas(self) -> Homography:
+        """The exact homography of the last picture: canvas px to camera px.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().image_from_canvas
+
+    def _running(self) -> _Drive:
+        if self._drive is None:
+            raise SimulatorError("there is no drive; call reset first")
+        return self._drive
+
+    def _order(self, session: Session, ego: carla.Vehicle, control: Control, crowd: Crowd | None = None) -> None:
+        """Send the control, and the others' places, for the next tick."""
+        pedals = carla.VehicleControl(throttle=control.throttle, steer=control.steer, brake=control.brake)
+        moves = [] if crowd is None else crowd.moves()
+        session.batch("a control", [carla.command.ApplyVehicleControl(ego.id, pedals), *moves])
+
+    def _start(self, session: Session, drive: _Drive) -> int:
+        """Put the settled car where the drive starts, as fast as it starts; the frame that shows it."""
+        start, dt = drive.scenario.start, self._dt_s
+        settled = session.ask("where the car is", session.world.get_snapshot).find(drive.ego.id).get_transform()
+        forward = carla_transform(0.0, 0.0, 0.0, start.yaw_rad).get_forward_vector()
+        # One tick is taken before the first picture.
+        place = carla_transform(start.x_m, start.y_m, settled.location.z, start.yaw_rad)
+        place.location -= forward * (start.speed_mps * dt)
+        session.batch(
+            "the start",
+            [
+                carla.command.ApplyTransform(drive.ego.id, place),
+                carla.command.ApplyTargetVelocity(drive.ego.id, forward * start.speed_mps),
+            ],
+        )
+        self._order(session, drive.ego, STOP if start.speed_mps == 0.0 else Control(0.0), drive.crowd)
+        return session.tick()
+
+    def _observe(self, drive: _Drive, frame: int) -> Observation:
+        session = self.session
+        images = drive.images = {kind: camera.picture(frame) for kind, camera in drive.cameras.items()}
+        snapshot = session.world.get_snapshot()
+        if snapshot.frame != frame:
+            raise SimulatorError(
+                f"the CARLA server at {session.where} is at frame {snapshot.frame}, expected {frame}; check that no "
+                "other client ticks it"
+            )
+        state = drive.state = vehicle_state(snapshot.find(drive.ego.id))
+        drive.image_from_canvas = (
+            image_from_world(self._camera, images["rgb"]) @ drive.scenario.canvas.world_from_canvas
+        )
+        picture = levels(images["rgb"])
+        if drive.pattern is not None:
+            picture = painted(self.scene(), drive.image_from_canvas, drive.pattern)
+        time_s = drive.steps * self._dt_s
+        place = drive.route.locate(state.x_m, state.y_m, drive.arclength_m if drive.steps else None)
+        drive.arclength_m = place.arclength_m
+        people = np.column_stack([self.pedestrians.x_m, self.pedestrians.y_m])
+        arrived = place.arclength_m >= drive.route.length_m - GOAL_M
+        return Observation(
+            frame=self._input(picture),
+            state=state,
+            command=place.command,
+            time_s=time_s,
+            events=drive.judge.watch(state, time_s, drive.collisions.contacts(drive.crowd), people),
+            done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
+            picture=picture if drive.full_pictures else None,
+        )
+
+
+def _check_pattern(pattern: PatternImage | None) -> None:
+    expected = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
+    if pattern is not None and (pattern.shape != expected or pattern.dtype != np.uint8):
+        raise SimulatorError(
+            f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {expected} (RGBA)"
+        )
+
+
+def _set_weather(session: Session, weather: Weather) -> None:
+    session.patiently("the weather", lambda: session.world.set_weather(carla_weather(weather)))
+    # Setting it gives no answer; asking for it does, once it is set.
+    session.patiently("the weather", session.world.get_weather)

@@ -1,0 +1,127 @@
+"""What can be spawned: a small part of CARLA's library, under CARLA's own names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from roadproof.simulators.carla_server.wire import Value
+from roadproof.simulators.town.models import PAINTS, Body
+
+
+class Kind(IntEnum):
+    """Types of attributes on the wire."""
+
+    BOOL = 1
+    INT = 2
+    FLOAT = 3
+    TEXT = 4
+    COLOUR = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Attribute:
+    """One attribute of a blueprint: its default, what is recommended, and whether it can be set."""
+
+    name: str
+    kind: Kind
+    default: str
+    recommended: tuple[str, ...] = ()
+    settable: bool = True
+
+    @property
+    def wire(self) -> Value:
+        """As the client takes it."""
+        return [self.name, int(self.kind), self.default, list(self.recommended), self.settable, False]
+
+
+@dataclass(frozen=True, slots=True)
+class Blueprint:
+    """One kind of actor."""
+
+    name: str
+    attributes: tuple[Attribute, ...]
+
+    def wire(self, uid: int) -> Value:
+        """As the client takes it."""
+        tags = ",".join(reversed(self.name.split(".")))
+        return [uid, self.name, tags, [attribute.wire for attribute in self.attributes]]
+
+
+VEHICLES = {
+    "vehicle.ford.mustang": Body.SEDAN,
+    "vehicle.lincoln.mkz_2017": Body.SEDAN,
+    "vehicle.tesla.model3": Body.SEDAN,
+    "vehicle.audi.a2": Body.HATCHBACK,
+    "vehicle.mini.cooper_s": Body.HATCHBACK,
+    "vehicle.mercedes.sprinter": Body.VAN,
+}
+COLOURS = tuple(",".join(str(round(255 * level)) for level in paint) for paint in PAINTS)
+WALKERS = 12
+CAMERAS = {
+    "sensor.camera.rgb": "rgb",
+    "sensor.camera.depth": "depth",
+    "sensor.camera.semantic_segmentation": "semantic_segmentation",
+}
+COLLISION_SENSOR, LANE_SENSOR = "sensor.other.collision", "sensor.other.lane_invasion"
+
+
+def _role(default: str) -> Attribute:
+    return Attribute("role_name", Kind.TEXT, default)
+
+
+def _vehicle(name: str) -> Blueprint:
+    return Blueprint(
+        name,
+        (
+            _role("autopilot"),
+            Attribute("color", Kind.COLOUR, COLOURS[0], COLOURS),
+            Attribute("number_of_wheels", Kind.INT, "4", settable=False),
+            Attribute("base_type", Kind.TEXT, "car", settable=False),
+            Attribute("generation", Kind.INT, "1", settable=False),
+        ),
+    )
+
+
+def _walker(number: int) -> Blueprint:
+    return Blueprint(
+        f"walker.pedestrian.{number:04}",
+        (
+            _role("pedestrian"),
+            Attribute("is_invincible", Kind.BOOL, "false"),
+            Attribute("speed", Kind.FLOAT, "1.4", ("0.0", "1.4", "2.8")),
+        ),
+    )
+
+
+def _camera(name: str) -> Blueprint:
+    return Blueprint(
+        name,
+        (
+            _role("front"),
+            Attribute("image_size_x", Kind.INT, "800"),
+            Attribute("image_size_y", Kind.INT, "600"),
+            Attribute("fov", Kind.FLOAT, "90.0"),
+            Attribute("sensor_tick", Kind.FLOAT, "0.0"),
+        ),
+    )
+
+
+LIBRARY = (
+    *(_vehicle(name) for name in VEHICLES),
+    *(_walker(number) for number in range(1, WALKERS + 1)),
+    *(_camera(name) for name in CAMERAS),
+    Blueprint(COLLISION_SENSOR, (_role("front"),)),
+    Blueprint(LANE_SENSOR, (_role("front"),)),
+)
+
+
+def look_of(name: str, attributes: dict[str, str]) -> int:
+    """The number by which the town chooses shape and colour of a vehicle or a walker."""
+    if name in VEHICLES:
+        wanted = [int(level) for level in attributes.get("color", COLOURS[0]).split(",")]
+        away = [
+            sum((a - 255 * b) ** 2 for a, b in zip(wanted, paint, strict=True)) for paint in PAINTS
+        ]  # the nearest of the town's paints
+        return int(VEHICLES[name]) + len(Body) * away.index(min(away))
+    return int(name.rsplit(".", 1)[1]) - 1

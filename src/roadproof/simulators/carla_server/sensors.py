@@ -1,0 +1,138 @@
+"""What the sensors of a world see, as messages for their streams."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from roadproof.datatypes import VehicleState
+from roadproof.errors import SimulatorError
+from roadproof.geometry import CameraModel
+from roadproof.simulators.carla_server import wire
+from roadproof.simulators.carla_server.actors import Actor, attached
+from roadproof.simulators.carla_server.world import Collision, World
+from roadproof.simulators.town.agents import Agents
+from roadproof.simulators.town.labels import FAR_M, Label
+
+MAX_SIDE_PX = 4096
+MAX_ROLL_DEG = 0.1
+
+CARLA_LABELS = {
+    Label.SKY: 11,
+    Label.ROAD: 1,
+    Label.ROAD_LINE: 24,
+    Label.SIDEWALK: 2,
+    Label.TERRAIN: 10,
+    Label.BUILDING: 3,
+    Label.FURNITURE: 20,
+    Label.VEGETATION: 9,
+    Label.VEHICLE: 14,
+    Label.PEDESTRIAN: 12,
+}
+"""CARLA's numbers since 0.9.14."""
+
+
+def check_camera(sensor: Actor) -> None:
+    """Refuse a camera that cannot be served.
+
+    Raises:
+        SimulatorError: its size, field of view or roll is out of range.
+    """
+    width, height, fov = _optics(sensor)
+    if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX and 1.0 <= fov <= 115.0):
+        raise SimulatorError(
+            f"a camera of {width}×{height} px and {fov}° is out of range: 1 to {MAX_SIDE_PX} px and 1° to 115°"
+        )
+    if abs(sensor.pose[5]) > MAX_ROLL_DEG:
+        raise SimulatorError(f"a camera rolled by {sensor.pose[5]:.1f}° cannot be served, expected 0")
+
+
+def _optics(sensor: Actor) -> tuple[int, int, float]:
+    values = sensor.values
+    return int(values["image_size_x"]), int(values["image_size_y"]), float(values["fov"])
+
+
+def pose_in_world(world: World, sensor: Actor) -> wire.Pose6:
+    """Where a sensor is."""
+    return attached(world.actors[sensor.parent].pose, sensor.pose) if sensor.parent else sensor.pose
+
+
+def picture_message(world: World, sensor: Actor) -> bytes:
+    """What a camera sends now."""
+    assert world.town is not None
+    pose = pose_in_world(world, sensor)
+    x, y, z, pitch, yaw, _ = pose
+    width, height, fov = _optics(sensor)
+    camera = CameraModel(width_px=width, height_px=height, fov_deg=fov, up_m=0.0, pitch_deg=pitch)
+    eye = VehicleState(x, -y, z, -math.radians(yaw), 0.0)
+    cars, people = (_agents(world, kind, sensor.parent) for kind in ("vehicle", "walker"))
+    if sensor.name == "sensor.camera.rgb":
+        world.town.renderer.set_agents(cars, people)
+        rgb = world.town.renderer.view(camera, eye, world.frame)
+    else:
+        scene = world.town.labels()
+        scene.set_agents(cars, people)
+        seen = scene.look(camera, eye)
+        rgb = depth_levels(seen.depth_m) if sensor.name == "sensor.camera.depth" else label_levels(seen.labels)
+    return wire.image(wire.header(wire.IMAGE, world.frame, world.time_s, pose), _bgra(rgb), fov)
+
+
+def depth_levels(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Metres as CARLA's depth camera sends them: 24 bits from red, the lowest, to blue, with 1000 m at the top."""
+    whole = np.round(np.clip(depth_m / FAR_M, 0.0, 1.0) * (2**24 - 1)).astype(np.uint32)
+    return np.stack([whole & 255, (whole >> 8) & 255, whole >> 16], axis=-1).astype(np.uint8)
+
+
+def label_levels(labels: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Kinds of things as CARLA's semantic camera sends them: its number in red."""
+    numbers = np.array([CARLA_LABELS[label] for label in Label], np.uint8)[labels]
+    return np.stack([numbers, np.zeros_like(numbers), np.zeros_like(numbers)], axis=-1)
+
+
+def collision_message(world: World, sensor: Actor, hit: Collision, port: int) -> bytes:
+    """What a collision sensor sends of a hit; the impulse is what stops the car of 1500 kg."""
+    start = wire.header(wire.COLLISION, world.frame, world.time_s, pose_in_world(world, sensor))
+    x, y, z = hit.actor.velocity
+    return wire.collision(start, hit.actor.wire(port), hit.other.wire(port), (-1500.0 * x, 1500.0 * y, -1500.0 * z))
+
+
+def world_message(world: World, clock_s: float, *, changed: bool = False) -> bytes:
+    """The state of a world for its own stream."""
+    states = [
+        wire.actor_state(
+            actor.id,
+            pose_in_world(world, actor) if actor.parent else actor.pose,
+            (actor.velocity[0], -actor.velocity[1], actor.velocity[2]),
+            wire.vehicle_state(actor.control) if actor.kind == "vehicle" else b"",
+        )
+        for actor in world.actors.values()
+    ]
+    return wire.episode_state(
+        wire.header(wire.WORLD_OBSERVER, world.frame, world.time_s, wire.ORIGIN),
+        episode=world.episode,
+        clock_s=clock_s,
+        dt_s=world.dt_s,
+        changed=changed,
+        actors=states,
+    )
+
+
+def _agents(world: World, kind: str, without: int) -> Agents:
+    """All actors of a kind as the town draws them, but for the one who carries the camera."""
+    chosen = [actor for actor in world.actors.values() if actor.kind == kind and actor.id != without]
+    states = [actor.state for actor in chosen]
+    return Agents(
+        x_m=np.array([state.x_m for state in states], float),
+        y_m=np.array([state.y_m for state in states], float),
+        yaw_rad=np.array([state.yaw_rad for state in states], float),
+        speed_mps=np.array([state.speed_mps for state in states], float),
+        travelled_m=np.array([actor.walked_m for actor in chosen], float),
+        look=np.array([actor.look for actor in chosen], np.int64),
+    )
+
+
+def _bgra(rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 4"]:
+    opaque = np.full((*rgb.shape[:2], 1), 255, np.uint8)
+    return np.concatenate([rgb[..., ::-1], opaque], axis=-1)

@@ -1,0 +1,67 @@
+"""A `roadproof carla serve` in a process of its own, and a small map for it."""
+
+import contextlib
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+
+START_S = 300.0
+
+
+def straight_map(folder, length_m=160.0):
+    """A straight street with a pavement on both sides."""
+    width = '<width sOffset="0" a="{}" b="0" c="0" d="0"/>'
+    mark = '<roadMark sOffset="0" type="{}" weight="standard" color="{}" width="0.15" laneChange="none"/>'
+    lanes = {
+        side: f'<{side}><lane id="{sign}1" type="driving" level="false"><link/>{width.format(3.5)}'
+        f'{mark.format("solid", "standard")}</lane><lane id="{sign}2" type="sidewalk" level="false"><link/>'
+        f"{width.format(2.5)}</lane></{side}>"
+        for side, sign in (("left", ""), ("right", "-"))
+    }
+    path = folder / "street.xodr"
+    path.write_text(
+        '<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4" name="" version="1.0">'
+        "<geoReference><![CDATA[+proj=tmerc +lat_0=0 +lon_0=0]]></geoReference></header>"
+        f'<road name="street" length="{length_m}" id="1" junction="-1"><link/><planView>'
+        f'<geometry s="0" x="0" y="0" hdg="0" length="{length_m}"><line/></geometry></planView>'
+        '<elevationProfile><elevation s="0" a="0" b="0" c="0" d="0"/></elevationProfile><lanes>'
+        f'<laneSection s="0">{lanes["left"]}<center><lane id="0" type="none" level="false">'
+        f"{mark.format('broken', 'yellow')}</lane></center>{lanes['right']}</laneSection></lanes></road></OpenDRIVE>"
+    )
+    return path
+
+
+def free_port():
+    """A port that is free, and the next one too."""
+    for _ in range(50):
+        with socket.socket() as first, socket.socket() as second:
+            first.bind(("127.0.0.1", 0))
+            port = first.getsockname()[1]
+            with contextlib.suppress(OSError, OverflowError):
+                second.bind(("127.0.0.1", port + 1))
+                return port
+    raise RuntimeError("no two ports beside each other are free")
+
+
+@contextlib.contextmanager
+def serving(*arguments, program="from roadproof.cli import main; main()"):
+    """Serve; yields the process and its port, once it listens."""
+    port = free_port()
+    command = [sys.executable, "-c", program, "carla", "serve", "--port", str(port), *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment) as process:
+        try:
+            said = b""
+            until = time.monotonic() + START_S
+            while b"Serving" not in said:
+                ready, _, _ = select.select([process.stdout], [], [], max(until - time.monotonic(), 0.0))
+                chunk = os.read(process.stdout.fileno(), 4096) if ready else b""
+                if not chunk:
+                    raise RuntimeError(f"the server did not start: {said.decode()}")
+                said += chunk
+            yield process, port
+        finally:
+            process.kill()

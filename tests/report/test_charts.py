@@ -1,0 +1,66 @@
+"""Charts take their colours from the page, and are drawn where things are."""
+
+import re
+
+import numpy as np
+import pytest
+
+from roadproof.evaluation.result import path_of
+from roadproof.metrics import Mean
+from roadproof.patterns import raster
+from roadproof.report import charts
+from roadproof.report.top_view import top_view
+from roadproof.report.words import mean_in_words
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from runs import CRASH, PATTERN, driven
+
+SCENARIO = find_scenario("straight-01", builtin_scenarios())
+
+
+@pytest.fixture(scope="module")
+def drives():
+    return driven(SCENARIO), driven(SCENARIO, 1.0, events=CRASH, painted=True)
+
+
+def test_metres_are_counted_from_the_canvas_near_edge(drives):
+    clean, canvas = drives[0], SCENARIO.canvas
+    metres = charts.metres_past(clean, canvas)
+    ahead = np.array([np.cos(canvas.yaw_rad), np.sin(canvas.yaw_rad)])
+    along = (path_of(clean) - (canvas.x_m, canvas.y_m)) @ ahead + canvas.length_m / 2
+    near = np.abs(along) < 5.0
+    assert near.sum() > 20
+    # The driven positions are 0.35 m apart, so the nearest to the middle is off by half of that at most.
+    np.testing.assert_allclose(metres[near], along[near], atol=0.2)
+
+
+def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drives):
+    drawn = [
+        charts.offsets([("clear-noon", *drives)], SCENARIO.canvas),
+        charts.steering(*drives, None, SCENARIO.canvas),
+        charts.search(np.zeros((5, 2, 3)), ["clean+right", "clean+left"]),
+    ]
+    for chart in drawn:
+        assert not re.search(r"#0101", chart.svg)
+        asked = set(re.findall(r"var\(--([\w-]+)\)", chart.svg))
+        assert asked <= {*charts.VARIABLES, "sans"}
+        assert {"muted", "sans"} <= asked
+        assert "<script" not in chart.svg
+        assert not re.search(r'<svg[^>]* (width|height)="', chart.svg), "as wide as the page allows"
+
+
+def test_the_view_from_above_numbers_the_infractions(drives):
+    chart = top_view(SCENARIO, raster(PATTERN), *drives)
+    assert "2 numbered events" in chart.caption
+    words = re.findall(r"<text[^>]*>([^<]*)</text>", chart.svg)
+    assert {"1", "2", "5 m"} <= set(words)
+
+
+def test_the_same_drives_give_the_same_chart(drives):
+    one, two = (top_view(SCENARIO, raster(PATTERN), *drives) for _ in range(2))
+    assert one == two
+
+
+def test_means_are_written_with_half_their_interval():
+    assert mean_in_words(Mean(1.333, 1.1, 1.566, 10), 2) == "1.33 ± 0.23"
+    assert mean_in_words(Mean(2.0, None, None, 1), 1) == "2.0"
+    assert mean_in_words(None, 1) == "–"
