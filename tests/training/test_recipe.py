@@ -63,6 +63,7 @@ def test_a_recipe_may_start_from_weights(tmp_path):
     assert isinstance(network, CIL)
     assert network.width == 0.05
     assert not network.is_folded
+    assert isinstance(Recipe(start="pilotnet").fresh(), ConditionalPilotNet)
 
 
 @pytest.mark.parametrize("changes", [{"network": "resnet"}, {"rounds": -1}, {"painted_drives": -2}])

@@ -26,6 +26,7 @@ from typing import Any
 
 from roadproof.controllers import CIL, ConditionalPilotNet, save_controller
 from roadproof.controllers.loading import load_network
+from roadproof.controllers.shipped import shipped_weights
 from roadproof.errors import TrainingError
 from roadproof.files import read_json, write_atomically
 from roadproof.training.collection import CollectionPlan, collect
@@ -48,7 +49,7 @@ class Recipe:
         network: "cil" or "pilotnet" (the conditional one).
         width: CIL's factor on channels and units.
         seed: of ways, traffic, knocks, weights, batches.
-        start: weights file to go on from; None begins with fresh weights.
+        start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
         drives: of the expert.
         painted_drives: of the expert over random paint, besides.
         pasted: share of the pictures learnt from with coloured rectangles pasted on the road.
@@ -71,7 +72,7 @@ class Recipe:
     pasted: float = 0.0
     samples: int = 200_000
     learning_rate: float = 1.2e-3
-    rounds: int = 1
+    rounds: int = 0
     round_drives: int = 100
     round_samples: int = 100_000
 
@@ -90,7 +91,8 @@ class Recipe:
     def fresh(self) -> Learner:
         """The network before it has seen anything of this recipe."""
         if self.start is not None:
-            return load_network(Path(self.start))
+            named = not self.start.endswith(".safetensors")
+            return load_network(shipped_weights(self.start) if named else Path(self.start))
         if self.network == "cil":
             return CIL(width=self.width, seed=self.seed)
         return ConditionalPilotNet(seed=self.seed)
