@@ -135,7 +135,7 @@ MISTAKES = {
     "no iterations": (["--iterations", "0"], {}, "iterations is 0"),
     "no restarts": (["--restarts", "0"], {}, "restarts is 0"),
     "wrong frame size": ([], {"controller": "own_controller:small"}, "takes frames of 200×66"),
-    "unknown controller": ([], {"controller": "resnet"}, "unknown controller 'resnet'"),
+    "unknown controller": ([], {"controller": "resnet"}, "no controller called 'resnet'"),
     "missing weights": ([], {"controller": "none.safetensors"}, "none.safetensors"),
     "missing factory": ([], {"controller": "own_controller:nothing"}, "nothing"),
     "unknown device": (["--device", "tpu"], {}, "tpu"),

@@ -14,9 +14,7 @@ if TYPE_CHECKING:
 
 
 def demo(
-    scenario: Annotated[
-        str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")
-    ] = "straight-05",
+    scenario: Annotated[str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")] = "left-03",
     scenarios: Annotated[
         Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
     ] = None,
@@ -26,7 +24,7 @@ def demo(
             help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
             "pilotnet:FILE or module:factory."
         ),
-    ] = "cil",
+    ] = "pilotnet",
     budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
