@@ -34,7 +34,18 @@ def test_the_consistent_frames_of_three_drives_are_imported(imported):
 def test_real_recordings_and_a_real_network_are_attacked(imported, pilotnet_data, tmp_path, monkeypatch):
     weights = pilotnet_data / "pilotnet.safetensors"
     arguments = ["attack", str(imported), "--controller", f"pilotnet:{weights}", "--out", str(tmp_path)]
-    few = "--schedule published --iterations 4 --restarts 1 --figures 3 --random-patterns 0".split()
+    few = [
+        "--schedule",
+        "published",
+        "--iterations",
+        "4",
+        "--restarts",
+        "1",
+        "--figures",
+        "3",
+        "--random-patterns",
+        "0",
+    ]
     monkeypatch.setattr(sys, "argv", ["roadproof", *arguments, *few])
     try:
         main()
