@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 
@@ -94,7 +94,7 @@ def attack(
 def _candidates(search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
     """Every start's best, the strongest first."""
     restarts = search.best.shape[1]
-    order: list[int] = search.best.flatten().argsort(descending=True).tolist()
+    order = cast("list[int]", search.best.flatten().argsort(descending=True).tolist())
     return tuple(
         Candidate(
             space.pattern(search.best_unit[index // restarts, index % restarts].cpu()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,6 +40,7 @@ def demo(
     from roadproof.cli.options import choice
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
+    from roadproof.files import write_atomically
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -63,6 +65,10 @@ def demo(
                 on_progress=show,
             )
         _film(world, who, result, out)
+    given = ["--scenario", scenario, "--controller", controller, "--budget", budget, "--figures", str(figures)]
+    given += ["--seed", str(seed), "--simulator", simulator, *(["--scenarios", str(scenarios)] if scenarios else [])]
+    command = shlex.join(["roadproof", "demo", *given, "--out", str(out)])
+    write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))
     _report(result, out)
 
 

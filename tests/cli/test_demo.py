@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from roadproof.attacks import Schedule
+from roadproof.cli import main
+from roadproof.datatypes import Weather
+from roadproof.stress_test import BUDGETS, Budget
+
+TINY = Budget(frames=4, schedule=Schedule.stretched(2), restarts=1, select=1, weathers=(Weather.CLEAR_NOON,), runs=0)
+
+
+@pytest.fixture
+def demo(monkeypatch, capsys):
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["roadproof", "demo", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        return stopped.value.code or 0, capsys.readouterr()
+
+    return call
+
+
+@pytest.mark.slow
+def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch):
+    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    pytest.importorskip("av", reason="av is not installed")
+    monkeypatch.setitem(BUDGETS, "quick", TINY)
+    for _ in range(2):  # the second finds all done
+        code, printed = demo("--figures", 1, "--out", tmp_path)
+        assert code == 0, printed.err
+        assert "left-03" in printed.out
+        assert "record" in printed.out
+    page = (tmp_path / "report.html").read_text()
+    assert "pilotnet" in page
+    assert "roadproof demo --scenario left-03" in page
+    assert (tmp_path / "evaluation" / "film.mp4").stat().st_size > 10_000
+    assert (tmp_path / "evaluation" / "fidelity.npz").exists()
+
+
+def test_mistakes_are_one_clear_line(demo, tmp_path):
+    for options, message in (
+        (["--budget", "endless"], "--budget is 'endless'"),
+        (["--scenario", "left-99"], "did you mean"),
+        (["--controller", "resnet"], "no controller called 'resnet'"),
+        (["--simulator", "moon"], "moon"),
+    ):
+        code, printed = demo(*options, "--out", tmp_path)
+        assert code == 2
+        assert message in printed.err
+        assert printed.err.count("\n") == 1
