@@ -44,7 +44,7 @@ class Driven:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Selection:
-    """The candidate that was worst when driven.
+    """The candidate that deviated most when driven.
 
     Args:
         pattern: it.
@@ -111,9 +111,9 @@ def select_by_driving(
     folder: Path,
     on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
 ) -> Selection:
-    """Drive over the strongest candidates of every group, once each, and keep the worst.
+    """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
 
-    More infraction points are worse; among equals, more deviation.
+    Deviation rather than infraction points, which jump: what grazes a post at noon may touch nothing in the rain.
 
     Args:
         simulator: an open simulator.
@@ -151,7 +151,7 @@ def select_by_driving(
         )
         driven.append(Driven(group=candidate.group, rank=rank, trial=trial))
         on_drive(done, max(each.trial.deviation_m for each in driven))
-    winner = max(range(len(driven)), key=lambda index: _badness(driven[index].trial))
+    winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
     selection = Selection(
         pattern=chosen[winner][1].pattern, driven=tuple(driven), chosen=winner, simulator_calls=1 + len(driven)
     )
@@ -168,10 +168,6 @@ def first_of_each_group(candidates: Sequence[Candidate], count: int) -> list[tup
         placed.append((seen[candidate.group], rank, candidate))
     kept = sorted(placed, key=lambda each: each[:2])[:count]
     return sorted(((rank, candidate) for _, rank, candidate in kept), key=lambda each: each[0])
-
-
-def _badness(trial: Trial) -> tuple[float, float]:
-    return trial.points, trial.deviation_m
 
 
 @dataclass(frozen=True, slots=True)
