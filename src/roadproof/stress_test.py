@@ -28,7 +28,7 @@ from roadproof.drives import Drives, Swerve, Trajectories, Window, record
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Selection, evaluate, select_by_driving
 from roadproof.files import check_writable, read_json, write_atomically
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Direction, Group
+from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.patterns import Pattern
 from roadproof.recordings import Push, RecordingSet, load_recordings, save_recordings
 from roadproof.scenarios import Scenario
@@ -282,10 +282,9 @@ def _evaluate(run: _Run, pattern: Pattern) -> Evaluation:
 
 def groups_of(recordings: RecordingSet) -> tuple[Group, ...]:
     """The paper's two groups where drives were pushed to both sides, else all drives pooled."""
-    pushes = tuple(dict.fromkeys(recording.push for recording in recordings.recordings))
-    if {Push.LEFT, Push.RIGHT} <= set(pushes):
+    if {Push.LEFT, Push.RIGHT} <= {recording.push for recording in recordings.recordings}:
         return (RIGHT_GROUP, LEFT_GROUP)
-    return (Group(pushes, Direction.EITHER),)
+    return parse_groups("all", recordings)
 
 
 class _Ledger:

@@ -95,7 +95,8 @@ def blackbox_search(
             f"at_once is {at_once}, but published-bo proposes one point at a time; run several scenarios side by side"
         )
     propose = _proposer(method, space, random_calls, seed)
-    trials = _resumed(checkpoint, space, repr((space, method, random_calls, seed, at_once)))
+    identity = repr((space, method, random_calls, seed, at_once))
+    trials = _resumed(checkpoint, space, identity)
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
     while len(trials) < calls:
@@ -111,7 +112,7 @@ def blackbox_search(
         )
         if checkpoint:
             state = {"unit": trials.unit, "value": trials.value, "seconds": trials.seconds}
-            save_checkpoint(checkpoint, repr((space, method, random_calls, seed, at_once)), state)
+            save_checkpoint(checkpoint, identity, state)
         on_step(len(trials), float(trials.value.max()))
     return trials
 

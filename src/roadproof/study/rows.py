@@ -1,10 +1,10 @@
-"""What a job gives back, where it is kept, and all of it as one table.
+"""What a job gives back, where it is kept in the folder of its study, and all of it as one table.
 
-STUDY/jobs/KEY/job.json     what was done, in words; for people
-STUDY/jobs/KEY/rows.json    its rows; there when the job is finished, or has failed
-STUDY/jobs/KEY/…            the job's files: pattern.json, paths.npz
-STUDY/work/KEY/             what a job keeps while it runs, to go on from
-STUDY/rows.parquet          every row of every job
+jobs/KEY/job.json     what was done, in words; for people
+jobs/KEY/rows.json    its rows; there when the job is finished, or has failed
+jobs/KEY/…            the job's files: pattern.json, paths.npz
+work/KEY/             what a job keeps while it runs, to go on from
+rows.parquet          every row of every job
 """
 
 from __future__ import annotations
