@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from roadproof.attacks import AttackResult, Schedule, attack
-from roadproof.calibration import Method, calibrate, load_report, replays_needed
+from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window, record
@@ -30,7 +30,7 @@ from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Selection, evaluate
 from roadproof.files import check_writable, read_json, write_atomically
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.patterns import Pattern
-from roadproof.recordings import Push, RecordingSet, load_recordings, save_recordings
+from roadproof.recordings import Push, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
@@ -160,10 +160,10 @@ def stress_test(
         drives = _record(run)
         ledger.calls("record", drives.calls)
     with ledger.stage("calibrate"):
-        recordings, calls = _calibrate(run, drives)
-        ledger.calls("calibrate", calls - drives.calls)
+        calibrated = _calibrate(run, drives)
+        ledger.calls("calibrate", calibrated.report.calls - drives.calls)
     with ledger.stage("attack"):
-        found = _attack(run, recordings)
+        found = _attack(run, calibrated.recordings)
     selection = None
     if budget.select:
         with ledger.stage("select"):
@@ -213,10 +213,10 @@ def _record(run: _Run) -> Drives:
     )
 
 
-def _calibrate(run: _Run, drives: Drives) -> tuple[RecordingSet, int]:
-    done, report = run.folder / "recordings", run.folder / "calibration" / "report.json"
-    if done.exists():
-        return load_recordings(done), load_report(report).calls
+def _calibrate(run: _Run, drives: Drives) -> Calibrated:
+    done = Calibrated.load(run.folder)
+    if done is not None:
+        return done
     total = replays_needed(drives, run.budget.calibration)
     result = calibrate(
         run.simulator,
@@ -225,9 +225,8 @@ def _calibrate(run: _Run, drives: Drives) -> tuple[RecordingSet, int]:
         folder=run.folder / "calibration",
         on_call=lambda made: run.on_progress("Calibrating", made, total, ""),
     )
-    result.report.save(report)
-    save_recordings(result.recordings, done)
-    return result.recordings, result.report.calls
+    result.save(run.folder)
+    return result
 
 
 def _attack(run: _Run, recordings: RecordingSet) -> AttackResult:

@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
 from roadproof.calibration.replays import Replays
-from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
+from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, load_report, stated_errors_px
 from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import Homography, homography_from_pose
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
-from roadproof.recordings import Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
 from roadproof.simulators.protocol import Simulator
 
 WORST_PX = 3.0
@@ -44,10 +44,34 @@ METHODS = tuple(Method)
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What came of a calibration."""
+    """What came of a calibration, and its place in the folder of a run.
+
+    RUN/calibration/report.json   how good it is
+    RUN/recordings/               the recordings; there when the calibration is finished
+    """
 
     recordings: RecordingSet
     report: CalibrationReport
+
+    def save(self, run: Path) -> None:
+        """Write both, the recordings last, since they say that it is finished.
+
+        Raises:
+            OutputError: they cannot be written.
+        """
+        self.report.save(run / "calibration" / "report.json")
+        save_recordings(self.recordings, run / "recordings")
+
+    @staticmethod
+    def load(run: Path) -> Calibrated | None:
+        """Read what `save` wrote; None where the run has not been calibrated.
+
+        Raises:
+            CalibrationError, RecordingError: a file is missing or damaged.
+        """
+        if not (run / "recordings").exists():
+            return None
+        return Calibrated(load_recordings(run / "recordings"), load_report(run / "calibration" / "report.json"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

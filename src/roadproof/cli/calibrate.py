@@ -27,14 +27,13 @@ def calibrate(
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.calibration import METHODS, load_report, replays_needed
+    from roadproof.calibration import METHODS, Calibrated, replays_needed
     from roadproof.calibration import calibrate as run
     from roadproof.cli.options import choice
     from roadproof.cli.progress import progress
     from roadproof.drives import load_drives
     from roadproof.errors import CalibrationError, RecordingError
     from roadproof.files import check_writable
-    from roadproof.recordings import load_recordings, save_recordings
     from roadproof.simulators.loading import open_simulator
 
     how = choice(method, "method", METHODS)
@@ -45,15 +44,14 @@ def calibrate(
     check_writable(folder)
 
     for path, drives in recorded.items():
-        report = path / "calibration" / "report.json"
-        if (path / "recordings").exists():
-            load_recordings(path / "recordings")
-            done = load_report(report)
-            if done.method != how:
+        done = Calibrated.load(path)
+        if done is not None:
+            before = done.report.method
+            if before != how:
                 raise CalibrationError(
-                    f"{path / 'recordings'} was calibrated by {done.method}; remove it to calibrate again by {how}"
+                    f"{path / 'recordings'} was calibrated by {before}; remove it to calibrate again by {how}"
                 )
-            _summarise(done, path)
+            _summarise(done.report, path)
             continue
         with (
             open_simulator(simulator) as world,
@@ -62,8 +60,7 @@ def calibrate(
             result = run(
                 world, drives, how, folder=path / "calibration", on_call=lambda done, show=show: show(done, 0.0)
             )
-        result.report.save(report)
-        save_recordings(result.recordings, path / "recordings")
+        result.save(path)
         _summarise(result.report, path)
 
 
