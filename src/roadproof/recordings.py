@@ -11,8 +11,6 @@ Nothing is pickled, and no path in a file leaves the folder.
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 import zipfile
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
@@ -25,7 +23,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
-from roadproof.files import read_json
+from roadproof.files import read_json, write_folder_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, check_image_from_canvas
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 
@@ -159,22 +157,13 @@ def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = F
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} exists already; choose a new folder for the recordings")
-    part: Path | None = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+
+    def write(part: Path) -> None:
         for recording in recordings.recordings:
             _write_drive(recording, part / recording.name, compact=compact)
         (part / "recordings.json").write_text(json.dumps(_manifest(recordings), indent=1, ensure_ascii=False) + "\n")
-        part.chmod(0o755)
-        part.replace(folder)
-    except OSError as error:
-        raise OutputError(
-            f"cannot write {folder}: {error.strerror or error}; choose a folder that can be written"
-        ) from None
-    finally:
-        if part is not None:
-            shutil.rmtree(part, ignore_errors=True)
+
+    write_folder_atomically(folder, write)
 
 
 def _manifest(recordings: RecordingSet) -> dict[str, Any]:

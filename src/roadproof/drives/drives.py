@@ -10,8 +10,6 @@ A drive's folder is there when the drive is finished. Nothing is pickled.
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 import zipfile
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
@@ -22,8 +20,8 @@ from jaxtyping import Float, Int, UInt8
 
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives.trajectories import Plan, Scheme, SteeringNoise, Swerve, Trajectories, Window
-from roadproof.errors import OutputError, RecordingError, RoadproofError
-from roadproof.files import read_json, write_atomically
+from roadproof.errors import RecordingError, RoadproofError
+from roadproof.files import read_json, write_atomically, write_folder_atomically
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.recordings import Push
 from roadproof.rollout import Episode
@@ -151,23 +149,14 @@ def write_drive(drive: Drive, folder: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    part: Path | None = None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(dir=folder, prefix=f".{drive.name}."))
+
+    def write(part: Path) -> None:
         drive.episode.save(part / "episode.npz")
         about = {"push": str(drive.push), "calls": drive.calls, "note": drive.note}
         arrays: dict[str, Any] = {name: getattr(drive, name) for name in _PER_FRAME}
         np.savez_compressed(part / "drive.npz", about=np.array(json.dumps(about)), **arrays)
-        part.chmod(0o755)
-        part.replace(folder / drive.name)
-    except OSError as error:
-        raise OutputError(
-            f"cannot write {folder / drive.name}: {error.strerror or error}; choose a folder that can be written"
-        ) from None
-    finally:
-        if part is not None:
-            shutil.rmtree(part, ignore_errors=True)
+
+    write_folder_atomically(folder / drive.name, write)
 
 
 def read_drive(plan: Plan, folder: Path) -> Drive | None:
