@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional
 
 from roadproof.controllers import CIL, Controller
-from roadproof.controllers.cil import branch_of
+from roadproof.controllers.conditional import branch_of
 from roadproof.errors import ControllerError
 
 

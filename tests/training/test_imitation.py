@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from roadproof.controllers import CIL, ConditionalPilotNet
-from roadproof.controllers.cil import SPEED_SCALE_MPS, CILOutput
+from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.errors import TrainingError
 from roadproof.training.augmentation import Augmentation
 from roadproof.training.dataset import SHARES, Batch, Dataset
@@ -92,7 +92,7 @@ def test_training_leaves_the_global_random_state_alone():
 
 
 def test_the_loss_is_hubers_weighted():
-    answer = CILOutput(torch.tensor([[0.05, 0.0, 0.5]]), torch.tensor([0.3]))
+    answer = ConditionalOutput(torch.tensor([[0.05, 0.0, 0.5]]), torch.tensor([0.3]))
     batch = Batch(torch.zeros(1, 3, 2, 2), torch.tensor([0.1 * SPEED_SCALE_MPS]), torch.tensor([2]), torch.zeros(1, 3))
     weights = LossWeights(steer=2.0, throttle=7.0, brake=3.0, speed=5.0)
     # Below 0.1: x² / 0.2; above: x − 0.05.

@@ -5,7 +5,7 @@ from roadproof.controllers.checks import ControllerCheck as ControllerCheck
 from roadproof.controllers.checks import ControllerReport as ControllerReport
 from roadproof.controllers.checks import check_controller as check_controller
 from roadproof.controllers.cil import CIL as CIL
-from roadproof.controllers.cil import CILOutput as CILOutput
+from roadproof.controllers.conditional import ConditionalOutput as ConditionalOutput
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet as ConditionalPilotNet
 from roadproof.controllers.frames import FramePreparation as FramePreparation
 from roadproof.controllers.loading import load_controller as load_controller

@@ -19,41 +19,21 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from roadproof.controllers.frames import one_frame_batch, require_frame_size
+from roadproof.controllers.conditional import BRANCHES, ConditionalNetwork
+from roadproof.controllers.frames import require_frame_size
 from roadproof.controllers.weights import initialise_xavier, seeded
-from roadproof.datatypes import Command, Control
 from roadproof.errors import ControllerError
-
-SPEED_SCALE_MPS = 25.0
-"""Speeds go in and come out divided by this (90 km/h)."""
 
 _KERNEL_STRIDE_CHANNELS = (
     (5, 2, 32), (3, 1, 32), (3, 2, 64), (3, 1, 64), (3, 2, 128), (3, 1, 128), (3, 1, 256), (3, 1, 256),
 )  # fmt: skip
 _LAST_MAP = (2, 16)
-_BRANCHES = 4
-# Plain integers: torch.compile does not compare tensors with members of an enum.
-_FOLLOW, _LEFT, _RIGHT = int(Command.FOLLOW), int(Command.LEFT), int(Command.RIGHT)
-
-
-class CILOutput(NamedTuple):
-    """What the network answers while it learns.
-
-    Args:
-        controls: steer, gas and brake of the commanded branch; linear, so slightly outside their ranges at times.
-        speed: the speed it believes to see, divided by `SPEED_SCALE_MPS`.
-    """
-
-    controls: Float[Tensor, "b 3"]
-    speed: Float[Tensor, " b"]
 
 
 class CentredBatchNorm2d(nn.Module):
@@ -78,7 +58,7 @@ class CentredBatchNorm2d(nn.Module):
         )
 
 
-class CIL(nn.Module):
+class CIL(ConditionalNetwork):
     """The network and the agent around it; a `Controller`.
 
     Args:
@@ -123,7 +103,7 @@ class CIL(nn.Module):
             hidden = (*_dense(image, branch, dropout=0.5), *_dense(branch, branch, dropout=0.0))
             return nn.Sequential(*hidden, nn.Linear(branch, outputs))
 
-        self.branches = nn.ModuleList(head(3) for _ in range(_BRANCHES))
+        self.branches = nn.ModuleList(head(3) for _ in range(BRANCHES))
         self.speed_branch = head(1)
 
     @property
@@ -135,36 +115,6 @@ class CIL(nn.Module):
     def is_folded(self) -> bool:
         """Whether batch normalisation has been merged into the convolutions."""
         return not any(isinstance(module, CentredBatchNorm2d) for module in self.modules())
-
-    def forward(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> CILOutput:
-        """Controls and predicted speed, in the network's own dtype; what training needs.
-
-        Args:
-            frames: RGB in [0, 1], 88×200.
-            speed_mps: measured speed.
-            command: CARLA's codes.
-        """
-        image = self._image_feature(frames)
-        return CILOutput(self._controls(image, speed_mps, command), self.speed_branch(image)[:, 0])
-
-    def steer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
-        """Steering, positive to the right, linear and not clipped; see `Controller.steer`.
-
-        Raises:
-            ControllerError: frames that are not 88×200.
-        """
-        return self._controls(self._image_feature(frames), speed_mps, command)[:, 0].to(frames.dtype)
-
-    def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
-        """The published agent's control: no braking below 0.1, gas or brake but not both, no gas above 10 m/s."""
-        frames, speed, code = one_frame_batch(self, frame, speed_mps, command)
-        with torch.no_grad():
-            steer, gas, brake = map(float, self._controls(self._image_feature(frames), speed, code)[0])
-        return agent_control(steer, gas, brake, speed_mps)
 
     def folded(self) -> CIL:
         """A copy for inference with batch normalisation merged into the convolutions: same answers, fewer operations.
@@ -185,34 +135,19 @@ class CIL(nn.Module):
                 block.add_module("norm", nn.Identity())
         return copied
 
-    def _image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
+    def image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
+        """Convolutions and dense layers.
+
+        Raises:
+            ControllerError: frames that are not 88×200.
+        """
         require_frame_size(frames, self.input_size)
         maps = self.convolutions(frames.to(next(self.parameters()).dtype))
         return self.image(maps.permute(0, 2, 3, 1).flatten(1))
 
-    def _controls(
-        self, image: Float[Tensor, "b image"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
-        speed = self.speed((speed_mps / SPEED_SCALE_MPS).to(image.dtype)[:, None])
-        joined = self.join(torch.cat([image, speed], dim=1))
-        # All branches, then the commanded one: they are half a percent of the work, and nothing waits for the device.
-        every = torch.stack([branch(joined) for branch in self.branches], dim=1)
-        return every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, 3))[:, 0]
-
-
-def agent_control(steer: float, gas: float, brake: float, speed_mps: float) -> Control:
-    """What the published agent makes of its network's answer: no braking below 0.1, gas or brake but not both."""
-    brake = 0.0 if brake < 0.1 or gas > brake else brake
-    if speed_mps > 10.0 and brake == 0.0:
-        gas = 0.0
-    return Control(steer=steer, throttle=gas, brake=brake).clipped()
-
-
-def branch_of(command: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
-    """Index of the branch for CARLA's codes: follow (and 0, goal reached) 0, left 2, right 3, everything else 1."""
-    branch = torch.ones_like(command, dtype=torch.int64)
-    branch = branch.masked_fill((command == _FOLLOW) | (command == 0), 0)
-    return branch.masked_fill(command == _LEFT, 2).masked_fill(command == _RIGHT, 3)
+    def joined(self, image: Float[Tensor, "b image"], speed: Float[Tensor, "b 1"]) -> Float[Tensor, "b joined"]:
+        """The dense layer over image and speed features."""
+        return self.join(torch.cat([image, self.speed(speed)], dim=1))
 
 
 def _dense(inputs: int, outputs: int, *, dropout: float) -> tuple[nn.Module, ...]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from roadproof.controllers import CIL, ConditionalPilotNet
-from roadproof.controllers.cil import SPEED_SCALE_MPS, CILOutput
+from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.controllers.weights import seeded
 from roadproof.errors import TrainingError
 from roadproof.files import write_atomically
@@ -29,7 +29,7 @@ from roadproof.training.dataset import Batch, Dataset
 from roadproof.training.pasting import PastedPaint
 
 Learner = CIL | ConditionalPilotNet
-"""A network that can be trained: frames, speed and command in, `CILOutput` out."""
+"""A network that can be trained: frames, speed and command in, `ConditionalOutput` out."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -152,7 +152,7 @@ def imitate(
         batch = data.batch(torch.multinomial(weights, plan.batch, replacement=True, generator=draw), place)
         batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw))
         with seeded(plan.seed * 1_000_003 + step), torch.autocast(place.type, torch.bfloat16):
-            answer: CILOutput = network(batch.frames, batch.speed_mps, batch.command)
+            answer: ConditionalOutput = network(batch.frames, batch.speed_mps, batch.command)
         loss = imitation_loss(answer, batch, plan.loss)
         optimiser.zero_grad()
         loss.backward()
@@ -173,7 +173,7 @@ def imitate(
     return average
 
 
-def imitation_loss(answer: CILOutput, batch: Batch, weights: LossWeights) -> Float[Tensor, ""]:
+def imitation_loss(answer: ConditionalOutput, batch: Batch, weights: LossWeights) -> Float[Tensor, ""]:
     """Huber's loss of each answer, weighted and added up; only the commanded branch has answered."""
     each = functional.smooth_l1_loss(answer.controls.float(), batch.expert, beta=0.1, reduction="none").mean(dim=0)
     speed = functional.smooth_l1_loss(answer.speed.float(), batch.speed_mps / SPEED_SCALE_MPS, beta=0.1)

@@ -1,0 +1,106 @@
+"""What conditional imitation learning networks have in common: command heads, a speed head, and the agent around them.
+
+References:
+    Codevilla et al., "End-to-end driving via conditional imitation learning", ICRA 2018; the agent and the order of
+    the heads are those of the published code (carla-simulator/imitation-learning).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor, nn
+
+from roadproof.controllers.frames import one_frame_batch
+from roadproof.datatypes import Command, Control
+
+SPEED_SCALE_MPS = 25.0
+"""Speeds go in and come out divided by this (90 km/h)."""
+
+BRANCHES = 4
+"""Heads, in order: follow, straight, left, right."""
+
+# Plain integers: torch.compile does not compare tensors with members of an enum.
+_FOLLOW, _LEFT, _RIGHT = int(Command.FOLLOW), int(Command.LEFT), int(Command.RIGHT)
+
+
+class ConditionalOutput(NamedTuple):
+    """What a network answers while it learns.
+
+    Args:
+        controls: steer, gas and brake of the commanded head; linear, so slightly outside their ranges at times.
+        speed: the speed it believes to see, divided by `SPEED_SCALE_MPS`.
+    """
+
+    controls: Float[Tensor, "b 3"]
+    speed: Float[Tensor, " b"]
+
+
+class ConditionalNetwork(nn.Module):
+    """A `Controller` whose head is picked by the command.
+
+    A network says what it makes of frames (`image_feature`) and of speed beside it (`joined`), and brings
+    `branches`, one for each command, and `speed_branch`.
+    """
+
+    branches: nn.ModuleList
+    speed_branch: nn.Module
+
+    def image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
+        """What is seen, in the network's own dtype."""
+        raise NotImplementedError
+
+    def joined(self, image: Float[Tensor, "b image"], speed: Float[Tensor, "b 1"]) -> Float[Tensor, "b joined"]:
+        """What the heads are given, of the image feature and the scaled speed."""
+        raise NotImplementedError
+
+    def forward(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> ConditionalOutput:
+        """Controls and predicted speed, in the network's own dtype; what training needs.
+
+        Args:
+            frames: RGB in [0, 1].
+            speed_mps: measured speed.
+            command: CARLA's codes.
+        """
+        image = self.image_feature(frames)
+        return ConditionalOutput(self._controls(image, speed_mps, command), self.speed_branch(image)[:, 0])
+
+    def steer(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, " b"]:
+        """Steering, positive to the right, linear and not clipped; see `Controller.steer`.
+
+        Raises:
+            ControllerError: frames of the wrong size.
+        """
+        return self._controls(self.image_feature(frames), speed_mps, command)[:, 0].to(frames.dtype)
+
+    def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
+        """The published agent's control: no braking below 0.1, gas or brake but not both, no gas above 10 m/s."""
+        frames, speed, code = one_frame_batch(self, frame, speed_mps, command)
+        with torch.no_grad():
+            steer, gas, brake = map(float, self._controls(self.image_feature(frames), speed, code)[0])
+        brake = 0.0 if brake < 0.1 or gas > brake else brake
+        if speed_mps > 10.0 and brake == 0.0:
+            gas = 0.0
+        return Control(steer=steer, throttle=gas, brake=brake).clipped()
+
+    def _controls(
+        self, image: Float[Tensor, "b image"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, "b 3"]:
+        joined = self.joined(image, (speed_mps / SPEED_SCALE_MPS).to(image.dtype)[:, None])
+        # All heads, then the commanded one: they are half a percent of the work, and nothing waits for the device.
+        every = torch.stack([branch(joined) for branch in self.branches], dim=1)
+        return every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, 3))[:, 0]
+
+
+def branch_of(command: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
+    """Index of the head for CARLA's codes: follow (and 0, goal reached) 0, left 2, right 3, everything else 1."""
+    branch = torch.ones_like(command, dtype=torch.int64)
+    branch = branch.masked_fill((command == _FOLLOW) | (command == 0), 0)
+    return branch.masked_fill(command == _LEFT, 2).masked_fill(command == _RIGHT, 3)
