@@ -5,15 +5,12 @@ write_report(Path("out/run"))   # out/run/report.html, out/run/result.json
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
 import roadproof
@@ -22,16 +19,16 @@ from roadproof.files import write_atomically
 from roadproof.metrics import counted
 from roadproof.patterns import Pattern, raster
 from roadproof.report import charts
+from roadproof.report.asphalt import on_asphalt
 from roadproof.report.commands import commands_of
+from roadproof.report.html import data_url, encoded, environment
 from roadproof.report.run import Judged, Run, read_run
 from roadproof.report.top_view import top_view
 from roadproof.report.verdict import verdict
 from roadproof.report.words import MISSING, mean_in_words
-from roadproof.simulators.protocol import PatternImage
 
 FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
-ASPHALT = (92, 94, 98)
 SHOWN_COMPOSITES = 3
 
 Fields = dict[str, Any]
@@ -60,26 +57,23 @@ def write_report(folder: Path) -> Path:
 
 def render(run: Run) -> str:
     """The page of a run. Everything shown is escaped."""
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).with_name("templates")),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("page.html.jinja").render(
-        version=roadproof.__version__,
-        name=_name(run),
-        verdict=verdict(run),
-        figures=_key_figures(run),
-        judged=_judged(run.judged),
-        pattern=_pattern(run),
-        attack=_attack(run),
-        fidelity=_fidelity(run.judged),
-        recorded=_recorded(run),
-        calibration=_calibration(run),
-        costs=_costs(run),
-        commands=commands_of(run),
+    return (
+        environment()
+        .get_template("page.html.jinja")
+        .render(
+            version=roadproof.__version__,
+            name=_name(run),
+            verdict=verdict(run),
+            figures=_key_figures(run),
+            judged=_judged(run.judged),
+            pattern=_pattern(run),
+            attack=_attack(run),
+            fidelity=_fidelity(run.judged),
+            recorded=_recorded(run),
+            calibration=_calibration(run),
+            costs=_costs(run),
+            commands=commands_of(run),
+        )
     )
 
 
@@ -157,8 +151,8 @@ def _judged(judged: Judged | None) -> Fields | None:
         "controller": evaluation.controller,
         "weather": _words(shown.weather),
         "traffic": f"{evaluation.cars} cars and {evaluation.pedestrians} people",
-        "film": _data_url("video/mp4", judged.film),
-        "poster": _data_url("image/jpeg", judged.poster),
+        "film": data_url("video/mp4", judged.film),
+        "poster": data_url("image/jpeg", judged.poster),
         "events": charts.told(counted(judged.painted.events)),
         "clean_events": charts.told(counted(judged.clean.events)),
         "lateral": f"{abs(shown.lateral_m):.2f} m to the {'left' if shown.lateral_m > 0 else 'right'}",
@@ -210,7 +204,7 @@ def _pattern(run: Run) -> Fields | None:
         return None
     size = (canvas.width_m, canvas.length_m) if canvas is not None else None
     return {
-        "picture": _on_asphalt(paint, size),
+        "picture": encoded(on_asphalt(paint, 480, size or (1.0, 1.0)), "PNG"),
         "size": f"{size[0]:.1f} × {size[1]:.1f} m" if size else "400 × 400 canvas pixels",
         "share": f"{(paint[..., 3] / 255).mean():.0%}",
         "figures": [] if pattern is None else _figures(pattern, size),
@@ -367,24 +361,5 @@ def _words(weather: str) -> str:
     return weather.replace("-", " ")
 
 
-def _on_asphalt(paint: PatternImage, size: tuple[float, float] | None) -> str:
-    """The canvas as it would lie on the road, in its true proportions."""
-    road = Image.new("RGB", (paint.shape[1], paint.shape[0]), ASPHALT)
-    road.paste(Image.fromarray(paint[..., :3]), (0, 0), Image.fromarray(paint[..., 3]))
-    width, length = size or (1.0, 1.0)
-    shown = road.resize((480, max(round(480 * length / width), 1)), Image.Resampling.LANCZOS)
-    return _encoded(shown, "PNG")
-
-
 def _picture(pixels: np.ndarray, *, lossless: bool = False) -> str:
-    return _encoded(Image.fromarray(pixels), "PNG" if lossless else "JPEG")
-
-
-def _encoded(image: Image.Image, kind: str) -> str:
-    out = io.BytesIO()
-    image.save(out, format=kind, quality=84, optimize=True)
-    return _data_url(f"image/{kind.lower()}", out.getvalue()) or ""
-
-
-def _data_url(kind: str, content: bytes | None) -> str | None:
-    return None if content is None else f"data:{kind};base64,{base64.b64encode(content).decode()}"
+    return encoded(Image.fromarray(pixels), "PNG" if lossless else "JPEG")

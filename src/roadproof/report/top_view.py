@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -28,10 +29,21 @@ from roadproof.simulators.town.roadmap import RoadMap
 
 MARGIN_M = 6.0
 BEFORE_M, AFTER_S = 10.0, 3.0
-GROUND = {"sidewalk": VARIABLES["kerb"], "shoulder": VARIABLES["asphalt"], "driving": VARIABLES["asphalt"]}
 SCALE_M = 5.0
 
 Plan = Float[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """The colours of a road."""
+
+    sidewalk: str
+    asphalt: str
+    marking: str
+
+
+GROUND = Ground(VARIABLES["kerb"], VARIABLES["asphalt"], VARIABLES["marking"])
 
 
 def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: Episode) -> Chart:
@@ -43,7 +55,7 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
         clean: the drive without paint.
         painted: the drive with it.
     """
-    around = _around(scenario.canvas)
+    around = around_canvas(scenario.canvas)
     bare, driven = around(path_of(clean)), around(path_of(painted))
     seen = passage(path_of(clean), scenario.canvas, horizon_m=BEFORE_M)
     shown = slice(seen.start, seen.stop + round(AFTER_S / clean.dt_s))
@@ -60,7 +72,7 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
     axes.add_patch(Rectangle((left, low), right - left, high - low, color=VARIABLES["grass"]))
     road = _road(scenario)
     if road is not None:
-        _draw_road(axes, road, around, (left, low, right, high))
+        draw_road(axes, road, around, (left, low, right, high), GROUND)
     _draw_canvas(axes, scenario.canvas, paint)
     axes.plot(*bare.T, color=CLEAN, linewidth=2.2, solid_capstyle="round")
     axes.plot(*driven.T, color=PAINTED, linewidth=2.2, solid_capstyle="round")
@@ -75,7 +87,7 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
     return Chart(svg_of(figure, "above", words), words + ". Up is the direction of travel at the canvas.")
 
 
-def _around(canvas: CanvasPlacement) -> Callable[[Plan], Plan]:
+def around_canvas(canvas: CanvasPlacement) -> Callable[[Plan], Plan]:
     """From world x, y to metres right of and ahead of the canvas' middle."""
     c, s = math.cos(canvas.yaw_rad), math.sin(canvas.yaw_rad)
 
@@ -94,10 +106,20 @@ def _road(scenario: Scenario) -> RoadMap | None:
         return None
 
 
-def _draw_road(
-    axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: tuple[float, float, float, float]
+def draw_road(
+    axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: tuple[float, float, float, float], ground: Ground
 ) -> None:
+    """Draw what of a map lies in a box.
+
+    Args:
+        axes: to draw on.
+        road: the map.
+        around: from world x, y to the axes' plane.
+        box: left, low, right, high in that plane.
+        ground: its colours.
+    """
     left, low, right, high = box
+    colours = {"sidewalk": ground.sidewalk, "shoulder": ground.asphalt, "driving": ground.asphalt}
 
     def inside(plan: Plan) -> bool:
         outside = (plan.max(0) < (left, low)) | (plan.min(0) > (right, high))
@@ -108,13 +130,13 @@ def _draw_road(
         if kind == "driving":
             outlines += [area.outline[:, :2] for area in road.junctions]
         shapes = [plan for plan in map(around, outlines) if inside(plan)]
-        axes.add_collection(PolyCollection(shapes, facecolors=GROUND[kind], edgecolors=GROUND[kind], linewidths=0.4))
+        axes.add_collection(PolyCollection(shapes, facecolors=colours[kind], edgecolors=colours[kind], linewidths=0.4))
     lines = [(around(line.points[:, :2]), line.mark.kind) for line in road.mark_lines if line.junction is None]
     kept = [(plan, "--" if kind == "broken" else "-") for plan, kind in lines if inside(plan)]
     axes.add_collection(
         LineCollection(
             [plan for plan, _ in kept],
-            colors=VARIABLES["marking"],
+            colors=ground.marking,
             linewidths=0.8,
             linestyles=[style for _, style in kept],
         )
