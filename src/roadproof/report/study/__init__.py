@@ -1,0 +1,1 @@
+"""What a study found, shown: the paper's tables with intervals, figures, one page of both."""

@@ -1,0 +1,209 @@
+"""A small table: headings over several columns, numbers with intervals, a note. And as Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from roadproof.errors import StudyError
+from roadproof.metrics import Mean
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A mean that is shown with its interval.
+
+    Args:
+        mean: the number.
+        digits: after the point.
+        best: whether it is the best of its row.
+        unit: stands behind the number; "%" for shares, which are in [0, 1].
+    """
+
+    mean: Mean
+    digits: int = 2
+    best: bool = False
+    unit: str = ""
+
+    @property
+    def value(self) -> str:
+        """The mean in words."""
+        return self._shown(self.mean.value) + self.unit
+
+    @property
+    def interval(self) -> tuple[str, str] | None:
+        """Both ends in words."""
+        if self.mean.low is None or self.mean.high is None:
+            return None
+        return self._shown(self.mean.low), self._shown(self.mean.high)
+
+    def _shown(self, number: float) -> str:
+        shown = f"{number * 100 if self.unit == '%' else number:.{self.digits}f}"
+        # −0.00 would look like a finding.
+        return shown.replace("-", "−") if float(shown) else shown.removeprefix("-")
+
+
+Cell: TypeAlias = str | Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """A heading over one or several columns."""
+
+    text: str
+    span: int = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Table:
+    """A table as people read it.
+
+    Args:
+        name: of its file, and of its label in LaTeX.
+        title: what it shows.
+        note: how to read it, and what is not in it.
+        header: rows of headings, each as wide as the table.
+        rows: cells; an empty text continues the cell above.
+        left: how many columns from the left hold names.
+
+    Raises:
+        StudyError: a row is not as wide as the others.
+    """
+
+    name: str
+    title: str
+    note: str
+    header: tuple[tuple[Heading, ...], ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    left: int = 1
+
+    def __post_init__(self) -> None:
+        for width in (*(sum(each.span for each in row) for row in self.header), *map(len, self.rows)):
+            if width != self.columns:
+                raise StudyError(f"table {self.name}: a row has {width} columns, the last heading {self.columns}")
+
+    @property
+    def columns(self) -> int:
+        """How many."""
+        return sum(each.span for each in self.header[-1])
+
+    @property
+    def flat_header(self) -> tuple[str, ...]:
+        """One heading a column, those above it first."""
+        stacks: list[list[str]] = [[] for _ in range(self.columns)]
+        for row in self.header:
+            at = 0
+            for heading in row:
+                for stack in stacks[at : at + heading.span]:
+                    stack += [heading.text] if heading.text else []
+                at += heading.span
+        return tuple(": ".join(stack) for stack in stacks)
+
+
+def slug(text: str) -> str:
+    """A text as part of a file name."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "method"
+
+
+def in_markdown(table: Table) -> str:
+    """The table with its title and note; the best of a row in bold, names escaped."""
+    marks = ["---"] * table.left + ["---:"] * (table.columns - table.left)
+    lines = [
+        _markdown_row([markdown_text(text) for text in table.flat_header]),
+        _markdown_row(marks),
+        *(_markdown_row([_markdown_cell(cell) for cell in row]) for row in table.rows),
+    ]
+    return f"### {markdown_text(table.title)}\n\n" + "\n".join(lines) + f"\n\n{markdown_text(table.note)}\n"
+
+
+def markdown_text(text: str) -> str:
+    """Text that Markdown and the HTML in it leave as it is."""
+    return re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", " ".join(text.split())).replace("&", "&amp;").replace("<", "&lt;")
+
+
+def in_latex(table: Table) -> str:
+    """The table for a paper, with booktabs; interval ends stand as sub- and superscript, the best of a row in bold."""
+    lines = [
+        "% needs \\usepackage{booktabs}",
+        "\\begin{table*}",
+        "\\centering",
+        f"\\begin{{tabular}}{{{'l' * table.left + 'c' * (table.columns - table.left)}}}",
+        "\\toprule",
+    ]
+    for depth, row in enumerate(table.header):
+        lines.append(" & ".join(_latex_heading(heading) for heading in row) + r" \\")
+        if depth < len(table.header) - 1:
+            lines += _rules(row)
+    lines += ["\\midrule", *(" & ".join(map(_latex_cell, row)) + r" \\" for row in table.rows), "\\bottomrule"]
+    caption = f"{latex_text(table.title)}. {latex_text(table.note)}"
+    return "\n".join(
+        [*lines, "\\end{tabular}", f"\\caption{{{caption}}}", f"\\label{{T:{table.name}}}", "\\end{table*}", ""]
+    )
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "&": r"\&",
+    "#": r"\#",
+    "_": r"\_",
+    "%": r"\%",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    "≥": r"$\geq$",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "−": "$-$",
+    "–": "--",
+    "’": "'",
+    "…": r"\ldots{}",
+}
+
+
+def latex_text(text: str) -> str:
+    """Text that LaTeX prints as it is."""
+    return "".join(_LATEX.get(letter, letter) for letter in " ".join(text.split()))
+
+
+def _markdown_row(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _markdown_cell(cell: Cell) -> str:
+    if isinstance(cell, str):
+        return markdown_text(cell)
+    value = f"**{cell.value}**" if cell.best else cell.value
+    return value if cell.interval is None else f"{value} ({cell.interval[0]} to {cell.interval[1]})"
+
+
+def _latex_heading(heading: Heading) -> str:
+    text = latex_text(heading.text)
+    return text if heading.span == 1 else f"\\multicolumn{{{heading.span}}}{{c}}{{\\textbf{{{text}}}}}"
+
+
+def _latex_cell(cell: Cell) -> str:
+    if isinstance(cell, str):
+        return latex_text(cell)
+    value = latex_text(cell.value).replace("$-$", "-")
+    number = f"\\mathbf{{{value}}}" if cell.best else value
+    if cell.interval is None:
+        return f"${number}$"
+    low, high = (end.replace("−", "-") for end in cell.interval)
+    return f"${number}_{{{low}}}^{{{high}}}$"
+
+
+def _rules(row: tuple[Heading, ...]) -> list[str]:
+    """A thin line under every heading that spans columns."""
+    rules: list[str] = []
+    at = 1
+    for heading in row:
+        if heading.span > 1:
+            rules.append(f"\\cmidrule(lr){{{at}-{at + heading.span - 1}}}")
+        at += heading.span
+    return ["".join(rules)] if rules else []

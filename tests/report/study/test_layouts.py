@@ -1,0 +1,159 @@
+import dataclasses
+
+from hand_made_study import BO, GRADOPT, bad, row
+from roadproof.report.study.blocks import DEVIATION, reference
+from roadproof.report.study.layouts import ablation_table, methods_table, paper_tables
+from roadproof.report.study.results import Method, results_of
+
+
+def text(cell):
+    return cell if isinstance(cell, str) else cell.value
+
+
+def tables_of(records, methods=(GRADOPT, BO)):
+    return {table.name: table for table in paper_tables(results_of(records, methods))}
+
+
+def rows_of(table):
+    return [tuple(map(text, row)) for row in table.rows]
+
+
+def test_the_overall_table_has_the_papers_layout(records):
+    table = tables_of(records)["overall-bo"]
+    assert [(heading.text, heading.span) for heading in table.header[0]] == [
+        ("", 1), ("Deviation", 3), ("Infraction penalty", 3),
+    ]  # fmt: skip
+    assert [heading.text for heading in table.header[1]] == ["K", *("BO", "GradOpt", "% ≥") * 2]
+    # Deviations 1, 2, 1.5, 3 against 0.5, 2, 2.5, 1; penalties in traffic twice that and 1.5 more.
+    assert rows_of(table) == [
+        ("1", "1.50", "1.88", "75%", "4.50", "5.25", "75%"),
+        ("5", "2.50", "2.88", "75%", "4.50", "5.25", "75%"),
+    ]
+    assert [cell.best for cell in table.rows[0][1:3]] == [False, True]
+    assert "in traffic" in table.note
+    assert "4 scenarios × 1 seed" in table.note
+    assert "bare road: 0.50" in table.note
+    assert "too narrow for as few as 4" in table.note
+
+
+def test_types_weathers_and_static_only_have_tables_of_their_own(records):
+    tables = tables_of(records)
+    assert list(tables) == [
+        "methods", "overall-bo", "paired-bo", "type-penalty-bo", "type-static-bo", "type-deviation-bo", "weathers-bo",
+        "rainy-noon-alone-bo",
+    ]  # fmt: skip
+    assert rows_of(tables["type-deviation-bo"])[0] == (
+        "1", "0.50", "1.00", "100%", "2.25", "1.75", "50%", "1.00", "3.00", "100%",
+    )  # fmt: skip
+    assert rows_of(tables["type-static-bo"])[0][4:7] == ("4.50", "3.50", "50%")
+    assert rows_of(tables["weathers-bo"])[0] == ("1", "4.50", "5.25", "75%")
+    assert rows_of(tables["rainy-noon-alone-bo"])[0] == ("1", "1.25", "1.62", "75%", "3.00", "3.75", "75%")
+
+
+def test_differences_come_with_ties_test_and_all_k_together(records):
+    rows = rows_of(tables_of(records)["paired-bo"])
+    assert [row[:2] for row in rows[:4]] == [
+        ("Deviation", "1"), ("", "5"), ("", "all"), ("Infraction penalty", "1"),
+    ]  # fmt: skip
+    assert rows[0][2:5] == ("0.38", "75%", "1")
+    assert rows[2][6:] == ("8", "4")
+    # 0.5, −1 and 2: the ranks against are 2 of 6, and 6 of the 8 signs are at least as extreme.
+    assert rows[0][5] == "0.750"
+
+
+def test_cost_stands_beside_what_was_found(records):
+    table = tables_of(records)["methods"]
+    assert rows_of(table)[0] == ("1", "GradOpt", "4", "61", "30", "1.88", "5.25")
+    assert rows_of(table)[1] == ("", "BO", "4", "1000", "30", "1.50", "4.50")
+
+
+def test_the_ablation_compares_variants_over_what_all_have():
+    variants = [
+        Method(name=name, search="gradopt", scheme=scheme, trajectories=t)
+        for name, scheme, t in (("R", "random", 3), ("G3", "group", 3), ("A", "group-all", 3), ("G1", "group", 1))
+    ]
+    rows = [
+        row(f"left-0{k}", method=method.name, deviation_m=float(k + len(method.scheme)))
+        for method in variants
+        for k in (1, 2)
+    ]
+    rows[0] = bad(scenario="left-01", method="R")
+    table = ablation_table(results_of(rows, variants), variants, DEVIATION)
+    assert [(heading.text, heading.span) for heading in table.header[0]] == [
+        ("", 1), ("Group", 2), ("Group-All", 1), ("Random", 1),
+    ]  # fmt: skip
+    assert [heading.text for heading in table.header[1]] == ["K", "T=1", "T=3", "T=3", "T=3"]
+    assert rows_of(table) == [("1", "7.00", "7.00", "11.00", "8.00")]
+    assert "1 job: left-01, K = 1, R, seed 0 (no luck)" in table.note
+    assert reference(variants).name == "G3"
+
+
+def test_variants_that_differ_otherwise_go_by_their_names():
+    variants = [dataclasses.replace(GRADOPT, name=name) for name in ("short", "long")]
+    rows = [row(method=method.name) for method in variants]
+    table = ablation_table(results_of(rows, variants), variants, DEVIATION)
+    assert [heading.text for heading in table.header[1]] == ["K", "short", "long"]
+
+
+def test_what_failed_is_noted_and_left_out_on_both_sides(records):
+    broken = [each for each in records if (each["scenario"], each["method"]) != ("right-01", "BO")]
+    broken += [bad("out of memory", scenario="right-01", method="BO", figures=k) for k in ("1", "5")]
+    tables = tables_of(broken)
+    # Without right-01 on either side: 1, 2, 1.5 against 0.5, 2, 2.5.
+    assert rows_of(tables["overall-bo"])[0][1:4] == ("1.67", "1.50", "67%")
+    for name, table in tables.items():
+        if name != "missing":
+            assert "2 jobs: right-01, K = 1, BO, seed 0 (out of memory)" in table.note, name
+    assert rows_of(tables["missing"])[0] == ("right-01", "1", "BO", "0", "out of memory")
+    assert tables["missing"].note.startswith("2 of 16 jobs")
+    right = tables["type-deviation-bo"].rows[0][7:]
+    assert right == ("–", "–", "–")
+
+
+def test_one_method_one_k_one_weather_give_what_makes_sense():
+    alone = tables_of([row("left-01"), row("left-02")])
+    assert list(alone) == ["methods"]
+    both = tables_of([row("left-01"), row("left-01", method="BO")])
+    assert list(both) == ["methods", "overall-bo", "paired-bo"]
+    assert [each[:2] for each in rows_of(both["paired-bo"])] == [("Deviation", "1"), ("Infraction penalty", "1")]
+    assert "one scenario has no interval" in both["overall-bo"].note
+    assert "alone on the road" in both["overall-bo"].note
+    assert "in traffic" not in both["overall-bo"].note
+    # Equal on both sides: neither is best.
+    assert not any(cell.best for cell in both["overall-bo"].rows[0] if not isinstance(cell, str))
+
+
+def test_without_gradopt_the_first_method_is_compared():
+    names = ("random", "TPE")
+    methods = [Method(name=name, search=name.lower()) for name in names]
+    tables = tables_of([row(method=name, search_calls=5) for name in names], methods)
+    assert "overall-tpe" in tables
+    assert tables["overall-tpe"].title.startswith("random and TPE")
+
+
+def test_methods_whose_names_look_alike_keep_their_files_apart():
+    names = ("GradOpt", "a b", "a-b")
+    tables = tables_of([row(method=name) for name in names])
+    assert {"overall-a-b", "overall-a-b-2"} <= set(tables)
+
+
+def test_an_unknown_search_is_compared_too():
+    assert methods_table(results_of([row(method="own")])).rows[0][1] == "own"
+
+
+def test_other_weathers_may_have_been_driven_alone(records):
+    kept = [each for each in records if each["weather"] == "clear-noon" or not each["traffic"]]
+    table = tables_of(kept)["weathers-bo"]
+    assert table.header[0][1].text == "Rainy noon (alone)"
+    assert rows_of(table)[0] == ("1", "3.00", "3.75", "75%")
+    assert "Missing" not in table.note
+
+
+def test_seeds_are_pairs_of_their_own():
+    rows = [
+        row("left-01", method=name, seed=seed, deviation_m=float(seed if name == "BO" else 0.5))
+        for name in ("GradOpt", "BO")
+        for seed in range(2)
+    ]
+    table = tables_of(rows)["overall-bo"]
+    assert rows_of(table)[0][3] == "50%"
