@@ -1,0 +1,130 @@
+"""The tables and figures of a study as files: one self-contained page, Markdown, LaTeX, PNG.
+
+OUT/tables.html     everything, pictures included
+OUT/tables.md       the same for a repository; its pictures lie in figures/
+OUT/NAME.tex        each table, with booktabs
+OUT/figures/*.png
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import roadproof
+from roadproof.files import write_atomically
+from roadproof.report.html import data_url, environment
+from roadproof.report.plots import save
+from roadproof.report.study.blocks import DEVIATION, PENALTY
+from roadproof.report.study.charts import Picture, by_figures, progress
+from roadproof.report.study.folder import Found, read_found
+from roadproof.report.study.layouts import paper_tables
+from roadproof.report.study.pictures import gallery, trajectories
+from roadproof.report.study.results import BLACK, Method, Record, Results, results_of, words
+from roadproof.report.study.table import Table, in_latex, in_markdown, markdown_text
+from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
+
+
+def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Sequence[Record] = ()) -> Path:
+    """Make every table and figure of a study.
+
+    Args:
+        records: its rows.
+        folder: of the study, for what its jobs left there.
+        out: where the files go; older ones of the same names are replaced.
+        transfer: rows of the same patterns driven by other controllers, see `transfer.transfer_of`.
+
+    Returns:
+        The page.
+
+    Raises:
+        StudyError: there is nothing to show, or a file of a job is damaged.
+        OutputError: a file cannot be written.
+    """
+    rows = list(records)
+    found = read_found(folder, rows)
+    methods = {job.method.name: job.method for job in found.values()}
+    results = results_of(rows, methods.values())
+    drawn = (by_figures(results), progress(results, tuple(found.values())), trajectories(results, found))
+    matrices = [transfer_of(transfer, metric) for metric in (DEVIATION, PENALTY)] if transfer else []
+    shown = (*drawn, gallery(results, found), *map(transfer_map, matrices))
+    pictures = [picture for picture in shown if picture is not None]
+    for picture in pictures:
+        save(picture.figure, out / "figures" / f"{picture.name}.png")
+    tables = [*paper_tables(results), *map(transfer_table, matrices)]
+    for table in tables:
+        _write(out / f"{table.name}.tex", in_latex(table))
+    name = folder.resolve().name
+    sentence = _sentence(results, found.values())
+    _write(out / "tables.md", _markdown(name, sentence, results, tables, pictures))
+    _write(out / "tables.html", _page(name, sentence, results, tables, pictures, out))
+    return out / "tables.html"
+
+
+def _page(
+    name: str, sentence: str, results: Results, tables: Sequence[Table], pictures: Sequence[Picture], out: Path
+) -> str:
+    jobs, gaps = len(results.jobs), len(results.gaps())
+    black = "1-b is one black figure" if BLACK in results.figures else "figures a pattern"
+    kinds = list(results.kinds.values())
+    facts = [
+        (len(kinds), "scenarios", ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))),
+        (", ".join(results.figures), "K", black),
+        (len(results.methods), "methods", ", ".join(map(described, results.methods))),
+        (
+            f"{jobs - gaps} of {jobs}",
+            "jobs done",
+            f"{gaps} failed or missing, listed below" if gaps else "",
+        ),
+    ]
+    return environment().get_template("study.html.jinja").render(
+        version=roadproof.__version__,
+        name=name,
+        sentence=sentence,
+        facts=[{"value": value, "label": label, "note": note} for value, label, note in facts],
+        tables=tables,
+        pictures=[
+            {
+                "name": picture.name,
+                "caption": picture.caption,
+                "source": data_url("image/png", (out / "figures" / f"{picture.name}.png").read_bytes()),
+            }
+            for picture in pictures
+        ],
+    )  # fmt: skip
+
+
+def _markdown(name: str, sentence: str, results: Results, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
+    shown = [
+        f"![{markdown_text(picture.caption)}](figures/{picture.name}.png)\n\n{markdown_text(picture.caption)}\n"
+        for picture in pictures
+    ]
+    methods = [f"- {markdown_text(described(method))}" for method in results.methods]
+    return "\n".join(
+        [f"# {markdown_text(name)}\n\n{markdown_text(sentence)}\n", *methods, "", *map(in_markdown, tables), *shown]
+    )
+
+
+def described(method: Method) -> str:
+    """A method and what is known of it, as "GradOpt (Group, T=3)"."""
+    if method.search == "gradopt":
+        return f"{method.name} ({method.scheme}, T={method.trajectories})"
+    return f"{method.name} ({method.search})" if method.search not in ("", method.name) else method.name
+
+
+def _sentence(results: Results, found: Iterable[Found]) -> str:
+    """What the study was, in a sentence."""
+    controllers = list(dict.fromkeys(job.controller for job in found))
+    scenarios = f"{len(results.kinds)} scenario{'s' if len(results.kinds) != 1 else ''}"
+    weathers = [words(weather) for weather in results.weathers]
+    also = f", judged also at {', '.join(weathers[1:])}" if weathers[1:] else ""
+    traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
+    seeds = (
+        "seed " + str(results.seeds[0]) if len(results.seeds) == 1 else f"seeds {', '.join(map(str, results.seeds))}"
+    )
+    against = f" against {', '.join(controllers)}" if controllers else ""
+    return f"Patterns{against} on {scenarios}, {seeds}, found at {weathers[0]}{also}, driven{traffic}."
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

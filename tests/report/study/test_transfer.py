@@ -1,0 +1,67 @@
+import pytest
+from PIL import Image
+
+from roadproof.errors import StudyError
+from roadproof.report.plots import save
+from roadproof.report.study.blocks import PENALTY
+from roadproof.report.study.table import Estimate
+from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
+
+
+def drive(found_on, driven_by, deviation_m, scenario="left-01", **changed):
+    return {
+        "found_on": found_on,
+        "driven_by": driven_by,
+        "scenario": scenario,
+        "figures": "3",
+        "method": "GradOpt",
+        "seed": 0,
+        "deviation_m": deviation_m,
+        "points": 2 * deviation_m,
+    } | changed
+
+
+DRIVES = [
+    drive("cil", "cil", 2.0),
+    drive("cil", "cil", 1.0, "left-02"),
+    drive("cil", "pilotnet", 0.5),
+    drive("cil", "robust", 0.25),
+    drive("pilotnet", "pilotnet", 1.5),
+    # Twice the same pattern, in two runs: one value.
+    drive("pilotnet", "cil", 0.2),
+    drive("pilotnet", "cil", 0.4),
+]
+
+
+def test_the_matrix_is_found_on_by_driven_by():
+    table = transfer_table(transfer_of(DRIVES))
+    assert [heading.text for heading in table.header[1]] == ["found on", "cil", "pilotnet", "robust"]
+    shown = [[cell.value if isinstance(cell, Estimate) else cell for cell in row] for row in table.rows]
+    assert shown == [["cil", "1.50", "0.50", "0.25"], ["pilotnet", "0.30", "1.50", "–"]]
+    assert [cell.best for cell in table.rows[0][1:]] == [True, False, True]
+    assert "1 to 2 patterns a cell" in table.note
+    assert "1 pairs were not driven" in table.note
+
+
+def test_the_penalty_has_a_matrix_of_its_own():
+    table = transfer_table(transfer_of(DRIVES, PENALTY))
+    assert table.rows[0][1].value == "3.00"
+    assert table.name == "transfer-infraction-penalty"
+
+
+def test_the_heat_map_is_a_picture(tmp_path):
+    picture = transfer_map(transfer_of(DRIVES))
+    save(picture.figure, tmp_path / "map.png")
+    with Image.open(tmp_path / "map.png") as drawn:
+        assert drawn.size[0] > 300
+    texts = [text.get_text() for text in picture.figure.axes[0].texts]
+    assert texts == ["1.50", "0.50", "0.25", "0.30", "1.50", "–"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [([], "no rows"), ([{"found_on": "cil"}], "no column 'driven_by'"), ([drive("a", "b", float("nan"))], "is nan")],
+)
+def test_rows_that_make_no_matrix_are_named(rows, message):
+    with pytest.raises(StudyError, match=message):
+        transfer_of(rows)
