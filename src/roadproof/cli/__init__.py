@@ -23,6 +23,7 @@ from roadproof.cli.evaluate import evaluate
 from roadproof.cli.record import record
 from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
+from roadproof.cli.study import study
 from roadproof.cli.train import train
 from roadproof.errors import RoadproofError
 
@@ -36,6 +37,7 @@ VERBS = (demo, record, calibrate, attack, evaluate, report, drive, scenarios, co
 for verb in VERBS:
     app.command()(verb)
 app.add_typer(carla, name="carla")
+app.add_typer(study, name="study")
 
 
 def _version(wanted: bool | None) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from roadproof.errors import StudyError
 from roadproof.files import read_json, write_atomically
@@ -113,19 +113,28 @@ def write_table(jobs: Iterable[Job], folder: Path) -> DataFrame:
     return frame
 
 
-def read_table(folder: Path) -> DataFrame:
+def read_table(folder: Path, name: str = "rows.parquet") -> DataFrame:
     """Every row of a study.
+
+    Args:
+        folder: of the study.
+        name: of the table in it; `study transfer` writes transfer.parquet.
 
     Raises:
         StudyError: there is none, it is damaged, or pandas and pyarrow are not installed.
     """
-    path = folder / "rows.parquet"
+    path = folder / name
     if not path.is_file():
-        raise StudyError(f"{folder} has no rows.parquet; run the study first")
+        raise StudyError(f"{folder} has no {name}; run the study first")
     try:
         return pandas().read_parquet(path)
     except (OSError, ValueError) as error:
         raise StudyError(f"{path} is damaged ({error}); run the study again, finished jobs are kept") from None
+
+
+def records(frame: DataFrame) -> list[dict[str, Any]]:
+    """The rows of a table, each by its columns' names."""
+    return cast("list[dict[str, Any]]", frame.to_dict("records"))
 
 
 def pandas() -> Any:  # noqa: ANN401  # the module
