@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from roadproof.controllers import CIL, ConditionalPilotNet
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
+from roadproof.controllers.precision import multiplies_bfloat16
 from roadproof.controllers.weights import seeded
 from roadproof.errors import TrainingError
 from roadproof.files import write_atomically
@@ -151,7 +152,8 @@ def imitate(
         draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
         batch = data.batch(torch.multinomial(weights, plan.batch, replacement=True, generator=draw), place)
         batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw))
-        with seeded(plan.seed * 1_000_003 + step), torch.autocast(place.type, torch.bfloat16):
+        mixed = torch.autocast(place.type, torch.bfloat16, enabled=multiplies_bfloat16(place))
+        with seeded(plan.seed * 1_000_003 + step), mixed:
             answer: ConditionalOutput = network(batch.frames, batch.speed_mps, batch.command)
         loss = imitation_loss(answer, batch, plan.loss)
         optimiser.zero_grad()
