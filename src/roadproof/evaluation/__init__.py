@@ -7,6 +7,8 @@ from roadproof.evaluation.fidelity import Fidelity as Fidelity
 from roadproof.evaluation.fidelity import compare_with_rendered as compare_with_rendered
 from roadproof.evaluation.fidelity import is_drive_of as is_drive_of
 from roadproof.evaluation.fidelity import rendered_frames as rendered_frames
+from roadproof.evaluation.objective import DrivenObjective as DrivenObjective
+from roadproof.evaluation.objective import Effect as Effect
 from roadproof.evaluation.result import Evaluation as Evaluation
 from roadproof.evaluation.result import Row as Row
 from roadproof.evaluation.result import Trial as Trial

@@ -221,6 +221,14 @@ def path_of(episode: Episode) -> Path2D:
     return np.column_stack([episode.x_m, episode.y_m])
 
 
+def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> float:
+    """The paper's deviation between two drives, over the instants at which the clean one has the canvas in view."""
+    bare, driven = path_of(clean), path_of(painted)
+    seen = passage(bare, canvas)
+    # A painted drive that ended before has its last position left.
+    return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
+
+
 def judge(
     clean: Episode, painted: Episode, canvas: CanvasPlacement, *, pattern: str, clean_file: str, painted_file: str
 ) -> Trial:
@@ -229,11 +237,7 @@ def judge(
     Deviation is taken over the instants at which the clean drive has the canvas in view, the largest offset over the
     whole painted drive.
     """
-    bare, driven = path_of(clean), path_of(painted)
-    seen = passage(bare, canvas)
-    # A painted drive that ended before has its last position left.
-    during = driven[seen] if len(driven) > seen.start else driven[-1:]
-    beside = lateral_m(bare, driven)
+    beside = lateral_m(path_of(clean), path_of(painted))
     return Trial(
         pattern=pattern,
         weather=painted.weather,
@@ -241,7 +245,7 @@ def judge(
         seed=painted.seed,
         clean=clean_file,
         painted=painted_file,
-        deviation_m=deviation_m(bare[seen], during),
+        deviation_m=passage_deviation_m(clean, painted, canvas),
         lateral_m=float(beside[np.abs(beside).argmax()]),
         points=infraction_points(painted.events),
         clean_points=infraction_points(clean.events),
