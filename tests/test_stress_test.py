@@ -94,3 +94,4 @@ def test_budgets_say_what_they_spend():
     assert BUDGETS["paper"].trajectories == 3
     assert BUDGETS["paper"].restarts * BUDGETS["paper"].schedule.iterations == 1000
     assert dataclasses.replace(TINY, deviations_m=(0.7, 1.5)).trajectories == 5
+    assert dataclasses.replace(TINY, deviations_m=()).trajectories == 1

@@ -24,7 +24,7 @@ from roadproof.attacks import AttackResult, Schedule, attack
 from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
-from roadproof.drives import Drives, Swerve, Trajectories, Window, record
+from roadproof.drives import Drives, Scheme, Swerve, Trajectories, Window, record
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Selection, evaluate, select_by_driving
 from roadproof.files import check_writable, read_json, write_atomically
@@ -48,7 +48,9 @@ class Budget:
     """How much is spent on one scenario.
 
     Args:
-        deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each.
+        deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each; T = 1 without.
+        scheme: whether those pairs are pushed right and left, or each drive to both sides at random.
+        pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
         frames: kept of every recorded drive.
         calibration: how the drives are calibrated.
         schedule: steps of the search.
@@ -59,6 +61,8 @@ class Budget:
     """
 
     deviations_m: tuple[float, ...] = (1.5,)
+    scheme: Scheme = Scheme.GROUP
+    pooled: bool = False
     frames: int = 24
     calibration: Method = Method.TWO_PAINT
     schedule: Schedule = field(default_factory=Schedule)
@@ -110,6 +114,11 @@ class StressTest:
     selection: Selection | None
     evaluation: Evaluation
     cost: dict[str, StageCost]
+
+    @property
+    def pattern(self) -> Pattern:
+        """The one that was chosen in the end."""
+        return self.attack.pattern if self.selection is None else self.selection.pattern
 
 
 def stress_test(
@@ -198,7 +207,9 @@ class _Run:
 
 
 def _record(run: _Run) -> Drives:
-    wanted = Trajectories(count=run.budget.trajectories, perturbation=Swerve(run.budget.deviations_m))
+    budget = run.budget
+    swerve = Swerve(budget.deviations_m) if budget.deviations_m else Swerve()
+    wanted = Trajectories(count=budget.trajectories, scheme=budget.scheme, perturbation=swerve)
     return record(
         run.simulator,
         run.controller,
@@ -237,7 +248,7 @@ def _attack(run: _Run, recordings: RecordingSet) -> AttackResult:
         recordings,
         run.controller,
         run.space,
-        groups=groups_of(recordings),
+        groups=parse_groups("all", recordings) if run.budget.pooled else groups_of(recordings),
         schedule=run.budget.schedule,
         restarts=run.budget.restarts,
         seed=run.seed,
