@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
@@ -61,6 +62,7 @@ def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
         {"seed": 7},
         {"weathers": (Weather.CLEAR_NOON,)},
         {"traffic": None},
+        {"simulator": "carla://localhost"},
         {"method": dataclasses.replace(job.method, iterations=1)},
         {"scenario": dataclasses.replace(job.scenario, time_limit_s=1.0)},
     ):
@@ -81,6 +83,12 @@ def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
         ("trajectories = 1", 'trajectories = "1"', "expected a number"),
         ('name = "BO"', 'name = "GradOpt"', "same name"),
         ("runs = 4", "runs = 0", "runs is 0"),
+        ("runs = 4", 'weathers = "some"', "weathers is 'some'"),
+        ("trajectories = 1", "trajectories = 9", "trajectories is 9"),
+        ("trajectories = 1", 'schedule = "slow"', "schedule is 'slow'"),
+        ("trajectories = 1", 'calibration = "by eye"', "calibration is 'by eye'"),
+        ("trajectories = 1", "frames = 0", "frames is 0"),
+        ("calls = 100", 'objective = "fame"', "objective is 'fame'"),
         ("[traffic]", "[traffic", "not valid TOML"),
         ('controller = "cil"\n', "", "controller is missing"),
         ("seeds = [0, 1]", 'scenario_file = "../own.toml"', "leaves the study's folder"),
@@ -101,3 +109,14 @@ def test_a_study_that_is_not_there_is_named(tmp_path):
 def test_every_built_in_scenario_can_be_chosen(tmp_path):
     study = load_study(written(tmp_path, TEXT.replace('["left-0[12]", "straight-03"]', '["*"]')))
     assert study.scenarios == builtin_scenarios()
+
+
+@pytest.mark.parametrize("name", ["paper", "small"])
+def test_the_studies_that_come_with_the_project_can_be_read(name):
+    study = load_study(Path(__file__).parents[2] / "studies" / f"{name}.toml")
+    assert {method.search for method in study.methods} >= {"gradopt", "published-bo"}
+    if name == "paper":
+        assert len(study.scenarios) == 40
+        assert study.figures == ("1-b", 1, 2, 3, 4, 5)
+        assert len(study.weathers) == 4
+        assert (study.methods[-1].calls, study.methods[-1].random_calls) == (1000, 400)

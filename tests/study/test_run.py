@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from roadproof.errors import StudyError
+from roadproof.study.job import run_job
 from roadproof.study.plan import load_study
 from roadproof.study.rows import read_table
 from roadproof.study.run import run_study
+from short_drive import write_plan
 from study_work import counts, dies_for_two_figures, fails_for_bo
 
 
@@ -69,16 +71,58 @@ method = [{ name = "GradOpt", search = "gradopt" }, { name = "BO", search = "pub
 @pytest.mark.parametrize("work", [counts, dies_for_two_figures])
 def test_a_cluster_gives_the_same_rows_also_when_a_worker_dies(work, tmp_path):
     pytest.importorskip("ray", reason="ray is not installed")
-    (tmp_path / "plan.toml").write_text(PLAN)
-    (tmp_path / "node").mkdir()
+    there = on_two_workers(PLAN, work, tmp_path)
+    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", counts)
+    # A worker that died costs its job one more try, and nobody else anything.
+    assert there.equals(here)
+
+
+DRIVEN = """
+format = "roadproof-study"
+version = 1
+controller = "pilotnet"
+scenario_file = "short.toml"
+scenarios = ["short"]
+figures = [1]
+
+[[method]]
+name = "GradOpt"
+search = "gradopt"
+trajectories = 1
+restarts = 1
+iterations = 2
+frames = 4
+select = 1
+
+[[method]]
+name = "chance"
+search = "random"
+calls = 2
+"""
+
+
+@pytest.mark.slow
+def test_a_cluster_finds_and_drives_as_this_machine_does(tmp_path):
+    pytest.importorskip("ray", reason="ray is not installed")
+    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    there = on_two_workers(DRIVEN, run_job, tmp_path)
+    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", run_job, workers=2)
+    assert here["error"].isna().all()
+    assert (here["deviation_m"] > 0).all()
+    time = ["search_seconds", "seconds"]
+    assert there.drop(columns=time).equals(here.drop(columns=time))
+
+
+def on_two_workers(plan, work, folder):
+    """The rows of a study on a Ray cluster of this machine."""
+    write_plan(folder, plan)
+    (folder / "node").mkdir()
     script = Path(__file__).parents[1] / "study_on_ray.py"
-    arguments = [sys.executable, script, tmp_path / "plan.toml", tmp_path / "there", tmp_path / "node", work.__name__]
+    arguments = [sys.executable, script, folder / "plan.toml", folder / "there", folder / "node", work.__name__]
     patient = os.environ | {"RAY_raylet_start_wait_time_s": "240"}
     ran = subprocess.run(list(map(str, arguments)), capture_output=True, text=True, timeout=300, env=patient)
     assert ran.returncode == 0, ran.stderr
-    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", counts)
-    # A worker that died costs its job one more try, and nobody else anything.
-    assert read_table(tmp_path / "there").equals(here)
+    return read_table(folder / "there")
 
 
 @pytest.mark.parametrize(

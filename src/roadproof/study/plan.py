@@ -3,6 +3,7 @@
 format = "roadproof-study"
 version = 1
 controller = "cil"
+simulator = "town"                        # or carla://HOST:PORT; with several workers, the town
 scenarios = ["straight-01", "left-*"]     # names or patterns of names
 figures = ["1-b", 1, 3, 5]                # K; 1-b is one black figure
 seeds = [0]
@@ -12,6 +13,7 @@ weathers = ["clear-noon", "rainy-noon"]   # of the evaluation; attacks are found
 cars = 20
 pedestrians = 20
 runs = 10
+weathers = "all"                          # or "first": the others are driven alone
 
 [[method]]
 name = "GradOpt"                          # stands in the tables
@@ -20,12 +22,17 @@ trajectories = 3                          # gradopt: recorded drives; scheme: gr
 scheme = "group"
 restarts = 4
 iterations = 250
+schedule = "published"                    # or "heats": many starts on few frames, the best go on
+calibration = "two-paint"                 # or published, or pose
+frames = 24                               # kept of every recorded drive
+select = 6                                # of the best starts, driven to keep the strongest; 0 believes the surrogate
 
 [[method]]
 name = "BO"
 search = "published-bo"
 calls = 1000                              # black box: how many patterns are tried, each in a whole drive
 random_calls = 400
+objective = "steering"                    # as published, or "deviation": what is reported
 """
 
 from __future__ import annotations
@@ -52,6 +59,7 @@ JOB_VERSION = 1
 
 Scheme = Literal["group", "group-all", "random"]
 SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
+SCHEDULES = ("published", "heats")
 BLACK = "1-b"
 
 
@@ -69,6 +77,10 @@ class MethodPlan:
         select: gradopt: how many of the best starts are driven, to keep the strongest; 0 believes the surrogate.
         calls: black box: patterns tried, each in a whole drive.
         random_calls: published-bo: how many of them before the model guides.
+        schedule: gradopt: "published" steps, or in "heats".
+        calibration: gradopt: how recorded drives are calibrated, a `calibration.Method`.
+        frames: gradopt: kept of every recorded drive, at most.
+        objective: black box: what a drive is judged by, an `evaluation.objective.Measure`.
     """
 
     name: str
@@ -80,31 +92,51 @@ class MethodPlan:
     select: int = 0
     calls: int = 1000
     random_calls: int = 400
+    schedule: str = "published"
+    calibration: str = "two-paint"
+    frames: int = 24
+    objective: str = "steering"
 
     def __post_init__(self) -> None:
         # Late, since torch comes with it; a process that only passes plans on is spared.
         from roadproof.attacks.blackbox import METHODS
+        from roadproof.calibration import METHODS as CALIBRATIONS
+        from roadproof.drives.trajectories import COUNTS
+        from roadproof.evaluation.objective import MEASURES
 
         _one_of(self.search, "search", ("gradopt", *METHODS))
         _one_of(self.scheme, "scheme", SCHEMES)
-        for name, least in (("trajectories", 1), ("restarts", 1), ("iterations", 1), ("select", 0), ("calls", 1)):
-            _at_least(getattr(self, name), name, least)
-        if self.trajectories % 2 == 0:
-            raise StudyError(f"trajectories is {self.trajectories}, expected an odd number: a clean drive and pairs")
+        _one_of(self.schedule, "schedule", SCHEDULES)
+        _one_of(self.calibration, "calibration", CALIBRATIONS)
+        _one_of(self.objective, "objective", MEASURES)
+        for name in ("restarts", "iterations", "calls", "random_calls", "frames"):
+            _at_least(getattr(self, name), name, 1)
+        _at_least(self.select, "select", 0)
+        if self.trajectories not in COUNTS:
+            raise StudyError(f"trajectories is {self.trajectories}, expected {', '.join(map(str, COUNTS))}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrafficPlan:
-    """Evaluation among others: seeded runs whose mean counts."""
+    """Evaluation among others: seeded runs whose mean counts.
+
+    Args:
+        cars: on the road.
+        pedestrians: about.
+        runs: in each weather.
+        weathers: "all", or "first": the study's other weathers are driven alone.
+    """
 
     cars: int = 20
     pedestrians: int = 20
     runs: int = 10
+    weathers: str = "all"
 
     def __post_init__(self) -> None:
         for name in ("cars", "pedestrians"):
             _at_least(getattr(self, name), name, 0)
         _at_least(self.runs, "runs", 1)
+        _one_of(self.weathers, "weathers", ("all", "first"))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -119,6 +151,7 @@ class Job:
         seed: of the recording and the search.
         weathers: of the evaluation; found in the first.
         traffic: of the evaluation, or None.
+        simulator: its spec, see `simulators.loading`.
     """
 
     controller: str
@@ -128,6 +161,7 @@ class Job:
     seed: int
     weathers: tuple[Weather, ...]
     traffic: TrafficPlan | None
+    simulator: str = "town"
 
     @property
     def key(self) -> str:
@@ -154,6 +188,7 @@ class Study:
     seeds: tuple[int, ...] = (0,)
     weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
     traffic: TrafficPlan | None = None
+    simulator: str = "town"
 
     def __post_init__(self) -> None:
         for field in ("scenarios", "figures", "methods", "seeds", "weathers"):
@@ -178,6 +213,7 @@ class Study:
                 seed=seed,
                 weathers=self.weathers,
                 traffic=self.traffic,
+                simulator=self.simulator,
             )
             for scenario, figures, method, seed in product(self.scenarios, self.figures, self.methods, self.seeds)
         )
@@ -222,6 +258,7 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
         seeds=tuple(int(seed) for seed in _list(stated, "seeds", (0,))),
         weathers=tuple(_weather(name) for name in _list(stated, "weathers", (Weather.CLEAR_NOON,))),
         traffic=None if traffic is None else _build(TrafficPlan, traffic, "traffic"),
+        simulator=str(stated.get("simulator", "town")),
     )
 
 
