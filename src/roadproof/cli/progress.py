@@ -16,6 +16,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+_HOURS_S = 6 * 3600.0
+
 
 @contextmanager
 def progress(title: str, total: int, value: str = "best {:.3f}") -> Generator[Callable[[int, float], None]]:
@@ -31,6 +33,24 @@ def progress(title: str, total: int, value: str = "best {:.3f}") -> Generator[Ca
     """
     with _bars() as bar:
         task = bar.add_task(title, total=total, value=value.format(0.0))
+        yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
+
+
+@contextmanager
+def long_progress(title: str, total: int, begun: int, value: str) -> Generator[Callable[[int, float], None]]:
+    """A bar for steps that take minutes each, some of which may be done already.
+
+    Args:
+        title: what is going on.
+        total: steps there are.
+        begun: how many of them were done before; they say nothing on the time left.
+        value: how the number beside the bar is shown.
+
+    Yields:
+        What to call with the steps done and that number.
+    """
+    with _bars(remember_s=_HOURS_S) as bar:
+        task = bar.add_task(title, total=total, completed=begun, value=value.format(0))
         yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
 
 
@@ -52,7 +72,7 @@ def stages() -> Generator[Callable[[str, int, int, str], None]]:
         yield show
 
 
-def _bars() -> Progress:
+def _bars(remember_s: float = 30.0) -> Progress:
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -63,4 +83,6 @@ def _bars() -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
+    return Progress(
+        *columns, console=console, disable=not console.is_terminal, transient=True, speed_estimate_period=remember_s
+    )

@@ -3,16 +3,85 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from roadproof.study.plan import Job
+    from roadproof.study.rows import JobResult
 
 study = typer.Typer(no_args_is_help=True, add_completion=False, help="Compare methods over many scenarios.")
 
 
-@study.callback()
-def _root() -> None:  # pyright: ignore[reportUnusedFunction]  # keeps a single command a subcommand
-    pass
+@study.command()
+def run(
+    plan: Annotated[Path, typer.Argument(help="TOML file that says what is compared.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
+        "out/study"
+    ),
+    workers: Annotated[int, typer.Option(help="Jobs at once on this machine, each in a process of its own.")] = 1,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="Address of a Ray cluster, or local for one on this machine.", show_default=False),
+    ] = None,
+) -> None:
+    """Find and evaluate a pattern for every scenario, number of figures, method and seed of a plan."""
+    # Torch takes seconds to import; `--help` should not.
+    from rich.console import Console
+
+    from roadproof.cli.progress import long_progress
+    from roadproof.study.job import run_job
+    from roadproof.study.plan import load_study
+    from roadproof.study.rows import is_done
+    from roadproof.study.run import run_study
+    from roadproof.study.summary import failures, summary
+
+    chosen = load_study(plan)
+    begun = sum(is_done(job, out) for job in chosen.jobs)
+    failed = 0
+    with long_progress("Jobs", len(chosen.jobs), begun, "{:.0f} failed") as show:
+
+        def told(done: int, _: Job, result: JobResult) -> None:
+            nonlocal failed
+            failed += any(row.get("error") for row in result.rows)
+            show(done, failed)
+
+        rows = run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told)
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    for line in summary(rows):
+        say(line)
+    say(f"Rows in {out / 'rows.parquet'}; tables and figures: roadproof study tables {out}")
+    bad = failures(rows)
+    for line in bad:
+        say(f"FAILED {line}")
+    if bad:
+        say("Give the same command again to try those once more")
+        raise typer.Exit(1)
+
+
+@study.command()
+def transfer(
+    plan: Annotated[Path, typer.Argument(help="The study's TOML file.", show_default=False)],
+    controllers: Annotated[str, typer.Option(help="Whom to try, with commas: cil,pilotnet.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder with the study's results.")] = Path("out/study"),
+) -> None:
+    """Drive other controllers over the patterns a study found."""
+    from rich.console import Console
+
+    from roadproof.cli.progress import long_progress
+    from roadproof.study.plan import load_study
+    from roadproof.study.summary import matrix
+    from roadproof.study.transfer import transfer as run_transfer
+
+    chosen = load_study(plan)
+    specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
+    with long_progress("Patterns", len(chosen.jobs) * len(specs), 0, "") as show:
+        rows = run_transfer(chosen, out, specs, on_pattern=lambda done, _total: show(done, 0.0))
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    for line in matrix(rows):
+        say(line)
+    say(f"Rows in {out / 'transfer.parquet'}")
 
 
 @study.command()

@@ -1,0 +1,85 @@
+"""Patterns found against one controller, tried on others: does a weakness belong to one network or to many?
+
+FOLDER/transfer/CONTROLLER/SCENARIO/   the drives of every controller, kept, so that the same call goes on
+FOLDER/transfer.parquet                a row for each pattern and controller
+
+Every pattern is driven over alone, in the weather it was found in. Columns: those that tell a job
+(`rows.JOB_COLUMNS`), `found_on`, the controller it was found against, and the ones of driving of `job.MEASURED`, from
+controller to ending.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from roadproof.controllers import Controller, load_controller
+from roadproof.errors import StudyError
+from roadproof.evaluation import evaluate
+from roadproof.files import write_atomically
+from roadproof.patterns import load_pattern
+from roadproof.simulators.loading import open_simulator
+from roadproof.simulators.protocol import Simulator
+from roadproof.study.job import measured
+from roadproof.study.plan import Job, Study
+from roadproof.study.rows import Row, is_done, job_columns, pandas
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+def transfer(
+    study: Study,
+    folder: Path,
+    controllers: Sequence[str],
+    *,
+    on_pattern: Callable[[int, int], object] = lambda _done, _total: None,
+) -> DataFrame:
+    """Drive every controller over the patterns of a study.
+
+    Args:
+        study: whose patterns.
+        folder: where its results are kept; jobs that are not done are left out.
+        controllers: specs; the one the patterns were found against may be among them.
+        on_pattern: told how many patterns have been driven over, and of how many, all controllers counted.
+
+    Raises:
+        StudyError: no controller is named, or no job of the study is done.
+        ControllerError: there is no such controller.
+        OutputError: the folder cannot be written.
+    """
+    if not controllers:
+        raise StudyError("no controller to try the patterns on; name one or more")
+    found = [job for job in study.jobs if is_done(job, folder)]
+    if not found:
+        raise StudyError(f"{folder} has no results of this study yet; run the study first")
+    drivers = {spec: load_controller(spec) for spec in controllers}
+    rows: list[Row] = []
+    with ExitStack() as stack:
+        world = stack.enter_context(open_simulator(study.simulator))
+        for spec, driver in drivers.items():
+            for job in found:
+                rows.append(_row(job, folder, world, spec, driver))
+                on_pattern(len(rows), len(drivers) * len(found))
+    frame = pandas().DataFrame(rows)
+    write_atomically(folder / "transfer.parquet", lambda part: frame.to_parquet(part, index=False))
+    return frame
+
+
+def _row(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> Row:
+    place = folder / "transfer" / re.sub(r"[^\w.-]", "_", spec) / job.scenario.name
+    evaluation = evaluate(
+        world,
+        driver,
+        job.scenario,
+        load_pattern(folder / "jobs" / job.key / "pattern.json"),
+        folder=place,
+        driver_name=spec,
+        weathers=job.weathers[:1],
+        runs=0,
+        seed=job.seed,
+    )
+    return {**job_columns(job), "found_on": job.controller, "controller": spec, **measured(evaluation.trials[0])}

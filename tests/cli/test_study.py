@@ -1,0 +1,86 @@
+"""`roadproof study` as its users call it."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from roadproof.cli import main
+from roadproof.study.rows import pandas, read_table
+from short_drive import write_plan
+
+PLAN = """
+format = "roadproof-study"
+version = 1
+controller = "pilotnet"
+scenario_file = "short.toml"
+scenarios = ["short"]
+figures = ["1-b"]
+method = [{ name = "chance", search = "random", calls = 1 }]
+"""
+
+
+@pytest.fixture
+def study(monkeypatch, capsys):
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["roadproof", "study", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        return stopped.value.code or 0, capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def plan(tmp_path):
+    return write_plan(tmp_path, PLAN)
+
+
+@pytest.mark.slow
+def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_path):
+    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    for _ in range(2):
+        code, printed = study("run", plan, "--out", tmp_path / "out")
+        assert code == 0, printed.err + printed.out
+        assert "chance" in printed.out
+        assert "found with 2 simulator calls" in printed.out
+        assert "FAILED" not in printed.out
+        assert printed.err == ""
+    own = read_table(tmp_path / "out")
+    for _ in range(2):
+        code, printed = study("transfer", plan, "--controllers", "pilotnet, cil", "--out", tmp_path / "out")
+        assert code == 0, printed.err
+        assert "chance, found against pilotnet" in printed.out
+    other = pandas().read_parquet(tmp_path / "out" / "transfer.parquet")
+    assert list(other["controller"]) == ["pilotnet", "cil"]
+    assert set(other["found_on"]) == {"pilotnet"}
+    assert other["deviation_m"].iloc[0] == own["deviation_m"].iloc[0]
+    assert other["deviation_m"].iloc[1] != own["deviation_m"].iloc[0]
+    # A clean and a painted drive each; the second call found them.
+    assert len(list((tmp_path / "out" / "transfer").rglob("episodes/*.npz"))) == 4
+
+
+@pytest.mark.slow
+def test_jobs_that_fail_are_a_line_each(study, plan, tmp_path):
+    plan.write_text(PLAN.replace('"pilotnet"', '"own:nobody"'))
+    code, printed = study("run", plan, "--out", tmp_path / "out")
+    assert code == 1
+    assert "FAILED short, K = 1-b, chance, seed 0: " in printed.out
+    assert "own" in printed.out.split("FAILED")[1]
+
+
+def test_mistakes_are_one_clear_line(study, plan, tmp_path):
+    unknown = tmp_path / "unknown.toml"
+    unknown.write_text(PLAN.replace("calls", "cals"))
+    for arguments, message in (
+        (["run", tmp_path / "none.toml"], "cannot read"),
+        (["run", unknown], "did you mean 'calls'"),
+        (["run", plan, "--workers", 0], "workers is 0"),
+        (["transfer", plan, "--controllers", "cil"], "no results of this study"),
+        (["transfer", plan, "--controllers", ","], "no controller"),
+    ):
+        code, printed = study(*arguments, "--out", tmp_path / "out")
+        assert code == 2
+        assert message in printed.err
+        assert printed.err.count("\n") == 1
