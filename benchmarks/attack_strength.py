@@ -21,6 +21,7 @@ import roadproof
 from roadproof.attacks import Schedule, Surrogate
 from roadproof.attacks.gradopt import gradopt, random_search
 from roadproof.controllers import load_controller
+from roadproof.memory import keep_freed_memory
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
 from roadproof.recordings import load_recordings
 from roadproof.search_space import SearchSpace
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--random-patterns", type=int, default=500, help="of the random search, 0 for none")
     args = parser.parse_args()
+    keep_freed_memory()  # as the command line does
     recordings = load_recordings(args.recordings)
     judge = Surrogate(recordings, load_controller(args.controller), GROUPS)
     searched = Surrogate(recordings, load_controller(args.controller, dtype=args.dtype), GROUPS)

@@ -27,6 +27,7 @@ from roadproof.attacks.published import PublishedSurrogate
 from roadproof.controllers import CIL, pilotnet_controller
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.memory import keep_freed_memory
 from roadproof.objectives import parse_groups
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Push, Recording, RecordingSet, load_recordings
@@ -147,6 +148,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--quick", action="store_true", help="K = 5 in float32 on the CPU only")
     args = parser.parse_args()
+    keep_freed_memory()  # as the command line does
     recordings = load_recordings(args.recordings) if args.recordings else synthetic_drive(args.frames)
     devices = ["cpu", "cuda"] if torch.cuda.is_available() and not args.quick else ["cpu"]
     dtypes = [torch.float32] if args.quick else [torch.float32, torch.bfloat16]

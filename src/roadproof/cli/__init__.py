@@ -26,6 +26,7 @@ from roadproof.cli.scenarios import scenarios
 from roadproof.cli.study import study
 from roadproof.cli.train import train
 from roadproof.errors import RoadproofError
+from roadproof.memory import keep_freed_memory
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -57,6 +58,7 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 
 def main() -> None:
     """Entry point of the `roadproof` command."""
+    keep_freed_memory()
     complain = Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print
     try:
         app()

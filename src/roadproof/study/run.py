@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.files import check_writable
+from roadproof.memory import keep_freed_memory
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import JobResult, failed, is_done, write_result, write_table
 
@@ -98,6 +99,7 @@ def _in_own_process(job: Job, scratch: Path, work: Work, threads: int) -> tuple[
 def _begin_process(threads: int) -> None:
     # Before torch is imported; workers that each took all cores would only get in each other's way.
     os.environ["OMP_NUM_THREADS"] = str(threads)
+    keep_freed_memory()
 
 
 def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job, JobResult]]:

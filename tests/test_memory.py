@@ -1,0 +1,35 @@
+"""Freed memory is kept: measured by the page faults of a process that asks for the same blocks again and again."""
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+ASK_AGAIN = """
+import resource, torch
+from roadproof.memory import keep_freed_memory
+{first}
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def step():
+    first, second = torch.ones(8 << 18), torch.ones(40 << 18)
+    del first
+    third = torch.ones(20 << 18)
+step()
+before = faults()
+for _ in range(5):
+    step()
+print(faults() - before)
+"""
+
+
+def page_faults(first: str) -> int:
+    told = subprocess.run(
+        [sys.executable, "-c", ASK_AGAIN.format(first=first)], capture_output=True, text=True, check=True
+    )
+    return int(told.stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_blocks_that_were_freed_are_used_again() -> None:
+    assert page_faults("keep_freed_memory()") < 0.1 * page_faults("")
