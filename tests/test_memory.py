@@ -16,6 +16,7 @@ def step():
     del first
     third = torch.ones(20 << 18)
 step()
+step()
 before = faults()
 for _ in range(5):
     step()
@@ -32,4 +33,4 @@ def page_faults(first: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
 def test_blocks_that_were_freed_are_used_again() -> None:
-    assert page_faults("keep_freed_memory()") < 0.1 * page_faults("")
+    assert page_faults("keep_freed_memory()") < 0.5 * page_faults("")
