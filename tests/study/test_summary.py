@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+from roadproof.study.summary import failures, matrix, summary
+
+
+def row(method, deviation_m, *, weather="clear-noon", traffic=False, error=None, **more):
+    job = {"scenario": "left-01", "kind": "left", "figures": "1", "method": method, "seed": 0}
+    costs = {"search_calls": 14, "search_seconds": 30.0}
+    return {**job, "weather": weather, "traffic": traffic, "deviation_m": deviation_m, **costs, "error": error, **more}
+
+
+def test_methods_are_summed_up_as_they_were_searched():
+    rows = [
+        row("GradOpt", 1.0),
+        row("GradOpt", 9.0, traffic=True),
+        row("GradOpt", 9.0, weather="rainy-noon"),
+        row("GradOpt", 2.0, search_calls=16),
+        row("BO", 0.5),
+        {**row("BO", None), "error": "no luck"},
+    ]
+    ours, theirs = summary(rows)
+    assert "GradOpt: 1.50 m deviation, alone in clear-noon; found with 15 simulator calls in 30 s" in ours
+    assert "BO: 0.50 m" in theirs
+    assert failures(rows) == ("left-01, K = 1, BO, seed 0: no luck",)
+
+
+def test_a_study_in_which_all_failed_has_failures_alone():
+    rows = [row("BO", None, error="no luck")]
+    assert summary(rows) == ()
+    assert len(failures(rows)) == 1
+
+
+def test_a_transfer_is_a_mean_for_each_method_and_controller():
+    found = {"found_on": "cil"}
+    rows = [row("BO", 1.0, controller="cil", **found), row("BO", 2.0, controller="cil", **found)]
+    assert matrix([*rows, row("BO", 0.25, controller="own", **found)]) == (
+        "BO, found against cil: 1.50 m deviation of cil",
+        "BO, found against cil: 0.25 m deviation of own",
+    )
