@@ -87,3 +87,42 @@ def test_no_more_than_the_allowed_share_is_painted(shape):
 def test_bounds_that_make_no_sense_are_refused(kwargs, message):
     with pytest.raises(PatternError, match=message):
         SearchSpace(**kwargs)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        SearchSpace(figures=3),
+        SearchSpace(figures=2, family="published-canvas-centre", albedo=(0.1, 0.8)),
+        SearchSpace(figures=1, family="published-bo", colour=False),
+        SearchSpace(figures=2, family="free", shape=Shape.TRIANGLE),
+        SearchSpace(figures=2, family="free", shape=Shape.ELLIPSE),
+    ],
+    ids=str,
+)
+def test_the_point_of_a_pattern_makes_it_again(space):
+    pattern = space.pattern(starts(space))
+    point = space.point(pattern)
+    assert point.shape == starts(space).shape
+    again = space.pattern(point)
+    torch.testing.assert_close(again.boxes, pattern.boxes, rtol=0, atol=1e-3)
+    torch.testing.assert_close(again.colours, pattern.colours, rtol=0, atol=1e-5)
+    torch.testing.assert_close(point, starts(space), rtol=0, atol=1e-4)
+
+
+def test_a_pattern_outside_has_the_nearest_point():
+    # Figures made narrow to keep to the share lie outside the published bounds.
+    space = SearchSpace(figures=3, max_painted_share=0.1)
+    pattern = space.pattern(starts(space))
+    point = space.point(pattern)
+    assert point.min() >= 0
+    assert point.max() <= 1
+    again = space.pattern(point)
+    assert again.painted_share.max() <= 0.1 + 1e-5
+    assert (again.boxes - pattern.boxes).abs().median() < 1.0
+
+
+def test_a_pattern_of_other_figures_has_no_point():
+    pattern = SearchSpace(figures=2).pattern(torch.full((2, 7), 0.5))
+    with pytest.raises(PatternError, match="expected 3 of shape rectangle"):
+        SearchSpace(figures=3).point(pattern)

@@ -95,6 +95,18 @@ def boxes_from_published(
     return torch.stack([x, y, width, length, rotation_deg], -1)
 
 
+def published_from_boxes(
+    boxes: Float[Tensor, "*b k 5"], *, rotate_about: Literal["figure", "canvas"] = "figure"
+) -> Float[Tensor, "*b k 4"]:
+    """The published parameters of boxes that `boxes_from_published` made."""
+    x, y, width, length, rotation_deg = boxes.unbind(-1)
+    arm = x - _MIDDLE
+    if rotate_about == "canvas":
+        angle = torch.deg2rad(rotation_deg)
+        arm = arm * torch.cos(angle) + (y - _MIDDLE) * torch.sin(angle)
+    return torch.stack([rotation_deg, _MIDDLE + arm - 10 - width / 2, width - 5, (CANVAS_SIZE_PX - length) / 2 - 5], -1)
+
+
 def rectangles_from_published(
     values: Sequence[Sequence[float]], *, rotate_about: Literal["figure", "canvas"] = "figure"
 ) -> Pattern:

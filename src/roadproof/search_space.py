@@ -16,7 +16,7 @@ from torch import Tensor
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
-from roadproof.patterns import Pattern, boxes_from_published
+from roadproof.patterns import Pattern, boxes_from_published, published_from_boxes
 
 Family = Literal["published", "published-canvas-centre", "published-bo", "free"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
@@ -54,6 +54,7 @@ _FREE = (
     _Parameter("length_px", 20.0, 390.0, 20.0),
     _Parameter("rotation_deg", 0.0, 180.0, 0.0),
 )
+_HALF_TURN = (1.0, 1.0, 1.0, 1.0, 0.5)
 _COLOUR_NAMES = ("red", "green", "blue")
 
 
@@ -135,15 +136,38 @@ class SearchSpace:
         boxes = natural if self.family == "free" else self._published_boxes(natural)
         if self.shape is Shape.TRIANGLE:
             # A triangle looks the same only after a full turn.
-            boxes = torch.cat([boxes[..., :4], 2 * boxes[..., 4:]], -1)
+            boxes = boxes / boxes.new_tensor(_HALF_TURN)
         darkest, brightest = self.albedo
         shares = unit[..., len(parameters) :] if self.colour else torch.zeros_like(unit[..., :3])
         pattern = Pattern((self.shape,) * self.figures, boxes, darkest + shares * (brightest - darkest))
         return pattern if self.max_painted_share is None else _shrunk(pattern, self.max_painted_share)
 
+    def point(self, pattern: Pattern) -> Float[Tensor, "*b k n"]:
+        """The point of a pattern: what `pattern` makes it from; the nearest one where the pattern is outside.
+
+        Raises:
+            PatternError: it has other figures.
+        """
+        if pattern.shapes != (self.shape,) * self.figures:
+            names = ", ".join(pattern.shapes)
+            raise PatternError(f"the pattern is {names}; expected {self.figures} of shape {self.shape}")
+        parameters = self._shape_parameters
+        boxes = pattern.boxes
+        if self.shape is Shape.TRIANGLE:
+            boxes = boxes * boxes.new_tensor(_HALF_TURN)
+        natural = boxes if self.family == "free" else published_from_boxes(boxes, rotate_about=self._rotate_about)
+        low = natural.new_tensor([p.low for p in parameters])
+        unit = (natural - low) / natural.new_tensor(self.shape_ranges)
+        darkest, brightest = self.albedo
+        colours = (pattern.colours - darkest) / (brightest - darkest)
+        return self.project(torch.cat([unit, colours], -1) if self.colour else unit)
+
+    @property
+    def _rotate_about(self) -> Literal["figure", "canvas"]:
+        return "canvas" if self.family == "published-canvas-centre" else "figure"
+
     def _published_boxes(self, natural: Float[Tensor, "*b k 4"]) -> Float[Tensor, "*b k 5"]:
-        rotate_about = "canvas" if self.family == "published-canvas-centre" else "figure"
-        return boxes_from_published(natural, rotate_about=rotate_about)
+        return boxes_from_published(natural, rotate_about=self._rotate_about)
 
 
 def _shrunk(pattern: Pattern, max_painted_share: float) -> Pattern:

@@ -138,20 +138,24 @@ class InterruptionError(Exception):
     pass
 
 
-def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path):
+@pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 13])
+def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path, at):
+    """Within the first heat, at its end, within the second, at its end, and in the search proper."""
+    schedule = dataclasses.replace(HEATED, iterations=11, heats=(*HEATED.heats, Heat(starts=3, iterations=2, every=1)))
+
     def run(checkpoint, on_step=lambda _step, _best: None):
         return attack(
             recording_set(),
             pull_to_the_right(),
             SearchSpace(figures=2),
-            schedule=HEATED,
+            schedule=schedule,
             restarts=2,
             checkpoint=checkpoint,
             on_step=on_step,
         )
 
     def interrupt(step, _best):
-        if step == 13:
+        if step == at:
             raise InterruptionError
 
     steps = []
@@ -159,9 +163,37 @@ def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path):
         run(tmp_path / "search.safetensors", interrupt)
     resumed = run(tmp_path / "search.safetensors", lambda step, _best: steps.append(step))
     # The step that was interrupted may be repeated, no other.
-    assert steps[0] in (13, 14)
-    assert steps[-1] == 22
-    np.testing.assert_array_equal(resumed.history, run(None).history)
+    assert steps == list(range(at, 16))
+    straight = run(None)
+    np.testing.assert_array_equal(resumed.history, straight.history)
+    for one, other in zip(resumed.candidates, straight.candidates, strict=True):
+        assert torch.equal(one.pattern.boxes, other.pattern.boxes)
+    assert resumed.cost.controller_frames >= straight.cost.controller_frames
+
+
+def test_a_search_that_stopped_early_is_not_searched_on(tmp_path):
+    schedule = Schedule(iterations=200, drops=(10,), patience=8)
+    surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
+    run = lambda: gradopt(  # noqa: E731
+        surrogate, SearchSpace(figures=1), schedule=schedule, restarts=1, seed=0, checkpoint=tmp_path / "s.safetensors"
+    )
+    once, again = run(), run()
+    assert torch.equal(once.history, again.history)
+    assert again.stopped == once.stopped
+
+
+def test_a_search_goes_on_from_the_candidates_of_another():
+    recordings, controller, space = recording_set(), pull_to_the_right(), SearchSpace(figures=2)
+    first = attack(recordings, controller, space, schedule=QUICK, restarts=2)
+    more = attack(
+        recordings, controller, space, schedule=Schedule.stretched(3), restarts=3, starts=first.candidates, seed=7
+    )
+    for group, best in first.by_group.items():
+        assert more.by_group[group] >= best - 1e-4
+    found = {name: [c.surrogate_shift for c in first.candidates if c.group == name] for name in first.by_group}
+    for number, name in enumerate(first.by_group):
+        np.testing.assert_allclose(more.history[0, number, :2], found[name], atol=1e-3)
+        assert abs(more.history[0, number, 2] - found[name][0]) > 1e-3, "the third start is a random one"
 
 
 def test_a_checkpoint_of_another_search_or_a_damaged_one_is_not_used(tmp_path):

@@ -2,6 +2,7 @@
 
 from roadproof.attacks.attack import GRADIENTS as GRADIENTS
 from roadproof.attacks.attack import attack as attack
+from roadproof.attacks.attack import kept_attack as kept_attack
 from roadproof.attacks.checks import Check as Check
 from roadproof.attacks.gradopt import Heat as Heat
 from roadproof.attacks.gradopt import Schedule as Schedule

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Literal, cast, get_args
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from roadproof.attacks.checks import check_search
 from roadproof.attacks.gradopt import Schedule, Search, gradopt
@@ -35,6 +37,7 @@ def attack(
     device: torch.device | str = "cpu",
     gradient: Gradient = "exact",
     random_patterns: int = 0,
+    starts: Sequence[Candidate] = (),
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
@@ -51,6 +54,7 @@ def attack(
         device: where to search.
         gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
         random_patterns: random patterns a group that the self-check compares with; 0 for none.
+        starts: of an earlier search, to search on from: each for its own group, instead of as many random ones.
         checkpoint: file that keeps the search after every step; an interrupted one goes on from it.
         on_step: called after every step with its number and the best shift so far.
 
@@ -68,6 +72,7 @@ def attack(
         schedule=schedule,
         restarts=restarts,
         seed=seed,
+        starts=[_points(space, starts, group) for group in groups],
         checkpoint=checkpoint,
         on_step=on_step,
     )
@@ -89,6 +94,30 @@ def attack(
         restarts=restarts,
         seed=seed,
     )
+
+
+def kept_attack(folder: Path, search: Callable[[Path], AttackResult]) -> AttackResult:
+    """A search that is done once: what it found is read from its folder where it is there already.
+
+    Args:
+        folder: of the result.
+        search: does it; gets the checkpoint to go on from.
+
+    Raises:
+        RoadproofError: the result is damaged, or the search refuses.
+        OutputError: the folder cannot be written.
+    """
+    checkpoint = folder / "search.safetensors"
+    if not (folder / "result.json").exists():
+        search(checkpoint).save(folder)
+    checkpoint.unlink(missing_ok=True)
+    return AttackResult.load(folder)
+
+
+def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:
+    """Those of a group, as points."""
+    points = [space.point(start.pattern) for start in starts if start.group == str(group)]
+    return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
 def _candidates(search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:

@@ -10,7 +10,7 @@ of them alone go on to all frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -126,6 +126,7 @@ def gradopt(
     schedule: Schedule,
     restarts: int,
     seed: int,
+    starts: Sequence[Float[Tensor, "s k n"]] = (),
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> Search:
@@ -137,8 +138,9 @@ def gradopt(
         schedule: steps and rates.
         restarts: of every group.
         seed: of the random starts.
-        checkpoint: a file that keeps the search after every step that follows the heats; where it is there already and
-            belongs to the same search, that search goes on, to the same result.
+        starts: points to begin at, for each group in turn; random ones make up what they lack.
+        checkpoint: a file that keeps the search after every step, those of the heats included; where it is there
+            already and belongs to the same search, that search goes on, to the same result.
         on_step: called after every step with its number and the best δ per frame so far.
 
     Raises:
@@ -149,49 +151,74 @@ def gradopt(
     """
     if restarts < 1:
         raise RoadproofError(f"restarts is {restarts}, expected 1 or more")
-    identity = repr((space, schedule, restarts, seed, surrogate.fingerprint()))
+    rungs = _rungs(schedule, restarts)
+    given = [points.tolist() for points in starts]
+    identity = repr((space, schedule, restarts, seed, given, surrogate.fingerprint()))
     state = load_checkpoint(checkpoint, identity, surrogate.device) if checkpoint else None
     if state is None:
-        state = _state_at(_starts(surrogate, space, schedule, restarts, seed, on_step))
+        rung, state = 0, _state_at(_starts(surrogate, space, rungs[0].starts, seed, starts))
+    else:
+        rung = int(state.pop("rung"))
+        surrogate.frames_evaluated += int(state.pop("frames"))
+    for number in range(rung, len(rungs)):
+        steps, last = rungs[number].steps, number == len(rungs) - 1
+        shown = surrogate if last else surrogate.thinned(rungs[number].every)
+        done = sum(before.steps.iterations for before in rungs[:number])
+        if number > rung:
+            state = _state_at(_strongest(state, rungs[number].starts))
+        while len(state["history"]) < steps.iterations and not _stalled(state["history"], steps):
+            state = _step(shown, space, steps, state)
+            on_step(done + len(state["history"]), float(state["best"].max()))
+            if checkpoint:
+                frames = surrogate.frames_evaluated + (0 if last else shown.frames_evaluated)
+                whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames)}
+                save_checkpoint(checkpoint, identity, whole)
+        if not last:
+            surrogate.frames_evaluated += shown.frames_evaluated
     stopped = "all iterations done"
-    in_heats = schedule.steps - schedule.iterations
-    while len(state["history"]) < schedule.iterations:
-        state = _step(surrogate, space, schedule, state)
-        on_step(in_heats + len(state["history"]), float(state["best"].max()))
-        if checkpoint:
-            save_checkpoint(checkpoint, identity, state)
-        if _stalled(state["history"], schedule):
-            stopped = f"no restart gained 0.1 % in the last {schedule.patience} iterations"
-            break
+    if len(state["history"]) < schedule.iterations:
+        stopped = f"no restart gained 0.1 % in the last {schedule.patience} iterations"
     return Search(state["best_unit"], state["best"], state["history"].cpu(), stopped)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rung:
+    """A heat, or the search proper: so many starts of every group, on every n-th frame."""
+
+    starts: int
+    every: int
+    steps: Schedule
+
+
+def _rungs(schedule: Schedule, restarts: int) -> list[_Rung]:
+    places = [*(heat.starts for heat in schedule.heats), restarts]
+    if any(after > before for before, after in pairwise(places)):
+        raise RoadproofError(f"heats of {places[:-1]} starts leave fewer than {restarts} restarts; ask for fewer")
+    steps = (
+        replace(schedule, iterations=heat.iterations, drops=(), patience=None, heats=()) for heat in schedule.heats
+    )
+    heats = [_Rung(heat.starts, heat.every, each) for heat, each in zip(schedule.heats, steps, strict=True)]
+    return [*heats, _Rung(restarts, 1, schedule)]
 
 
 def _starts(
     surrogate: Surrogate,
     space: SearchSpace,
-    schedule: Schedule,
-    restarts: int,
+    count: int,
     seed: int,
-    on_step: Callable[[int, float], object],
+    given: Sequence[Float[Tensor, "s k n"]],
 ) -> Float[Tensor, "g r k n"]:
-    """Random points, or what is left of them after the heats."""
-    places = [*(heat.starts for heat in schedule.heats), restarts]
-    if any(after > before for before, after in pairwise(places)):
-        raise RoadproofError(f"heats of {places[:-1]} starts leave fewer than {restarts} restarts; ask for fewer")
-    groups = len(surrogate.groups)
-    unit = space.random((groups, places[0]), torch.Generator().manual_seed(seed)).to(surrogate.device)
-    done = 0
-    for heat, left in zip(schedule.heats, places[1:], strict=True):
-        thinned = surrogate.thinned(heat.every)
-        steps = replace(schedule, iterations=heat.iterations, drops=(), heats=())
-        state = _state_at(unit)
-        for _ in range(heat.iterations):
-            state = _step(thinned, space, steps, state)
-            done += 1
-            on_step(done, float(state["best"].max()))
-        surrogate.frames_evaluated += thinned.frames_evaluated
-        unit = state["best_unit"][torch.arange(groups)[:, None], state["best"].topk(left, 1).indices]
-    return unit
+    """Random points, the first of them replaced by those given."""
+    unit = space.random((len(surrogate.groups), count), torch.Generator().manual_seed(seed))
+    for group, points in enumerate(given):
+        unit[group, : len(points)] = points[:count]
+    return unit.to(surrogate.device)
+
+
+def _strongest(state: dict[str, Tensor], count: int) -> Float[Tensor, "g r k n"]:
+    """Where the best of every group are."""
+    best = state["best"].topk(count, 1).indices
+    return state["best_unit"][torch.arange(len(best), device=best.device)[:, None], best]
 
 
 def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:
