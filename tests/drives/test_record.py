@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from roadproof.datatypes import Control, Weather
-from roadproof.drives import Swerve, Trajectories, Window, load_drives, record
+from paint_shy import PaintShy
+from roadproof.datatypes import Control, Event, EventKind, Weather
+from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
 from roadproof.recordings import Push
@@ -137,3 +138,27 @@ def test_a_folder_that_cannot_be_written_is_named(town, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         record(town, expert, LEFT, folder=tmp_path / "file" / "record")
+
+
+def test_a_drive_made_before_is_recorded_over_the_bare_road(drives, town, tmp_path):
+    right = drives.drives[1]
+    along = record_along(town, PaintShy(), drives, right.episode, name="round-1", folder=tmp_path)
+    assert along.push is Push.RIGHT
+    assert along.deviation_m == pytest.approx(right.deviation_m, abs=0.02)
+    np.testing.assert_array_equal(along.frames, right.frames)
+    np.testing.assert_array_equal(along.frame_number, right.frame_number)
+    np.testing.assert_array_equal(along.episode.x_m[along.frame_number], right.episode.x_m[right.frame_number])
+    assert (along.steer == 0).all(), "asked of a controller that sees no paint, not given"
+    kept = (tmp_path / "round-1" / "drive.npz").stat().st_mtime_ns
+    again = record_along(town, PaintShy(), drives, right.episode, name="round-1", folder=tmp_path)
+    assert (tmp_path / "round-1" / "drive.npz").stat().st_mtime_ns == kept
+    np.testing.assert_array_equal(again.frames, along.frames)
+
+
+def test_it_is_cut_where_the_drive_came_to_harm(drives, town):
+    left = drives.drives[2]
+    harm_s = float(left.episode.time_s[left.frame_number[2]])
+    hit = dataclasses.replace(left.episode, events=(Event(EventKind.COLLISION_STATIC, harm_s, "tree"),))
+    along = record_along(town, PaintShy(), drives, hit, name="round-1")
+    assert along.episode.time_s[-1] == pytest.approx(harm_s)
+    assert along.frame_number[-1] < left.frame_number[2]

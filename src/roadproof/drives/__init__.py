@@ -4,6 +4,7 @@ from roadproof.drives.drives import Drive as Drive
 from roadproof.drives.drives import Drives as Drives
 from roadproof.drives.drives import load_drives as load_drives
 from roadproof.drives.record import record as record
+from roadproof.drives.record import record_along as record_along
 from roadproof.drives.trajectories import Scheme as Scheme
 from roadproof.drives.trajectories import SteeringNoise as SteeringNoise
 from roadproof.drives.trajectories import Swerve as Swerve

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from roadproof.datatypes import VehicleState, Weather
-from roadproof.drives.trajectories import Plan, Scheme, SteeringNoise, Swerve, Trajectories, Window
+from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.files import read_json, write_atomically, write_folder_atomically
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
@@ -159,14 +159,14 @@ def write_drive(drive: Drive, folder: Path) -> None:
     write_folder_atomically(folder / drive.name, write)
 
 
-def read_drive(plan: Plan, folder: Path) -> Drive | None:
+def read_drive(name: str, folder: Path) -> Drive | None:
     """A finished drive of a recording, or None where it is not finished.
 
     Raises:
         RecordingError: it is damaged.
         EpisodeError: its episode is.
     """
-    path = folder / plan.name / "drive.npz"
+    path = folder / name / "drive.npz"
     if not path.parent.is_dir():
         return None
     try:
@@ -175,7 +175,7 @@ def read_drive(plan: Plan, folder: Path) -> Drive | None:
             arrays: dict[str, Any] = {name: np.asarray(stored[name]) for name in _PER_FRAME}
             about = json.loads(str(stored["about"]))
         drive = Drive(
-            name=plan.name,
+            name=name,
             push=Push(about["push"]),
             episode=Episode.load(path.with_name("episode.npz")),
             calls=int(about["calls"]),
@@ -204,7 +204,7 @@ def load_drives(folder: Path) -> Drives:
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
     settings = _from_json(read_json(folder / "record.json", FORMAT, FORMAT_VERSION, RecordingError), folder)
     plans = settings.trajectories.plans()
-    drives = [read_drive(plan, folder) for plan in plans]
+    drives = [read_drive(plan.name, folder) for plan in plans]
     missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]
     if missing:
         raise RecordingError(f"{folder} lacks the drive {missing[0]}; give the same `roadproof record` again to finish")

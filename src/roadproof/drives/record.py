@@ -19,8 +19,9 @@ from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Win
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, homography_from_pose
 from roadproof.recordings import Push
-from roadproof.rollout import Driver, Episode, Policy, SimulatorT, policy_of, rollout
+from roadproof.rollout import Driver, Episode, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import Simulator
 
 TRIES = 4
 SMALLER = 0.7
@@ -80,7 +81,7 @@ def record(
     drives: list[Drive] = []
     for done, plan in enumerate(settings.trajectories.plans()):
         on_drive(done)
-        drive = None if folder is None else read_drive(plan, folder)
+        drive = None if folder is None else read_drive(plan.name, folder)
         if drive is None:
             clean = drives[0] if drives else None
             drive = (
@@ -91,6 +92,61 @@ def record(
         drives.append(drive)
     on_drive(len(drives))
     return Drives(settings=settings, drives=tuple(drives))
+
+
+def record_along(
+    simulator: Simulator,
+    controller: Controller,
+    drives: Drives,
+    episode: Episode,
+    *,
+    name: str,
+    folder: Path | None = None,
+) -> Drive:
+    """Record the bare road along a drive made before: its controls given again, open loop, with no paint.
+
+    What the paint did to it is in the way it goes, and it alone; where it came to harm, the drive is cut. It counts as
+    pushed to the side on which it was furthest from the clean drive.
+
+    Args:
+        simulator: an open simulator, the one the drives were recorded in.
+        controller: asked for its answers to the frames, which are not carried out.
+        drives: a recording of the same scenario; gives scenario, weather, window and clean drive.
+        episode: what is driven again.
+        name: of the drive.
+        folder: keeps it; a drive it holds already is not driven again.
+
+    Raises:
+        RecordingError: the canvas never comes into view, or the drive in the folder is damaged.
+        SimulatorError, ScenarioError, ControllerError: as `rollout` does.
+        OutputError: the folder cannot be written.
+    """
+    kept = None if folder is None else read_drive(name, folder)
+    if kept is not None:
+        return kept
+    settings, clean = drives.settings, drives.drives[0]
+    path = CleanPath.of(clean.episode)
+    last_m, _ = path.locate(clean.states[-1], None)
+    harm_s = min((event.time_s for event in episode.events if event.kind in _ENDS_IT), default=np.inf)
+    film, at_m = _Film(settings.scenario, settings.window), None
+
+    def over(seen: Observation) -> bool:
+        nonlocal at_m
+        at_m, _ = path.locate(seen.state, at_m)
+        return at_m > last_m + AFTER_M or seen.time_s >= harm_s
+
+    again = rollout(simulator, replay(episode), settings.scenario, weather=settings.weather, on_step=film, until=over)
+    chosen = _chosen(film, settings, name)
+    steps, frames, which = chosen
+    answers = np.zeros(len(again))
+    for step, frame in zip(steps.tolist(), frames, strict=True):
+        answers[step] = controller.act(frame, float(again.speed_mps[step]), int(again.command[step])).steer
+    right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in which])
+    push = Push.RIGHT if right_m[np.abs(right_m).argmax()] > 0 else Push.LEFT
+    drive = _drive(Plan(name, push, 0.0, 0), again, chosen, answers, right_m)
+    if folder is not None:
+        write_drive(drive, folder)
+    return drive
 
 
 Frame: TypeAlias = UInt8[np.ndarray, "h w 3"]
