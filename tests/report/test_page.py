@@ -9,9 +9,11 @@ import pytest
 
 from browser import opened, until
 from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.ledger import Ledger
+from roadproof.patterns import save_pattern
 from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
-from runs import CRASH, read_result, write_attack, write_evaluation, write_film, write_run
+from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run
 
 SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
 HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)>"&'{{7*7}}$\\frac{1}{2}$"""
@@ -87,6 +89,32 @@ def test_the_numbers_shown_are_those_of_the_evaluation(run):
         assert f"{row.points.value:.1f}" in text
     # Four drives of eight penalty points each, by hand: wrong lane 2 and a tree 6; none on the bare road.
     assert "costs 8.0 ± 0.0 penalty points instead of 0.0 ± 0.0" in text
+
+
+def test_the_costs_shown_are_those_of_the_ledger_where_there_is_one(tmp_path):
+    write_run(tmp_path)
+    ledger = Ledger(tmp_path, "this run", ("record", "calibrate", "attack", "select", "rounds", "evaluate"))
+    for stage, calls in {"record": 4, "calibrate": 6, "attack": 0, "select": 7, "evaluate": 12}.items():
+        with ledger.stage(stage):
+            ledger.calls(stage, calls)
+    page = report_of(tmp_path)
+    costs = read_result(tmp_path)["cost"]
+    assert {each["stage"]: each["simulator_calls"] for each in costs} == {
+        "record": 4, "calibrate": 6, "attack": 0, "select": 7, "evaluate": 12
+    }  # fmt: skip
+    assert all(each["seconds"] > 0 for each in costs)
+    assert [each["frames"] for each in costs if each["stage"] == "attack"] != [None]
+    assert "select 7" in page.text
+    assert "Seconds are of the whole run" in page.text
+
+
+def test_the_figures_listed_are_those_of_the_pattern_that_was_chosen(tmp_path):
+    write_run(tmp_path)
+    attack = tmp_path / "attack" / "pattern.json"
+    save_pattern(dataclasses.replace(PATTERN, colours=PATTERN.colours.flip(0)), attack)
+    assert "#e5cc1a" not in report_of(tmp_path).text, "the attack's strongest is not what was painted"
+    save_pattern(PATTERN, tmp_path / "pattern.json")
+    assert "#e5cc1a" in report_of(tmp_path).text
 
 
 def test_the_page_needs_nothing_from_outside(run):

@@ -16,6 +16,7 @@ from PIL import Image
 import roadproof
 from roadproof.calibration.report import Spread
 from roadproof.files import write_atomically
+from roadproof.ledger import StageCost
 from roadproof.metrics import counted
 from roadproof.patterns import Pattern, raster
 from roadproof.report import charts
@@ -72,6 +73,7 @@ def render(run: Run) -> str:
             recorded=_recorded(run),
             calibration=_calibration(run),
             costs=_costs(run),
+            whole=bool(run.cost),
             commands=commands_of(run),
         )
     )
@@ -192,11 +194,11 @@ def _judged(judged: Judged | None) -> Fields | None:
 
 def _pattern(run: Run) -> Fields | None:
     """What is painted, as it lies on the road."""
-    pattern = None if run.attack is None else run.attack.pattern
+    pattern = run.pattern
     canvas = None if run.judged is None else run.judged.evaluation.scenario.canvas
     if run.judged is not None:
         paint = run.judged.paint
-        # The attack's own figures are listed only if they are what was painted.
+        # Its figures are listed only if they are what was painted.
         pattern = pattern if pattern is not None and np.array_equal(raster(pattern), paint) else None
     elif pattern is not None:
         paint = raster(pattern)
@@ -325,7 +327,14 @@ def _spread(spread: Spread | None) -> str:
 
 
 def _costs(run: Run) -> list[Fields]:
-    """Simulator calls and seconds of each stage; None where the stage did not note them."""
+    """Simulator calls, seconds and the controller's frames of each stage; None where they were not noted."""
+    if run.cost:
+        frames = {} if run.attack is None else {"attack": run.attack.cost.controller_frames}
+        return [
+            {"stage": stage, **asdict(cost), "frames": frames.get(stage)}
+            for stage, cost in run.cost.items()
+            if cost != StageCost()
+        ]
     costs: list[Fields] = []
     if run.drives is not None:
         costs.append({"stage": "record", "simulator_calls": run.drives.calls, "seconds": None, "frames": None})

@@ -4,6 +4,8 @@ RUN/record/DRIVE/episode.npz   recorded drives
 RUN/recordings/                the same, calibrated (`roadproof.recordings`)
 RUN/attack/                    what the attack found (`roadproof.attacks`)
 RUN/evaluation/                what driving over it showed (`roadproof.evaluation`)
+RUN/pattern.json               optional: the pattern that was chosen in the end
+RUN/run.json                   optional: what the stages took (`roadproof.ledger`)
 RUN/commands.txt               optional: the commands that made it, one a line
 """
 
@@ -22,6 +24,8 @@ from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Trial
 from roadproof.evaluation.result import load_paint
+from roadproof.ledger import StageCost, read_cost
+from roadproof.patterns import Pattern, load_pattern
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.report.film import FILM, POSTER, STRIP, Strip
 from roadproof.rollout import Episode
@@ -68,6 +72,8 @@ class Run:
         calibration: what the calibration says of itself.
         attack: the attack's result.
         judged: the evaluation.
+        pattern: that was chosen in the end; the attack's own where the run says nothing else.
+        cost: of each stage since the run began; empty where the run keeps no ledger.
         commands: that made it, where they were kept.
     """
 
@@ -77,6 +83,8 @@ class Run:
     calibration: CalibrationReport | None
     attack: AttackResult | None
     judged: Judged | None
+    pattern: Pattern | None
+    cost: dict[str, StageCost]
     commands: tuple[str, ...]
 
 
@@ -88,13 +96,17 @@ def read_run(folder: Path) -> Run:
     """
     if not folder.is_dir():
         raise RoadproofError(f"no folder {folder}; expected a run with record, recordings, attack or evaluation in it")
+    attack = AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None
+    chosen = load_pattern(path) if (path := folder / "pattern.json").exists() else attack and attack.pattern
     run = Run(
         folder=folder,
         drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
         calibration=load_report(report) if (report := folder / "calibration" / "report.json").exists() else None,
-        attack=AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None,
+        attack=attack,
         judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,
+        pattern=chosen,
+        cost=read_cost(folder),
         commands=_commands(folder / "commands.txt"),
     )
     if run.drives is None and run.recordings is None and run.attack is None and run.judged is None:
