@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from roadproof.errors import OutputError, RecordingError
-from roadproof.photometry import PixelMaps
-from roadproof.recordings import Push, RecordingSet, load_recordings, save_recordings
+from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
+from roadproof.recordings import Push, RecordingSet, load_recordings, pooled, save_recordings
 from scenes import PLAIN, recording, recording_set
 
 PER_FRAME = ("frames", "frame_number", "image_from_canvas", "speed_mps", "command", "steer")
@@ -153,3 +153,18 @@ def test_two_drives_need_two_names():
 
 def test_a_set_keeps_its_type():
     assert isinstance(recording_set(), RecordingSet)
+
+
+def test_sets_are_pooled_and_all_their_drives_keep_a_name():
+    dry, wet = recording_set(frames=3), recording_set(frames=2)
+    both = pooled({"noon": dry, "rain": wet})
+    assert [drive.name for drive in both.recordings] == [
+        "clean", "right", "left", "rain-clean", "rain-right", "rain-left"
+    ]  # fmt: skip
+    assert [len(drive.frames) for drive in both.recordings] == [3, 3, 3, 2, 2, 2]
+    assert pooled({"noon": dry}).recordings == dry.recordings
+    darker = replace(wet, colour=ColourTransform(AffineResponse(0.5 * torch.eye(3), torch.zeros(3))))
+    with pytest.raises(RecordingError, match="the recordings rain have another camera, crop or colour"):
+        pooled({"noon": dry, "rain": darker})
+    with pytest.raises(RecordingError, match="at least one set"):
+        pooled({})

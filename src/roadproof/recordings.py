@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -142,6 +143,27 @@ class RecordingSet:
                     f"drive {recording.name} has frames of {width}×{height}, "
                     f"expected {self.view.width_px}×{self.view.height_px} as the set's crop and resize make them"
                 )
+
+
+def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
+    """The drives of several sets as one, such as the same drives in several weathers.
+
+    Args:
+        sets: by name; drives of all but the first are named after theirs.
+
+    Raises:
+        RecordingError: there is none, or one differs in camera, crop or colour transform; per-pixel maps may differ.
+    """
+    first, *others = sets.values() or (None,)
+    if first is None:
+        raise RecordingError("there are no recordings to pool, expected at least one set")
+    drives = list(first.recordings)
+    for name, each in list(sets.items())[1:]:
+        if (each.camera, each.view, each.colour.to_dict()) != (first.camera, first.view, first.colour.to_dict()):
+            raise RecordingError(f"the recordings {name} have another camera, crop or colour transform than the first")
+        drives += [replace(drive, name=f"{name}-{drive.name}") for drive in each.recordings]
+    origin = "; ".join(each.origin for each in (first, *others))
+    return replace(first, recordings=tuple(drives), origin=origin)
 
 
 def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = False) -> None:

@@ -5,39 +5,41 @@
     RUN/recordings/    the drives, calibrated (`recordings`)
     RUN/attack/        what the search found (`attacks.attack`)
     RUN/selection/     which of it was strongest when driven (`evaluation.select_by_driving`)
+    RUN/round-1/       searching on where the attacked car went (`rounds`), where rounds are asked for
+    RUN/pattern.json   the pattern that was chosen in the end
     RUN/evaluation/    how bad that is, by weather, alone and in traffic (`evaluation.evaluate`)
+    RUN/run.json       what the stages took (`ledger`)
 
-Every stage goes on from what its folder holds.
+Every stage goes on from what its folder holds. A search in expectation over several weathers has the drives of each
+weather but the first in RUN/WEATHER/, as those of the first are in RUN.
 """
 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, Schedule, attack
+from roadproof.attacks import AttackResult, Schedule, attack, kept_attack
 from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
-from roadproof.drives import Drives, Scheme, Swerve, Trajectories, Window, record
+from roadproof.drives import Drives, Scheme, SteeringNoise, Swerve, Trajectories, Window, record
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Selection, evaluate, select_by_driving
-from roadproof.files import check_writable, read_json, write_atomically
+from roadproof.files import check_writable
+from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
-from roadproof.patterns import Pattern
-from roadproof.recordings import Push, RecordingSet
+from roadproof.patterns import Pattern, save_pattern
+from roadproof.recordings import Push, RecordingSet, pooled
+from roadproof.rounds import Rounds, search_on
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
 
-FORMAT = "roadproof-run"
-FORMAT_VERSION = 1
-STAGES = ("record", "calibrate", "attack", "select", "evaluate")
+STAGES = ("record", "calibrate", "attack", "select", "rounds", "evaluate")
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
 """Told of a stage's name, how much of it is done, of how much, and a word on it."""
@@ -51,13 +53,20 @@ class Budget:
         deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each; T = 1 without.
         scheme: whether those pairs are pushed right and left, or each drive to both sides at random.
         pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
+        noise_deg: as many pairs, pushed as published instead: least and most degrees added to the steering.
         frames: kept of every recorded drive.
         calibration: how the drives are calibrated.
         schedule: steps of the search.
         restarts: starts of it, for each side; of those that came through the heats, where there are some.
         select: candidates driven once each, of which the strongest is kept; 0 believes the surrogate.
-        weathers: of the evaluation; everything before is done in the first.
+        weathers: of the evaluation; candidates are driven in the first.
         runs: drives with traffic in each weather.
+        rounds: of searching on along the way that the attacked car took (`rounds`).
+        attack_weathers: of the recordings; the search is for what is strongest on average. By default the first of
+            `weathers` alone.
+
+    Raises:
+        RoadproofError: rounds without candidates to drive, or several weathers with colours that hold in one alone.
     """
 
     deviations_m: tuple[float, ...] = (1.5,)
@@ -70,11 +79,35 @@ class Budget:
     select: int = 6
     weathers: tuple[Weather, ...] = PAPER_WEATHERS
     runs: int = 10
+    rounds: int = 0
+    attack_weathers: tuple[Weather, ...] = ()
+    noise_deg: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.rounds and not self.select:
+            raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
+        if len(self.recorded_in) > 1 and self.calibration is Method.PUBLISHED:
+            raise RoadproofError(
+                f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "
+                f"choose {Method.TWO_PAINT}"
+            )
+
+    @property
+    def recorded_in(self) -> tuple[Weather, ...]:
+        """The weathers of the recordings."""
+        return self.attack_weathers or self.weathers[:1]
 
     @property
     def trajectories(self) -> int:
         """T: a clean drive, and a pair for each deviation."""
         return 1 + 2 * len(self.deviations_m)
+
+    @property
+    def perturbation(self) -> Swerve | SteeringNoise:
+        """How the pairs are pushed."""
+        if self.noise_deg is not None:
+            return SteeringNoise(*self.noise_deg)
+        return Swerve(self.deviations_m) if self.deviations_m else Swerve()
 
 
 QUICK = Budget(frames=14, schedule=Schedule.in_heats(30), runs=0)
@@ -86,19 +119,6 @@ PAPER = Budget(calibration=Method.PUBLISHED)
 BUDGETS = {"quick": QUICK, "paper": PAPER}
 
 
-@dataclass(frozen=True, slots=True)
-class StageCost:
-    """What a stage took.
-
-    Args:
-        seconds: wall time.
-        simulator_calls: drives.
-    """
-
-    seconds: float = 0.0
-    simulator_calls: int = 0
-
-
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class StressTest:
     """What came of the whole loop.
@@ -106,19 +126,21 @@ class StressTest:
     Args:
         attack: the search; its numbers are the surrogate's.
         selection: the drives over its candidates; None where the surrogate was believed.
+        rounds: what came of searching on; None where that was not asked for.
         evaluation: the drives over the chosen pattern; closed loop.
         cost: of each stage, since the run began.
     """
 
     attack: AttackResult
     selection: Selection | None
+    rounds: Rounds | None
     evaluation: Evaluation
     cost: dict[str, StageCost]
 
     @property
     def pattern(self) -> Pattern:
         """The one that was chosen in the end."""
-        return self.attack.pattern if self.selection is None else self.selection.pattern
+        return _chosen(self.attack, self.selection, self.rounds)
 
 
 def stress_test(
@@ -151,37 +173,60 @@ def stress_test(
     Raises:
         RoadproofError: the folder holds a run of something else, or a stage refuses; the message says why.
     """
+    check_writable(folder)
+    space = space or SearchSpace(figures=5)
+    # What tells this run from another.
+    told = (asdict(scenario), asdict(budget), asdict(space), seed, controller_name)
+    ledger = Ledger(folder, json.dumps(told, default=str), STAGES)
+
+    def tell(stage: str, done: int, total: int, word: str) -> None:
+        ledger.step()
+        on_progress(stage, done, total, word)
+
     run = _Run(
         simulator=simulator,
         controller=controller,
         scenario=scenario,
         folder=folder,
         budget=budget,
-        space=space or SearchSpace(figures=5),
+        space=space,
         seed=seed,
         controller_name=controller_name,
         device=device,
-        on_progress=on_progress,
+        on_progress=tell,
     )
-    check_writable(folder)
-    ledger = _Ledger(run)
     with ledger.stage("record"):
-        drives = _record(run)
-        ledger.calls("record", drives.calls)
+        drives = [_record(run, number) for number in range(len(budget.recorded_in))]
+        ledger.calls("record", sum(each.calls for each in drives))
     with ledger.stage("calibrate"):
-        calibrated = _calibrate(run, drives)
-        ledger.calls("calibrate", calibrated.report.calls - drives.calls)
+        calibrated = [_calibrate(run, number, each) for number, each in enumerate(drives)]
+        ledger.calls("calibrate", sum(replays_needed(each, budget.calibration) for each in drives))
+        recordings = pooled(
+            {str(each.settings.weather): c.recordings for each, c in zip(drives, calibrated, strict=True)}
+        )
+    groups = parse_groups("all", recordings) if budget.pooled else groups_of(recordings)
     with ledger.stage("attack"):
-        found = _attack(run, calibrated.recordings)
-    selection = None
+        found = _attack(run, recordings, groups)
+    selection, rounds = None, None
     if budget.select:
         with ledger.stage("select"):
             selection = _select(run, found)
             ledger.calls("select", selection.simulator_calls)
+    if selection is not None and budget.rounds:
+        with ledger.stage("rounds"):
+            rounds = _search_on(run, drives[0], recordings, groups, found, selection)
+            ledger.calls("rounds", rounds.simulator_calls)
+    pattern = _chosen(found, selection, rounds)
+    save_pattern(pattern, folder / "pattern.json")
     with ledger.stage("evaluate"):
-        evaluation = _evaluate(run, found.pattern if selection is None else selection.pattern)
+        evaluation = _evaluate(run, pattern)
         ledger.calls("evaluate", evaluation.simulator_calls)
-    return StressTest(attack=found, selection=selection, evaluation=evaluation, cost=ledger.cost)
+    return StressTest(attack=found, selection=selection, rounds=rounds, evaluation=evaluation, cost=ledger.cost)
+
+
+def _chosen(found: AttackResult, selection: Selection | None, rounds: Rounds | None) -> Pattern:
+    chosen = selection if rounds is None else rounds.best
+    return found.pattern if chosen is None else chosen.pattern
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -199,66 +244,89 @@ class _Run:
     device: str
     on_progress: OnProgress
 
-    @property
-    def identity(self) -> str:
-        """What tells this run from another."""
-        told = (asdict(self.scenario), asdict(self.budget), asdict(self.space), self.seed, self.controller_name)
-        return json.dumps(told, default=str)
+    def folder_of(self, number: int) -> Path:
+        """Where the drives of a weather are."""
+        return self.folder / self.budget.recorded_in[number] if number else self.folder
 
 
-def _record(run: _Run) -> Drives:
+def _record(run: _Run, number: int) -> Drives:
     budget = run.budget
-    swerve = Swerve(budget.deviations_m) if budget.deviations_m else Swerve()
-    wanted = Trajectories(count=budget.trajectories, scheme=budget.scheme, perturbation=swerve)
+    wanted = Trajectories(count=budget.trajectories, scheme=budget.scheme, perturbation=budget.perturbation)
+    total = wanted.count * len(budget.recorded_in)
     return record(
         run.simulator,
         run.controller,
         run.scenario,
-        weather=run.budget.weathers[0],
+        weather=run.budget.recorded_in[number],
         trajectories=wanted,
         window=Window(frames=run.budget.frames),
         seed=run.seed,
         driver_name=run.controller_name,
-        folder=run.folder / "record",
-        on_drive=lambda done: run.on_progress("Recording", done, wanted.count, ""),
+        folder=run.folder_of(number) / "record",
+        on_drive=lambda done: run.on_progress("Recording", number * wanted.count + done, total, ""),
     )
 
 
-def _calibrate(run: _Run, drives: Drives) -> Calibrated:
-    done = Calibrated.load(run.folder)
+def _calibrate(run: _Run, number: int, drives: Drives) -> Calibrated:
+    place = run.folder_of(number)
+    done = Calibrated.load(place)
     if done is not None:
         return done
-    total = replays_needed(drives, run.budget.calibration)
+    each = replays_needed(drives, run.budget.calibration)
+    total = each * len(run.budget.recorded_in)
     result = calibrate(
         run.simulator,
         drives,
         run.budget.calibration,
-        folder=run.folder / "calibration",
-        on_call=lambda made: run.on_progress("Calibrating", made, total, ""),
-    )
-    result.save(run.folder)
-    return result
-
-
-def _attack(run: _Run, recordings: RecordingSet) -> AttackResult:
-    place, steps = run.folder / "attack", run.budget.schedule.steps
-    if (place / "result.json").exists():
-        return AttackResult.load(place)
-    result = attack(
-        recordings,
-        run.controller,
-        run.space,
-        groups=parse_groups("all", recordings) if run.budget.pooled else groups_of(recordings),
-        schedule=run.budget.schedule,
-        restarts=run.budget.restarts,
-        seed=run.seed,
-        device=run.device,
-        checkpoint=place / "search.safetensors",
-        on_step=lambda step, best: run.on_progress("Searching", step, steps, f"shift {best:.3f}"),
+        folder=place / "calibration",
+        on_call=lambda made: run.on_progress("Calibrating", number * each + made, total, ""),
     )
     result.save(place)
-    (place / "search.safetensors").unlink(missing_ok=True)
     return result
+
+
+def _attack(run: _Run, recordings: RecordingSet, groups: tuple[Group, ...]) -> AttackResult:
+    steps = run.budget.schedule.steps
+    return kept_attack(
+        run.folder / "attack",
+        lambda checkpoint: attack(
+            recordings,
+            run.controller,
+            run.space,
+            groups=groups,
+            schedule=run.budget.schedule,
+            restarts=run.budget.restarts,
+            seed=run.seed,
+            device=run.device,
+            checkpoint=checkpoint,
+            on_step=lambda step, best: run.on_progress("Searching", step, steps, f"shift {best:.3f}"),
+        ),
+    )
+
+
+def _search_on(
+    run: _Run,
+    drives: Drives,
+    recordings: RecordingSet,
+    groups: tuple[Group, ...],
+    found: AttackResult,
+    selection: Selection,
+) -> Rounds:
+    return search_on(
+        run.simulator,
+        run.controller,
+        drives,
+        recordings,
+        groups,
+        found,
+        selection,
+        rounds=run.budget.rounds,
+        best=run.budget.select,
+        method=run.budget.calibration,
+        folder=run.folder,
+        device=run.device,
+        on_step=lambda done, total, word: run.on_progress("Searching on", done, total, word),
+    )
 
 
 def _select(run: _Run, found: AttackResult) -> Selection:
@@ -295,45 +363,3 @@ def groups_of(recordings: RecordingSet) -> tuple[Group, ...]:
     if {Push.LEFT, Push.RIGHT} <= {recording.push for recording in recordings.recordings}:
         return (RIGHT_GROUP, LEFT_GROUP)
     return parse_groups("all", recordings)
-
-
-class _Ledger:
-    """What the stages of a run took, kept in its folder.
-
-    Args:
-        run: whose.
-
-    Raises:
-        RoadproofError: the folder is another run's.
-    """
-
-    def __init__(self, run: _Run) -> None:
-        self._path, self._identity = run.folder / "run.json", run.identity
-        self.cost = {stage: StageCost() for stage in STAGES}
-        if not self._path.exists():
-            self._write()
-            return
-        stored = read_json(self._path, FORMAT, FORMAT_VERSION, RoadproofError)
-        if stored.get("identity") != self._identity:
-            raise RoadproofError(f"{run.folder} holds a run with other settings; choose another folder, or remove it")
-        self.cost |= {stage: StageCost(**cost) for stage, cost in stored.get("cost", {}).items()}
-
-    @contextmanager
-    def stage(self, name: str) -> Generator[None]:
-        """Time a stage; one that is gone on with adds to what it took before."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            before = self.cost[name]
-            self.cost[name] = replace(before, seconds=before.seconds + time.perf_counter() - began)
-            self._write()
-
-    def calls(self, name: str, simulator_calls: int) -> None:
-        """Say how many drives a stage took, from its beginning."""
-        self.cost[name] = replace(self.cost[name], simulator_calls=simulator_calls)
-
-    def _write(self) -> None:
-        cost = {stage: asdict(cost) for stage, cost in self.cost.items()}
-        content = {"format": FORMAT, "version": FORMAT_VERSION, "identity": self._identity, "cost": cost}
-        write_atomically(self._path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,6 +28,7 @@ def demo(
         ),
     ] = "pilotnet",
     budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
+    rounds: Annotated[int, typer.Option(help="Rounds of searching on along the way that the attacked car took.")] = 0,
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
     simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
@@ -47,7 +49,7 @@ def demo(
     from roadproof.stress_test import BUDGETS, stress_test
 
     tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
-    spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
+    spent = replace(BUDGETS[choice(budget, "budget", tuple(BUDGETS))], rounds=rounds)
     space = SearchSpace(figures=figures)
     who = load_controller(controller, device=device)
     with open_simulator(simulator) as world:
@@ -65,8 +67,9 @@ def demo(
                 on_progress=show,
             )
         _film(world, who, result, out)
-    given = ["--scenario", scenario, "--controller", controller, "--budget", budget, "--figures", str(figures)]
-    given += ["--seed", str(seed), "--simulator", simulator, *(["--scenarios", str(scenarios)] if scenarios else [])]
+    given = ["--scenario", scenario, "--controller", controller, "--budget", budget, "--rounds", str(rounds)]
+    given += ["--figures", str(figures), "--seed", str(seed), "--simulator", simulator]
+    given += ["--scenarios", str(scenarios)] if scenarios else []
     command = shlex.join(["roadproof", "demo", *given, "--out", str(out)])
     write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))
     _report(result, out)
@@ -81,17 +84,18 @@ def _film(world: Simulator, controller: Controller, result: StressTest, out: Pat
 
     place, evaluation = out / "evaluation", result.evaluation
     film_trial(world, evaluation, load_paint(place), place)
-    pattern = result.attack.pattern if result.selection is None else result.selection.pattern
     recordings = load_recordings(out / "recordings")
     clean = recordings.recordings[0]
     (driven,) = episodes(place, [evaluation.shown().clean])
-    rendered = rendered_frames(world, evaluation.scenario, driven, pattern, clean.frame_number)
-    compare_with_rendered(pattern, recordings, controller, rendered, drive=clean.name).save(place / "fidelity.npz")
+    rendered = rendered_frames(world, evaluation.scenario, driven, result.pattern, clean.frame_number)
+    compared = compare_with_rendered(result.pattern, recordings, controller, rendered, drive=clean.name)
+    compared.save(place / "fidelity.npz")
 
 
 def _report(result: StressTest, out: Path) -> None:
     from rich.console import Console
 
+    from roadproof.ledger import StageCost
     from roadproof.report.page import write_report
     from roadproof.report.run import read_run
     from roadproof.report.verdict import verdict
@@ -100,6 +104,8 @@ def _report(result: StressTest, out: Path) -> None:
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     say(verdict(read_run(out)).sentence)
     for stage, cost in result.cost.items():
+        if cost == StageCost():
+            continue
         drives = f", {cost.simulator_calls} drives" if cost.simulator_calls else ""
         say(f"  {stage:10} {cost.seconds:4.0f} s{drives}")
     say(f"The report is {page}, its numbers are in {page.with_name('result.json')}")

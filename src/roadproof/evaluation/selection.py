@@ -50,13 +50,18 @@ class Selection:
         pattern: it.
         driven: every candidate driven, in the surrogate's order.
         chosen: index of it among them.
-        simulator_calls: drives, the clean one included.
+        simulator_calls: drives, the clean one included where it was made for this.
     """
 
     pattern: Pattern
     driven: tuple[Driven, ...]
     chosen: int
     simulator_calls: int
+
+    @property
+    def deviation_m(self) -> float:
+        """Of the drive over the chosen one."""
+        return self.driven[self.chosen].trial.deviation_m
 
     def save(self, folder: Path) -> None:
         """Write the choice beside the drives.
@@ -109,6 +114,7 @@ def select_by_driving(
     best: int,
     weather: Weather = Weather.CLEAR_NOON,
     folder: Path,
+    clean: Episode | None = None,
     on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
 ) -> Selection:
     """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
@@ -123,6 +129,7 @@ def select_by_driving(
         best: how many are driven; every group gets its share, since the surrogate does not know which side gives way.
         weather: of the drives.
         folder: keeps every drive and the choice; what it holds is not done again.
+        clean: the drive over the bare road, where it was made already.
         on_drive: told after each drive how many are done, and the largest deviation so far.
 
     Raises:
@@ -136,6 +143,9 @@ def select_by_driving(
     if not chosen:
         raise RoadproofError(f"{len(candidates)} candidates and {best} of them to drive; expected at least one")
     drive = _Drives(simulator, controller, scenario, weather, folder)
+    calls = int(clean is None)
+    if clean is not None and not drive.path("clean").exists():
+        clean.save(drive.path("clean"))
     clean = drive("clean", None)
     on_drive(1, 0.0)
     driven: list[Driven] = []
@@ -153,7 +163,10 @@ def select_by_driving(
         on_drive(done, max(each.trial.deviation_m for each in driven))
     winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
     selection = Selection(
-        pattern=chosen[winner][1].pattern, driven=tuple(driven), chosen=winner, simulator_calls=1 + len(driven)
+        pattern=chosen[winner][1].pattern,
+        driven=tuple(driven),
+        chosen=winner,
+        simulator_calls=calls + len(driven),
     )
     selection.save(folder)
     return selection
@@ -180,8 +193,12 @@ class _Drives:
     weather: Weather
     folder: Path
 
+    def path(self, name: str) -> Path:
+        """Where a drive is kept."""
+        return self.folder / "episodes" / f"{name}.npz"
+
     def __call__(self, name: str, pattern: Pattern | None) -> Episode:
-        path = self.folder / "episodes" / f"{name}.npz"
+        path = self.path(name)
         if path.exists():
             return Episode.load(path)
         episode = rollout(self.simulator, self.driver, self.scenario, weather=self.weather, pattern=pattern)
