@@ -132,6 +132,7 @@ def rows_of(cell: Cell) -> list[Row]:
 
 def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Scenario) -> list[Row]:
     def run(name: str, budget: Budget) -> StressTest:
+        share_drives(cell, name, "evaluation")
         return stress_test(
             town,
             controller,
@@ -144,6 +145,7 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
         )
 
     def judge(name: str, pattern: Pattern, baseline: Sequence[Pattern] = ()) -> Evaluation:
+        share_drives(cell, name)
         return evaluate(
             town, controller, scenario, pattern, folder=cell.folder / name, runs=0, baseline=baseline,
             driver_name=cell.controller,
@@ -189,6 +191,16 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
         pushed = _pushed(cell, name)
         rows.append(row(cell, method, result.evaluation, **cost(result, *FOUND_BY, "select"), pushed_m=pushed))
     return sorted(rows, key=lambda each: METHODS.index(each["method"]))
+
+
+def share_drives(cell: Cell, *place: str) -> None:
+    """Let all evaluations of a cell keep their drives in one folder, so that the bare road is driven once."""
+    link = cell.folder.joinpath(*place, "episodes")
+    link.parent.mkdir(parents=True, exist_ok=True)
+    drives = cell.folder / "episodes"
+    drives.mkdir(exist_ok=True)
+    if not link.is_symlink():
+        link.symlink_to(drives.resolve(), target_is_directory=True)
 
 
 def _pushed(cell: Cell, name: str) -> list[float]:

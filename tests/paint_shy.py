@@ -4,8 +4,10 @@ import dataclasses
 
 import torch
 
+from carla_serving import straight_map
 from roadproof.datatypes import Control, VehicleState
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.geometry import CanvasPlacement
+from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 
 
 class PaintShy:
@@ -35,3 +37,16 @@ def just_before_the_canvas(time_limit_s):
     start = VehicleState(x_m=291.75, y_m=222.0, z_m=0.0, yaw_rad=1.571, speed_mps=6.0)
     left = find_scenario("left-03", builtin_scenarios())
     return dataclasses.replace(left, name="short", start=start, time_limit_s=time_limit_s)
+
+
+def along_a_street(folder, time_limit_s=4.0):
+    """A straight street of its own, which is built far sooner than the town, with a canvas 17 m ahead."""
+    return Scenario(
+        name="street",
+        kind="straight",
+        map_name=str(straight_map(folder, length_m=100.0)),
+        start=VehicleState(x_m=15.0, y_m=-1.75, z_m=0.0, yaw_rad=0.0, speed_mps=6.0),
+        goal_m=(80.0, -1.75),
+        canvas=CanvasPlacement(x_m=32.0, y_m=0.0, width_m=6.6),
+        time_limit_s=time_limit_s,
+    )

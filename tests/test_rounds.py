@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from paint_shy import PaintShy, just_before_the_canvas
+from paint_shy import PaintShy, along_a_street
 from roadproof.attacks import Heat, Schedule
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
@@ -18,7 +18,7 @@ from roadproof.recordings import Push
 from roadproof.search_space import SearchSpace
 from roadproof.stress_test import Budget, stress_test
 
-SHORT = just_before_the_canvas(4.5)
+pytestmark = pytest.mark.slow
 NOON, RAIN = Weather.CLEAR_NOON, Weather.RAINY_NOON
 BUDGET = Budget(
     deviations_m=(0.8,),
@@ -41,14 +41,20 @@ def town():
         yield world
 
 
-def run(town, folder, budget, **options):
-    return stress_test(town, PaintShy(gain=30.0), SHORT, folder, budget=budget, space=SearchSpace(figures=2), **options)
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    return along_a_street(tmp_path_factory.mktemp("map"), 3.2)
+
+
+def run(town, street, folder, budget, **options):
+    space = SearchSpace(figures=2)
+    return stress_test(town, PaintShy(gain=30.0), street, folder, budget=budget, space=space, **options)
 
 
 @pytest.fixture(scope="module")
-def done(town, tmp_path_factory):
+def done(town, street, tmp_path_factory):
     folder, told = tmp_path_factory.mktemp("rounds"), []
-    result = run(town, folder, BUDGET, on_progress=lambda *each: told.append(each))
+    result = run(town, street, folder, BUDGET, on_progress=lambda *each: told.append(each))
     return folder, result, told
 
 
@@ -92,11 +98,11 @@ def test_a_round_begins_where_the_search_before_it_came_to(done):
     np.testing.assert_allclose(sorted(again.history[0, 1]), before, atol=1e-3)
 
 
-def test_what_is_done_is_not_done_again(done, town):
+def test_what_is_done_is_not_done_again(done, town, street):
     folder, result, told = done
     files = {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")}
     words = []
-    again = run(town, folder, BUDGET, on_progress=lambda *each: words.append(each))
+    again = run(town, street, folder, BUDGET, on_progress=lambda *each: words.append(each))
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.npz")} == files
     assert again.evaluation.trials == result.evaluation.trials
     assert again.rounds.best.driven == result.rounds.best.driven
@@ -106,7 +112,7 @@ def test_what_is_done_is_not_done_again(done, town):
     assert on[-1] == 16
 
 
-def test_a_round_that_cannot_be_calibrated_ends_them(done, town, tmp_path, monkeypatch):
+def test_a_round_that_cannot_be_calibrated_ends_them(done, town, street, tmp_path, monkeypatch):
     import shutil
 
     folder = shutil.copytree(done[0], tmp_path / "run")
@@ -118,14 +124,14 @@ def test_a_round_that_cannot_be_calibrated_ends_them(done, town, tmp_path, monke
         raise CalibrationError("drive round-2 has 1 of 6 frames left")
 
     monkeypatch.setattr("roadproof.rounds.calibrate", blind)
-    rounds = run(town, folder, BUDGET).rounds
+    rounds = run(town, street, folder, BUDGET).rounds
     assert len(rounds.done) == 1
     assert rounds.stopped == "round 2: drive round-2 has 1 of 6 frames left"
 
 
-def test_one_search_may_be_for_several_weathers(town, tmp_path):
+def test_one_search_may_be_for_several_weathers(town, street, tmp_path):
     budget = dataclasses.replace(BUDGET, rounds=1, attack_weathers=(NOON, RAIN), deviations_m=())
-    result = run(town, tmp_path, budget)
+    result = run(town, street, tmp_path, budget)
     assert result.cost["record"].simulator_calls == 2
     assert result.cost["calibrate"].simulator_calls == 4
     assert (tmp_path / "rainy-noon" / "recordings" / "recordings.json").exists()
