@@ -43,12 +43,12 @@ from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, evaluate, random_patterns
 from roadproof.files import write_atomically
 from roadproof.ledger import StageCost
+from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.metrics import mean_95
 from roadproof.patterns import Pattern
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
-from roadproof.stress_test import Budget, StressTest, stress_test
 
 SCENARIOS = ("left-03", "right-05", "straight-04", "left-07", "right-02", "straight-09")
 METHODS = ("no paint", "random", "T=1", "T=3 published", "T=3 metres", "+ driven", "+ rounds", "+ weathers")

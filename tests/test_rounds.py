@@ -14,9 +14,9 @@ from roadproof.datatypes import Weather
 from roadproof.drives.drives import read_drive
 from roadproof.errors import CalibrationError, RoadproofError
 from roadproof.evaluation.result import episodes
+from roadproof.loop import Budget, stress_test
 from roadproof.recordings import Push
 from roadproof.search_space import SearchSpace
-from roadproof.stress_test import Budget, stress_test
 
 pytestmark = pytest.mark.slow
 NOON, RAIN = Weather.CLEAR_NOON, Weather.RAINY_NOON

@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     from roadproof.compositing import composite as composite
     from roadproof.compositing import view_canvas as view_canvas
     from roadproof.controllers import Controller as Controller
+    from roadproof.controllers import CruiseControl as CruiseControl
     from roadproof.controllers import check_controller as check_controller
     from roadproof.controllers import load_controller as load_controller
     from roadproof.coverage import Shape as Shape
+    from roadproof.datatypes import Control as Control
+    from roadproof.datatypes import Weather as Weather
     from roadproof.errors import RoadproofError as RoadproofError
     from roadproof.evaluation import Evaluation as Evaluation
     from roadproof.evaluation import evaluate as evaluate
@@ -28,11 +31,18 @@ if TYPE_CHECKING:
     from roadproof.geometry import CropResize as CropResize
     from roadproof.geometry import homography_from_points as homography_from_points
     from roadproof.geometry import homography_from_pose as homography_from_pose
+    from roadproof.loop import PAPER as PAPER
+    from roadproof.loop import QUICK as QUICK
+    from roadproof.loop import Budget as Budget
+    from roadproof.loop import StressTest as StressTest
+    from roadproof.loop import stress_test as stress_test
     from roadproof.objectives import Group as Group
+    from roadproof.objectives import parse_groups as parse_groups
     from roadproof.patterns import Pattern as Pattern
     from roadproof.patterns import load_pattern as load_pattern
     from roadproof.patterns import raster as raster
     from roadproof.patterns import save_pattern as save_pattern
+    from roadproof.photometry import AffineResponse as AffineResponse
     from roadproof.photometry import ColourTransform as ColourTransform
     from roadproof.photometry import fit_colour as fit_colour
     from roadproof.recordings import Push as Push
@@ -40,23 +50,33 @@ if TYPE_CHECKING:
     from roadproof.recordings import RecordingSet as RecordingSet
     from roadproof.recordings import load_recordings as load_recordings
     from roadproof.recordings import save_recordings as save_recordings
+    from roadproof.report.page import write_report as write_report
+    from roadproof.scenarios import Scenario as Scenario
+    from roadproof.scenarios import builtin_scenarios as builtin_scenarios
+    from roadproof.scenarios import find_scenario as find_scenario
     from roadproof.search_space import SearchSpace as SearchSpace
+    from roadproof.simulators.town.simulator import TownSimulator as TownSimulator
 
 __version__ = "0.1.0"
 
 _ROOMS = {
     "attacks": ("AttackResult", "Schedule", "attack", "show_pattern"),
     "compositing": ("CanvasView", "composite", "view_canvas"),
-    "controllers": ("Controller", "check_controller", "load_controller"),
+    "controllers": ("Controller", "CruiseControl", "check_controller", "load_controller"),
     "coverage": ("Shape",),
+    "datatypes": ("Control", "Weather"),
     "errors": ("RoadproofError",),
     "evaluation": ("Evaluation", "evaluate"),
     "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
-    "objectives": ("Group",),
+    "loop": ("Budget", "PAPER", "QUICK", "StressTest", "stress_test"),
+    "objectives": ("Group", "parse_groups"),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
-    "photometry": ("ColourTransform", "fit_colour"),
+    "photometry": ("AffineResponse", "ColourTransform", "fit_colour"),
     "recordings": ("Push", "Recording", "RecordingSet", "load_recordings", "save_recordings"),
+    "report.page": ("write_report",),
+    "scenarios": ("Scenario", "builtin_scenarios", "find_scenario"),
     "search_space": ("SearchSpace",),
+    "simulators.town.simulator": ("TownSimulator",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

@@ -11,6 +11,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from roadproof.errors import RoadproofError
 from roadproof.files import read_json, write_atomically
@@ -101,13 +102,9 @@ def read_cost(folder: Path) -> dict[str, StageCost]:
     return _costs(read_json(path, FORMAT, FORMAT_VERSION, RoadproofError), path) if path.exists() else {}
 
 
-def _costs(stored: dict[str, object], path: Path) -> dict[str, StageCost]:
-    cost = stored.get("cost")
+def _costs(stored: dict[str, Any], path: Path) -> dict[str, StageCost]:
     try:
-        if not isinstance(cost, dict):
-            raise TypeError(f"cost is {cost!r}")
-        return {
-            str(stage): StageCost(float(each["seconds"]), int(each["simulator_calls"])) for stage, each in cost.items()
-        }
-    except (KeyError, TypeError, ValueError) as error:
+        cost: dict[str, dict[str, float]] = stored["cost"]
+        return {stage: StageCost(float(each["seconds"]), int(each["simulator_calls"])) for stage, each in cost.items()}
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove it, the stages stay") from None

@@ -7,7 +7,7 @@ import pytest
 from roadproof.attacks import Schedule
 from roadproof.cli import main
 from roadproof.datatypes import Weather
-from roadproof.stress_test import BUDGETS, Budget
+from roadproof.loop import BUDGETS, Budget
 
 TINY = Budget(frames=4, schedule=Schedule.stretched(2), restarts=1, select=1, weathers=(Weather.CLEAR_NOON,), runs=0)
 

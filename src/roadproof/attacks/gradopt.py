@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -152,7 +153,7 @@ def gradopt(
     if restarts < 1:
         raise RoadproofError(f"restarts is {restarts}, expected 1 or more")
     rungs = _rungs(schedule, restarts)
-    given = [points.tolist() for points in starts]
+    given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, schedule, restarts, seed, given, surrogate.fingerprint()))
     state = load_checkpoint(checkpoint, identity, surrogate.device) if checkpoint else None
     if state is None:

@@ -11,8 +11,8 @@ import typer
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
+    from roadproof.loop import StressTest
     from roadproof.simulators.protocol import Simulator
-    from roadproof.stress_test import StressTest
 
 
 def demo(
@@ -43,10 +43,10 @@ def demo(
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.files import write_atomically
+    from roadproof.loop import BUDGETS, stress_test
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
-    from roadproof.stress_test import BUDGETS, stress_test
 
     tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
     spent = replace(BUDGETS[choice(budget, "budget", tuple(BUDGETS))], rounds=rounds)

@@ -49,11 +49,11 @@ from roadproof.drives import Scheme
 from roadproof.evaluation import DrivenObjective, Evaluation, evaluate
 from roadproof.evaluation.objective import Measure
 from roadproof.evaluation.result import Trial, episodes, path_of
+from roadproof.loop import Budget, stress_test
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.stress_test import Budget, stress_test
 from roadproof.study.plan import BLACK, Job, MethodPlan
 from roadproof.study.rows import JobResult, Row, job_columns
 

@@ -10,10 +10,10 @@ from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, Selection
+from roadproof.loop import BUDGETS, STAGES, Budget, stress_test
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
-from roadproof.stress_test import BUDGETS, STAGES, Budget, stress_test
 
 TINY = Budget(frames=4, schedule=Schedule.stretched(3), restarts=2, select=2, weathers=(Weather.CLEAR_NOON,), runs=0)
 STAGE_OF_WORD = {

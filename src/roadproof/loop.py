@@ -59,11 +59,11 @@ class Budget:
         schedule: steps of the search.
         restarts: starts of it, for each side; of those that came through the heats, where there are some.
         select: candidates driven once each, of which the strongest is kept; 0 believes the surrogate.
-        weathers: of the evaluation; candidates are driven in the first.
+        weathers: of the evaluation.
         runs: drives with traffic in each weather.
         rounds: of searching on along the way that the attacked car took (`rounds`).
-        attack_weathers: of the recordings; the search is for what is strongest on average. By default the first of
-            `weathers` alone.
+        attack_weathers: of the recordings; the search is for what is strongest on average, and candidates are driven
+            in the first. By default the first of `weathers` alone.
 
     Raises:
         RoadproofError: rounds without candidates to drive, or several weathers with colours that hold in one alone.
@@ -337,7 +337,7 @@ def _select(run: _Run, found: AttackResult) -> Selection:
         run.scenario,
         found.candidates,
         best=run.budget.select,
-        weather=run.budget.weathers[0],
+        weather=run.budget.recorded_in[0],
         folder=run.folder / "selection",
         on_drive=lambda done, best: run.on_progress("Choosing by driving", done, total, f"{best:.2f} m"),
     )
