@@ -1,0 +1,112 @@
+"""A run that is killed in every stage, without warning, ends as one that is not."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import time
+
+import numpy as np
+import pytest
+
+from roadproof.attacks import AttackResult
+from roadproof.evaluation import Evaluation, Selection
+from roadproof.ledger import read_cost
+from roadproof.report.run import read_run
+
+pytest.importorskip("panda3d", reason="panda3d is not installed")
+pytest.importorskip("av", reason="av is not installed")
+
+FIRST_STEP = {
+    "record": ("record/clean", "record/left"),
+    "calibrate": ("calibration/*-light.npz", "recordings"),
+    "attack": ("attack/search.safetensors", "attack/result.json"),
+    "select": ("selection/episodes/*.npz", "selection/selection.json"),
+    "rounds": ("round-1/attack/search.safetensors", "round-1/selection/selection.json"),
+    "evaluate": ("evaluation/episodes/*.npz", "evaluation/evaluation.json"),
+    "report": ("evaluation/evaluation.json", "report.html"),
+}
+"""What shows that a stage has done its first step, and what it leaves when it is done."""
+PATIENCE_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    """Starts the demo in a process of its own, which finds everything imported."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["demo_child"])
+
+    def begin(folder):
+        import demo_child
+
+        process = context.Process(target=demo_child.demo, args=(folder, folder.with_suffix(".log")))
+        process.start()
+        return process
+
+    return begin
+
+
+def finished(folder):
+    """Drives, replays and episodes that are whole: each is moved into place when it is."""
+    parts = {".npz"}
+    return {
+        path: (path.stat().st_ino, path.stat().st_mtime_ns)
+        for path in folder.rglob("*")
+        if path.suffix in parts and not any(name.startswith(".") for name in path.relative_to(folder).parts)
+    }
+
+
+def kill_at_first_step(process, folder, stage):
+    sign, last = FIRST_STEP[stage]
+    until = time.monotonic() + PATIENCE_S
+    while not any(folder.glob(sign)):
+        assert process.is_alive(), f"ended before {stage}: {folder.with_suffix('.log').read_text()}"
+        assert time.monotonic() < until, f"{stage} does not begin"
+        time.sleep(0.002)
+    process.kill()
+    process.join()
+    assert not (folder / last).exists(), f"killed after {stage}, not in it"
+
+
+@pytest.mark.slow
+def test_a_run_killed_in_every_stage_ends_as_one_that_is_not(start, tmp_path):
+    straight, killed = tmp_path / "straight", tmp_path / "killed"
+    whole = start(straight)
+    before = {}
+    for stage in FIRST_STEP:
+        process = start(killed)
+        kill_at_first_step(process, killed, stage)
+        now = finished(killed)
+        assert before.items() <= now.items(), f"something was done twice before {stage}"
+        before = now
+    process = start(killed)
+    for each in (process, whole):
+        each.join(PATIENCE_S)
+        assert each.exitcode == 0
+    assert (straight / "report.html").exists(), straight.with_suffix(".log").read_text()
+    assert (killed / "report.html").exists(), killed.with_suffix(".log").read_text()
+    assert before.items() <= finished(killed).items(), "something was done twice"
+    check_same(straight, killed)
+
+
+def check_same(one, two):
+    assert {path.relative_to(one) for path in finished(one)} == {path.relative_to(two) for path in finished(two)}
+    for place in ("attack", "round-1/attack"):
+        results = [AttackResult.load(folder / place) for folder in (one, two)]
+        np.testing.assert_array_equal(results[0].history, results[1].history)
+        assert results[0].by_group == results[1].by_group
+    for place in ("selection", "round-1/selection"):
+        assert Selection.load(one / place).driven == Selection.load(two / place).driven
+    assert (one / "pattern.json").read_bytes() == (two / "pattern.json").read_bytes()
+    assert Evaluation.load(one / "evaluation").trials == Evaluation.load(two / "evaluation").trials
+    costs = [read_cost(folder) for folder in (one, two)]
+    assert {k: c.simulator_calls for k, c in costs[0].items()} == {k: c.simulator_calls for k, c in costs[1].items()}
+    assert all(cost.seconds > 0 for cost in costs[1].values())
+    # Every file of the run can be read; what a killed process left half written is not among them.
+    assert read_run(two).judged is not None
+    numbers = [json.loads((folder / "result.json").read_text()) for folder in (one, two)]
+    for content in numbers:
+        content.pop("cost")
+        content.pop("calibration")
+        content.pop("name")
+    assert numbers[0] == numbers[1]
