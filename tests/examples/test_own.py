@@ -1,0 +1,69 @@
+"""The examples that the README shows, run as they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import roadproof.loop
+from references import approach
+from roadproof.attacks import Schedule
+from roadproof.controllers import check_controller
+from roadproof.datatypes import Weather
+from roadproof.evaluation import Evaluation
+from roadproof.geometry import apply_homography
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(name, *arguments, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+    return runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+
+def test_a_recording_of_ones_own_is_attacked(tmp_path, monkeypatch, capsys):
+    homographies = approach(3, last_m=10.0)
+    corners = np.array([[-0.5, -0.5], [399.5, -0.5], [399.5, 399.5], [-0.5, 399.5]])
+    seen = [apply_homography(each, corners).ravel() for each in homographies]
+    rng = np.random.default_rng(0)
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    for number in range(3):
+        Image.fromarray(rng.integers(90, 140, (600, 800, 3), np.uint8)).save(drive / f"{number}.png")
+    np.savetxt(drive / "corners.csv", np.column_stack([seen, np.full(3, 6.0)]), delimiter=",")
+    # The example's own search, less of it.
+    monkeypatch.setattr(Schedule, "in_heats", staticmethod(lambda: Schedule(iterations=4, drops=())))
+    run("own_recording.py", drive, "pilotnet", tmp_path / "out", monkeypatch=monkeypatch)
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["surrogate_shift"] > 0
+    assert list(result["by_group"]) == ["all"]
+    assert (tmp_path / "out" / "pattern.png").exists()
+    assert "steer a frame, predicted" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    tiny = dataclasses.replace(
+        roadproof.loop.QUICK,
+        frames=5,
+        schedule=Schedule(iterations=8, drops=()),
+        restarts=2,
+        select=2,
+        weathers=(Weather.CLEAR_NOON,),
+    )
+    monkeypatch.setattr(roadproof.loop, "QUICK", tiny)
+    names = run("own_controller.py", tmp_path, monkeypatch=monkeypatch)
+    check_controller(names["LineFollower"]()).require()
+    (trial,) = Evaluation.load(tmp_path / "evaluation").trials
+    assert trial.clean_points == 0, "it drives where nothing is painted"
+    assert trial.ending == "goal reached" or trial.points > 0
+    assert f"clear-noon: {trial.deviation_m:.2f} m" in capsys.readouterr().out
+    assert (tmp_path / "report.html").exists()
