@@ -323,6 +323,36 @@ def test_depth_and_kinds_of_things_fit_the_picture(world):
     assert depth[0, 80] > 999
 
 
+def test_pieces_of_road_take_textures_until_the_map_is_loaded_again(client, world):
+    names = list(world.get_names_of_all_objects())
+    assert names == [f"Road_Road_street_{number}" for number in range(8)]
+    place = carla.Transform(carla.Location(40.0, 0.0, 8.0), carla.Rotation(pitch=-35.0))
+    size = {"image_size_x": 80, "image_size_y": 80, "fov": 60}
+    magenta = carla.TextureColor(4, 4)
+    for k in range(16):
+        magenta.set(k % 4, k // 4, carla.Color(255, 0, 255))
+
+    def magenta_share(shown_world):
+        _, image = shown(shown_world, sensor(shown_world, None, "camera.rgb", place, **size))
+        picture = pixels(image).astype(int)
+        return float((np.minimum(picture[..., 0], picture[..., 2]) - picture[..., 1] > 60).mean())
+
+    diffuse = carla.MaterialParameter.Diffuse
+    assert magenta_share(world) == 0.0
+    world.apply_color_texture_to_object("Road_Road_street_99", diffuse, magenta)
+    world.apply_color_texture_to_object(names[2], carla.MaterialParameter.Normal, magenta)
+    assert magenta_share(world) == 0.0
+    world.apply_color_texture_to_object(names[2], diffuse, magenta)
+    one = magenta_share(world)
+    assert one > 0.1
+    world.apply_color_texture_to_objects(names[2:4], diffuse, magenta)
+    assert magenta_share(world) > one + 0.02
+    for made in LISTENING:
+        made.stop()
+    LISTENING.clear()
+    assert magenta_share(client.reload_world(False)) == 0.0
+
+
 TRAFFIC = """
 import socket, sys
 import carla

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import cast
 
+import numpy as np
+
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.simulators.carla_server import blueprints, wire
 from roadproof.simulators.carla_server.actors import Actor
@@ -14,12 +16,12 @@ from roadproof.simulators.carla_server.wire import DONE, ORIGIN, WORLD_STREAM, V
 from roadproof.simulators.carla_server.world import SETTINGS, World
 
 SPAWN, DESTROY, CONTROL, WALK, TRANSFORM, WALKER_STATE, VELOCITY, PHYSICS = 0, 1, 2, 4, 6, 7, 8, 14
+DIFFUSE = 2
 
 NOT_THERE: dict[str, Value] = {
     "freeze_all_traffic_lights": DONE,
     "get_all_level_BBs": granted([]),
     "get_environment_objects": granted([]),
-    "get_names_of_all_objects": granted([]),
     "get_navigation_mesh": granted(b""),
     "get_required_files": granted([]),
     "get_vehicle_light_states": granted([]),
@@ -120,6 +122,18 @@ class Calls:
     def call_get_actors_by_id(self, ids: list[int]) -> Value:
         actors = self._world.actors
         return granted([actors[i].wire(self._port + 1) for i in ids if i in actors])
+
+    def call_get_names_of_all_objects(self) -> Value:
+        assert self._world.town is not None
+        return granted(list(self._world.town.pieces))
+
+    def call_apply_color_texture_to_objects(self, names: list[str], material: int, texture: Value) -> Value:
+        width, height, colours = texture
+        # As in CARLA, what cannot be painted is no error.
+        if material == DIFFUSE and width * height == len(colours) > 0:
+            levels = np.array(colours, np.uint8).reshape(height, width, 4)
+            self._world.paint(names, levels[..., :3])
+        return DONE
 
     # Actors
 

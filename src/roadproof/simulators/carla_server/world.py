@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, VehicleState, Weather
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.simulators.carla_server import blueprints, weather
 from roadproof.simulators.carla_server.actors import Actor
+from roadproof.simulators.carla_server.pieces import Piece, road_pieces
 from roadproof.simulators.carla_server.wire import ORIGIN, Pose6, Value
 from roadproof.simulators.town.judge import people_hit
 from roadproof.simulators.town.labels import LabelScene
@@ -47,6 +49,7 @@ class Town:
     roads: RoadMap
     scenery: Scenery
     renderer: Renderer
+    pieces: dict[str, Piece]
     labelled: LabelScene | None = None
 
     def labels(self) -> LabelScene:
@@ -101,6 +104,7 @@ class World:
         self._next_actor, self._next_stream = 100, 2
         self._physics: dict[int, Physics] = {}
         self._crowd: dict[int, int] = {}
+        self._painted: dict[str, UInt8[np.ndarray, "400 400 4"]] = {}
 
     @property
     def dt_s(self) -> float:
@@ -129,7 +133,10 @@ class World:
             scenery = build_scenery(roads)
             if self.town is not None:
                 self.town.close()
-            self.town = Town(name, file, roads, scenery, Renderer(roads, scenery, CIL_CAMERA, CIL_INPUT))
+            pieces = {piece.name: piece for piece in road_pieces(name, roads)}
+            self.town = Town(name, file, roads, scenery, Renderer(roads, scenery, CIL_CAMERA, CIL_INPUT), pieces)
+        self.town.renderer.paint_road({})
+        self._painted.clear()
         self.weather = weather.CLEAR
         self.town.renderer.set_weather(self.sky)
         self.episode += 1
@@ -153,6 +160,14 @@ class World:
         self.weather = parameters
         if self.town is not None:
             self.town.renderer.set_weather(self.sky)
+
+    def paint(self, names: Sequence[str], picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Cover pieces of road with a picture until the map is loaded again; as in CARLA, other names do nothing."""
+        if self.town is None:
+            return
+        pieces = self.town.pieces
+        self._painted |= {name: pieces[name].pattern(picture) for name in names if name in pieces}
+        self.town.renderer.paint_road({pieces[name].placement: paint for name, paint in self._painted.items()})
 
     def set_settings(self, settings: Value) -> None:
         """Take CARLA's settings.

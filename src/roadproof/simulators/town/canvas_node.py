@@ -73,6 +73,12 @@ class CanvasNode:
         for texture, copy in zip(self._textures, made, strict=True):
             fill_texture(texture, copy)
 
+    def hide(self) -> None:
+        """Not to be seen until the next `see`."""
+        self._shown = [False] * len(self._paths)
+        for path in self._paths:
+            path.hide()
+
     def see(self, state: VehicleState, which: int) -> None:
         """Shape the canvas for one view from one screen."""
         if self._placement is None:

@@ -7,6 +7,9 @@ the ground, a cell at a time, and into vertex colours. Haze is a row of transluc
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import UInt8
@@ -56,6 +59,9 @@ class Renderer:
         self._stage = ground_stage()
         self._screens: dict[int, Screen] = {}
         self._views: dict[CameraModel, Screen] = {}
+        self._painted: dict[CanvasPlacement, UInt8[np.ndarray, "400 400 4"]] = {}
+        self._patches: dict[tuple[CameraModel, CanvasPlacement], CanvasNode] = {}
+        self._laid: dict[tuple[CameraModel, CanvasPlacement], UInt8[np.ndarray, "400 400 4"]] = {}
         self._weather: Weather | None = None
         self._lit: LitGround
         self._lit_nodes: Path = None
@@ -86,11 +92,18 @@ class Renderer:
         self._build_air(sky)
         self._agents.relight(self._lit)
         self._canvas.forget()
+        for patch in self._patches.values():
+            patch.forget()
+        self._laid.clear()
 
     def set_canvas(self, placement: CanvasPlacement, pattern: UInt8[np.ndarray, "400 400 4"] | None) -> None:
         """Lay the canvas and paint a pattern on it."""
         self._canvas.lay(placement, lambda: road_patch(self._lit, placement, self._grain, self._streets.paint))
         self._canvas.paint(pattern)
+
+    def paint_road(self, paints: Mapping[CanvasPlacement, UInt8[np.ndarray, "400 400 4"]]) -> None:
+        """Paint places of the road for `view`; those painted before and not given are bare again."""
+        self._painted = dict(paints)
 
     def set_agents(self, cars: Agents, people: Agents) -> None:
         """Replace all cars and people; afterwards `move_agents` moves as many."""
@@ -109,12 +122,13 @@ class Renderer:
         return self._shoot(PICTURE, state, tick)
 
     def view(self, camera: CameraModel, state: VehicleState, tick: int = 0) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture of any camera, for worlds without a canvas."""
+        """The picture of any camera, with the places of `paint_road` instead of a canvas."""
         if camera not in self._views:
             self._views[camera] = Screen(self._pipe, self._root, camera, whole(camera), 2)
         screen = self._views[camera]
         self._aim(screen, state, tick)
         self._agents.see(state, everybody=True)
+        self._see_patches(camera, state)
         return screen.shoot()
 
     def close(self) -> None:
@@ -134,6 +148,26 @@ class Renderer:
         self._agents.see(state)
         self._canvas.see(state, which)
         return screen.shoot()
+
+    def _see_patches(self, camera: CameraModel, state: VehicleState) -> None:
+        """Lay the painted places near a camera that is anywhere, and shape them for its view."""
+        for patch in self._patches.values():
+            patch.hide()
+        # How fine a copy of the paint suits a row depends on the height above the road.
+        up_m = max(round(camera.up_m + state.z_m, 1), 0.1)
+        raised = replace(camera, up_m=up_m)
+        below = replace(state, z_m=camera.up_m + state.z_m - up_m)
+        for place, pattern in self._painted.items():
+            if math.hypot(place.x_m - state.x_m, place.y_m - state.y_m) > NEAR_SEEN_M + place.length_m:
+                continue
+            key = (raised, place)
+            if key not in self._patches:
+                self._patches[key] = CanvasNode(self._root, raised, ((whole(raised), 2),))
+            if self._laid.get(key) is not pattern:
+                self._patches[key].lay(place, partial(road_patch, self._lit, place, self._grain, self._streets.paint))
+                self._patches[key].paint(pattern)
+                self._laid[key] = pattern
+            self._patches[key].see(below, 0)
 
     def _aim(self, screen: Screen, state: VehicleState, tick: int) -> None:
         x, y, z = screen.look_from(state)

@@ -1,0 +1,80 @@
+"""The pieces of road that clients can paint, each by the name of its object.
+
+Convention:
+    A piece's picture covers it once. How it lies there differs from piece to piece, as it does in CARLA's own towns, so
+    clients have to find out: turned by quarters, and mirrored on every second piece.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.simulators.town.roadmap import RoadMap
+
+PIECE_M = 20.0
+STRAIGHT_RAD = 0.02
+TURNS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A straight piece of road, over all its driving lanes.
+
+    Args:
+        name: of the object.
+        placement: where it is; its far edge is the end of the piece along the road.
+        turns: quarter turns of its picture, counter-clockwise as seen from above.
+        mirrored: whether the picture is mirrored before it is turned.
+    """
+
+    name: str
+    placement: CanvasPlacement
+    turns: int
+    mirrored: bool
+
+    def pattern(self, picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "400 400 4"]:
+        """A picture as opaque paint all over the piece, its far edge on top."""
+        laid = np.rot90(picture[:, ::-1] if self.mirrored else picture, self.turns)
+        image = Image.fromarray(np.ascontiguousarray(laid))
+        size = (CANVAS_SIZE_PX, CANVAS_SIZE_PX)
+        # A box where it is made smaller; blocks, not blurs, where it is made larger.
+        smaller = image.width > CANVAS_SIZE_PX
+        fitted = np.asarray(image.resize(size, Image.Resampling.BOX if smaller else Image.Resampling.NEAREST))
+        return np.dstack([fitted, np.full(size, 255, np.uint8)])
+
+
+def road_pieces(map_name: str, roads: RoadMap) -> tuple[Piece, ...]:
+    """The straight pieces of a map's roads outside of junctions, in order of their numbers."""
+    pieces: list[Piece] = []
+    against = {(lane.road, lane.section, lane.number): lane for lane in roads.lanes if lane.kind == "driving"}
+    for lane in roads.lanes:
+        if lane.kind != "driving" or lane.junction is not None or lane.number != -1:
+            continue
+        # The lane that comes the other way lies to its left.
+        other = against.get((lane.road, lane.section, 1))
+        width_m = lane.width_m + (0.0 if other is None else other.width_m)
+        for begin in np.arange(0.0, lane.length_m - PIECE_M + 1e-6, PIECE_M).tolist():
+            inside = (lane.stations_m > begin - 1e-6) & (lane.stations_m < begin + PIECE_M + 1e-6)
+            if not inside.any() or float(np.ptp(lane.headings_rad[inside])) > STRAIGHT_RAD:
+                continue
+            middle = begin + PIECE_M / 2
+            x, y, z = (float(np.interp(middle, lane.stations_m, lane.centre[:, axis])) for axis in range(3))
+            heading = float(lane.headings_rad[inside].mean())
+            left_m = (width_m - lane.width_m) / 2
+            placement = CanvasPlacement(
+                x_m=x - left_m * math.sin(heading),
+                y_m=y + left_m * math.cos(heading),
+                z_m=z,
+                yaw_rad=heading,
+                width_m=width_m,
+                length_m=PIECE_M,
+            )
+            number = len(pieces)
+            pieces.append(Piece(f"Road_Road_{map_name}_{number}", placement, number % TURNS, number % 2 == 1))
+    return tuple(pieces)
