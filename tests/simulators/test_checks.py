@@ -69,12 +69,12 @@ class HasNoise(Altered):
 
 
 class KeepsThePaint(Altered):
-    paint = None
+    kept = None
 
     def reset(self, scenario, **options):
         if options.get("pattern") is not None:
-            self.paint = options["pattern"]
-        return super().reset(scenario, **{**options, "pattern": self.paint})
+            self.kept = options["pattern"]
+        return super().reset(scenario, **{**options, "pattern": self.kept})
 
 
 class MirrorsTheCanvas(Altered):

@@ -23,6 +23,8 @@ def test_the_town_is_opened_by_its_name_and_closed_again():
         ("carla://host:99999", "no address"),
         ("carla://host:2000/Town01", "no address"),
         ("carla:host", "unknown"),
+        ("carla://host:2000?paint=spray", "expected nothing or paint= and one of inject, native, auto"),
+        ("carla://host:2000?colour=red", "asks for 'colour=red'"),
     ],
 )
 def test_what_is_no_address_is_refused(spec, complaint):

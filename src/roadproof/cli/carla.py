@@ -76,8 +76,7 @@ def scenario(
     # CARLA's client is an extra.
     from roadproof.errors import ScenarioError
     from roadproof.scenarios import load_scenarios, save_scenarios
-    from roadproof.simulators.carla.doctor import spawn_places
-    from roadproof.simulators.carla.places import scenario_between
+    from roadproof.simulators.carla.places import scenario_between, spawn_places
     from roadproof.simulators.carla.simulator import CarlaSimulator
 
     with CarlaSimulator(host, port) as simulator:

@@ -1,4 +1,7 @@
-"""Which simulator is meant: "town" is the embedded one, "carla://HOST:PORT" a CARLA server."""
+"""Which simulator is meant: "town" is the embedded one, "carla://HOST:PORT" a CARLA server.
+
+A server is told how to paint by `?paint=` and inject, native or auto after its port.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from roadproof.errors import SimulatorError
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import PaintChoice, Simulator
 from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.routes import Route
@@ -60,23 +63,34 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
             yield town
         return
     if spec.startswith("carla://"):
-        host, port = _address(spec)
+        host, port, paint = _address(spec)
         # CARLA's client is an extra.
         from roadproof.simulators.carla.simulator import CarlaSimulator
 
-        with CarlaSimulator(host, port) as server:
+        with CarlaSimulator(host, port, paint=paint) as server:
             yield server
         return
     raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")
 
 
-def _address(spec: str) -> tuple[str, int]:
-    """Host and port of carla://HOST:PORT; a port left out is CARLA's own."""
+def _address(spec: str) -> tuple[str, int, PaintChoice]:
+    """Host, port and paint of carla://HOST:PORT?paint=PAINT; a port left out is CARLA's own, paint is injected."""
     try:
         parts = urlsplit(spec)
         host, port = parts.hostname, parts.port
     except ValueError as error:
         raise SimulatorError(f"simulator {spec!r} is no address ({error}), expected carla://HOST:PORT") from None
-    if not host or parts.path or parts.query or parts.fragment or parts.username:
+    if not host or parts.path or parts.fragment or parts.username:
         raise SimulatorError(f"simulator {spec!r} is no address, expected carla://HOST:PORT")
-    return host, CARLA_PORT if port is None else port
+    match parts.query:
+        case "" | "paint=inject":
+            paint: PaintChoice = "inject"
+        case "paint=native":
+            paint = "native"
+        case "paint=auto":
+            paint = "auto"
+        case other:
+            raise SimulatorError(
+                f"simulator {spec!r} asks for {other!r}, expected nothing or paint= and one of inject, native, auto"
+            )
+    return host, CARLA_PORT if port is None else port, paint

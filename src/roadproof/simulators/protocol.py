@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from types import TracebackType
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -14,6 +15,23 @@ from roadproof.scenarios import Scenario
 
 PatternImage = UInt8[np.ndarray, "400 400 4"]
 """What is painted on the canvas: RGBA with straight (not premultiplied) alpha; y = 0 is the far edge."""
+
+
+class PaintKind(StrEnum):
+    """How a simulator puts a pattern on the road; every result says it."""
+
+    RENDERED = "rendered"
+    """Part of the simulator's own world, as in the town."""
+
+    NATIVE = "native"
+    """Part of the world of a CARLA server: the texture of a piece of its road."""
+
+    INJECT = "inject"
+    """Put into the pictures of the car's camera."""
+
+
+PaintChoice: TypeAlias = Literal["inject", "native", "auto"]
+"""What can be asked of a CARLA server; "auto" is the second if it works there, else the first."""
 
 
 @runtime_checkable
@@ -37,6 +55,11 @@ class Simulator(Protocol):
     @property
     def dt_s(self) -> float:
         """Simulated seconds per step."""
+        ...
+
+    @property
+    def paint(self) -> PaintKind:
+        """How patterns are put on the road."""
         ...
 
     def __enter__(self) -> Simulator: ...

@@ -23,7 +23,18 @@ from roadproof.simulators.town.maps import load_map, scenario_route
 
 CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)
-ALL = ["connection", "map", "pictures", "speed", "repeatability", "road", "paint", "traffic", "clean-up"]
+ALL = [
+    "connection",
+    "map",
+    "pictures",
+    "speed",
+    "repeatability",
+    "road",
+    "paint",
+    "native paint",
+    "traffic",
+    "clean-up",
+]
 
 # A server whose depth camera is wrong by a tenth: paint would lie elsewhere.
 WRONG_DEPTH = """
@@ -46,16 +57,19 @@ def port(street):
         yield opened
 
 
+@pytest.mark.slow
 def test_a_sound_server_is_found_sound(port):
     told = []
     findings = examine(CarlaSimulator(port=port, camera=CAMERA, input=INPUT), told.append)
     assert findings.passed, str(findings)
     assert [check.name for check in findings.checks] == ALL
     assert tuple(told) == findings.checks
+    assert "native: squares are seen within" in str(findings)
     assert "differ by up to 0.000 m and 0.00 levels" in str(findings)
     assert str(findings).endswith("everything works")
 
 
+@pytest.mark.slow
 def test_a_wrong_depth_camera_is_found(street):
     with serving("--map", street, program=WRONG_DEPTH) as (_, port):
         findings = examine(CarlaSimulator(port=port, camera=CAMERA, input=INPUT))

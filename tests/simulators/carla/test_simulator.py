@@ -26,6 +26,7 @@ from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
+from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
 
 CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
@@ -171,7 +172,7 @@ def test_a_taken_place_is_refused_and_the_next_drive_goes_well(simulator, onlook
 def test_a_spec_opens_it(port):
     with open_simulator(f"carla://127.0.0.1:{port}") as simulator:
         assert simulator.road_map("street").lanes
-        assert simulator.paint == "inject"
+        assert simulator.paint is PaintKind.INJECT
 
 
 def test_nobody_at_the_port_is_told_in_time():
@@ -252,11 +253,19 @@ def test_a_server_of_another_version_is_refused(street):
         CarlaSimulator(port=port).__enter__()
 
 
-def test_without_the_client_one_line_names_the_extra():
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["drive", "--simulator", "carla://127.0.0.1:1"],
+        ["record", "left-03", "--simulator", "carla://127.0.0.1:1?paint=native"],
+        ["carla", "doctor"],
+        ["carla", "scenario", "0", "1"],
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_without_the_client_one_line_names_the_extra(words):
     program = "import sys; sys.modules['carla'] = None\nfrom roadproof.cli import main; main()"
-    told = subprocess.run(
-        [sys.executable, "-c", program, "drive", "--simulator", "carla://127.0.0.1:1"], capture_output=True, text=True
-    )
+    told = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True)
     assert told.returncode == 2
     assert told.stderr.count("\n") == 1
     assert "pip install 'roadproof[carla]'" in told.stderr

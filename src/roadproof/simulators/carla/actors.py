@@ -38,7 +38,7 @@ def spawn_driven(session: Session, start: VehicleState) -> carla.Vehicle:
     Raises:
         SimulatorError: it cannot stand there, or the server has none of the cars known.
     """
-    library = session.world.get_blueprint_library()
+    library = session.library()
     known = {blueprint.id for blueprint in library}
     name = next((name for name in DRIVEN if name in known), None)
     if name is None:
@@ -66,7 +66,7 @@ class Crowd:
             SimulatorError: the server refuses.
         """
         self._session, self.traffic = session, traffic
-        library = session.world.get_blueprint_library()
+        library = session.library()
         cars = [b for b in library.filter("vehicle.*") if _is_car(b)]
         people = list(library.filter("walker.pedestrian.*"))
         self._cars = self._spawn("a car of the traffic", cars, traffic.cars, 0.0)
@@ -100,7 +100,7 @@ class Crowd:
             still = carla.command.SetSimulatePhysics(carla.command.FutureActor, False)
             commands.append(carla.command.SpawnActor(blueprint, _place(agents, i, up_m)).then(still))
         ids = self._session.batch(what, commands, tick=True) if commands else []
-        for actor in self._session.world.get_actors(ids) if ids else ():
+        for actor in self._session.ask(what, lambda: self._session.world.get_actors(ids)) if ids else ():
             self._session.keep(actor)
         return ids
 

@@ -1,10 +1,12 @@
-"""The cameras on the car: pictures are waited for until they are those of the tick."""
+"""The cameras, on the car or above the road: pictures are waited for until they are those of the tick."""
 
 from __future__ import annotations
 
+import math
 import queue
 import time
 
+from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
 from roadproof.simulators.carla.session import Session, carla
@@ -16,20 +18,20 @@ STILL = {"motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0", "l
 
 
 class Camera:
-    """One camera on the car.
+    """One camera.
 
     Args:
         session: keeps it until the end of the drive.
         kind: rgb, depth or semantic_segmentation.
         model: size, field of view and place.
-        ego: what it is fixed to.
+        carrier: the car it is fixed to, or where it stands in the town's world as if it were on a car there.
     """
 
-    def __init__(self, session: Session, kind: str, model: CameraModel, ego: carla.Actor) -> None:
+    def __init__(self, session: Session, kind: str, model: CameraModel, carrier: carla.Actor | VehicleState) -> None:
         self._session, self._kind = session, kind
         self._name = f"the {kind} camera of the CARLA server at {session.where}"
         self._arrived: queue.SimpleQueue[carla.Image] = queue.SimpleQueue()
-        blueprint = session.world.get_blueprint_library().find(f"sensor.camera.{kind}")
+        blueprint = session.library().find(f"sensor.camera.{kind}")
         size = {"image_size_x": str(model.width_px), "image_size_y": str(model.height_px), "fov": str(model.fov_deg)}
         for name, value in (size | STILL).items():
             if blueprint.has_attribute(name):
@@ -37,7 +39,16 @@ class Camera:
         place = carla.Transform(
             carla.Location(x=model.forward_m, y=-model.left_m, z=model.up_m), carla.Rotation(pitch=model.pitch_deg)
         )
-        sensor = session.ask(f"a {kind} camera", lambda: session.world.spawn_actor(blueprint, place, attach_to=ego))
+        parent: carla.Actor | None = None
+        if isinstance(carrier, VehicleState):
+            yaw, x, y = carrier.yaw_rad, model.forward_m, model.left_m
+            place.location.x = carrier.x_m + x * math.cos(yaw) - y * math.sin(yaw)
+            place.location.y = -(carrier.y_m + x * math.sin(yaw) + y * math.cos(yaw))
+            place.location.z = carrier.z_m + model.up_m
+            place.rotation.yaw = -math.degrees(yaw)
+        else:
+            parent = carrier
+        sensor = session.ask(f"a {kind} camera", lambda: session.world.spawn_actor(blueprint, place, attach_to=parent))
         assert isinstance(sensor, carla.Sensor)
         session.keep(sensor)
         sensor.listen(self._arrived.put)

@@ -13,8 +13,9 @@ class Collisions:
     """The collision sensor on the car; the session keeps it until the end of the drive."""
 
     def __init__(self, session: Session, ego: carla.Actor) -> None:
+        self._session = session
         self._hits: queue.SimpleQueue[carla.CollisionEvent] = queue.SimpleQueue()
-        blueprint = session.world.get_blueprint_library().find("sensor.other.collision")
+        blueprint = session.library().find("sensor.other.collision")
         sensor = session.ask(
             "a collision sensor", lambda: session.world.spawn_actor(blueprint, carla.Transform(), attach_to=ego)
         )
@@ -26,7 +27,9 @@ class Collisions:
         """What was hit since the last call, people aside: where they are is known, and the judge looks there."""
         found: dict[str, Contact] = {}
         while not self._hits.empty():
-            other = self._hits.get_nowait().other_actor
+            hit = self._hits.get_nowait()
+            # The server is asked who that is.
+            other = self._session.ask("what was hit", lambda hit=hit: hit.other_actor)
             if other.type_id.startswith("walker."):
                 continue
             index = None if crowd is None else crowd.car_index(other.id)

@@ -13,15 +13,16 @@ from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.scenarios import Scenario
-from roadproof.simulators.carla.inject import ASPHALT_LEVEL
-from roadproof.simulators.carla.places import scenario_between, straight_stretch
-from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.carla.inject import ASPHALT_LEVEL, may_show
+from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.checks import Check, check_simulator
+from roadproof.simulators.protocol import PaintKind
 
 STRETCH_M, CANVAS_AT_M = 60.0, 30.0
 STEPS = 20
 AHEAD = Control(0.0, throttle=0.6)
+COLOURS = ((200, 40, 40), (40, 180, 40), (50, 60, 200), (220, 220, 220))
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +52,8 @@ def examine(simulator: CarlaSimulator, told: Callable[[Check], object] = lambda 
         told: of each finding as it is made.
 
     Returns:
-        Findings on connection, map, pictures, speed, repeatability, road, paint, traffic and clean-up. Whatever goes
-        wrong is a finding; only what cannot be done without it is left out.
+        Findings on connection, map, pictures, speed, repeatability, road, paint, native paint, traffic and clean-up.
+        Whatever goes wrong is a finding; only what cannot be done without it is left out.
     """
     checks: list[Check] = []
 
@@ -76,6 +77,7 @@ def examine(simulator: CarlaSimulator, told: Callable[[Check], object] = lambda 
                 ("repeatability", patient.repeatability),
                 ("road", patient.road),
                 ("paint", patient.paint),
+                ("native paint", patient.native),
                 ("traffic", patient.traffic),
             ):
                 found(name, look)
@@ -169,6 +171,32 @@ class _Patient:
                 raise _Bad(f"{check.name}: {check.detail}")
         return f"{self._simulator.paint}: {report.checks[1].detail}; {report.checks[3].detail}"
 
+    def native(self) -> str:
+        """Whether paint can be part of the server's world, and how paint in pictures differs from it."""
+        scenario, ground = self._simulator.prove_native()
+        before, self._scenario = self._scenario, scenario
+        try:
+            views = [self._coloured()]
+            self._simulator.paint_by(PaintKind.NATIVE)
+            seen = self.paint()
+            views.append(self._coloured())
+        finally:
+            self._simulator.paint_by(PaintKind.INJECT)
+            self._scenario = before
+        off = np.abs(views[0].astype(float) - views[1]).mean(axis=-1)
+        within = may_show(self._simulator.image_from_canvas(), off.shape)
+        return f"{ground}; {seen}; {off[within].mean():.1f} of 255 levels from paint in pictures"
+
+    def _coloured(self) -> np.ndarray:
+        """A picture of a canvas of four colours from where the doctor's drive begins."""
+        pattern = np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), 255, np.uint8)
+        half = CANVAS_SIZE_PX // 2
+        for k, colour in enumerate(COLOURS):
+            pattern[half * (k // 2) :, half * (k % 2) :, :3] = colour
+        picture = self._near(pattern).picture
+        assert picture is not None
+        return picture
+
     def traffic(self) -> str:
         self._simulator.reset(self.scenario, cars=8, pedestrians=8, seed=1)
         for _ in range(STEPS):
@@ -191,16 +219,6 @@ class _Patient:
 
     def _near(self, pattern: np.ndarray) -> Observation:
         return self._simulator.reset(self.scenario, pattern=pattern, full_pictures=True)
-
-
-def spawn_places(session: Session) -> list[VehicleState]:
-    """The server's spawn points in the town's world, in its order."""
-    points = session.ask("its map", session.world.get_map).get_spawn_points()
-    return [_place(point) for point in points]
-
-
-def _place(point: carla.Transform) -> VehicleState:
-    return VehicleState(point.location.x, -point.location.y, point.location.z, -math.radians(point.rotation.yaw), 0.0)
 
 
 def _apart(a: VehicleState, b: VehicleState) -> float:

@@ -53,7 +53,7 @@ def painted(scene: Scene, image_from_canvas: Homography, pattern: PatternImage) 
         Pixel centres at integers; `image_from_canvas` has a positive third coordinate in front of the camera.
     """
     free = scene.road & (np.abs(scene.height_m) < PLANE_M)
-    rows, columns = np.nonzero(free & _may_show(image_from_canvas, scene.road.shape))
+    rows, columns = np.nonzero(free & may_show(image_from_canvas, scene.road.shape))
     if not len(rows):
         return scene.picture
     paint = _averaged(np.linalg.inv(image_from_canvas), rows, columns, pattern)
@@ -68,7 +68,7 @@ def painted(scene: Scene, image_from_canvas: Homography, pattern: PatternImage) 
     return result
 
 
-def _may_show(image_from_canvas: Homography, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+def may_show(image_from_canvas: Homography, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
     """Pixels of which some part lies on the canvas, and a few beside them."""
     rows, columns = np.mgrid[: shape[0] + 1, : shape[1] + 1] - 0.5
     x, y, ahead = _mapped(np.linalg.inv(image_from_canvas), columns, rows)

@@ -8,6 +8,7 @@ from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
 from roadproof.scenarios import Kind, Scenario
+from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.town.maps import check_canvas
 from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.routes import Route
@@ -75,6 +76,20 @@ def straight_stretch(roads: RoadMap, places: list[VehicleState], length_m: float
             x, y, z = (float(value) for value in lane.centre[min(n, len(lane.centre) - 1)])
             return start, VehicleState(x, y, z, float(turned[-1]), 0.0)
     raise ScenarioError(f"no spawn point of the map has {length_m:.0f} m of straight road before it; load another map")
+
+
+def spawn_places(session: Session) -> list[VehicleState]:
+    """The server's spawn points in the town's world, in its order.
+
+    Raises:
+        SimulatorError: it does not answer.
+    """
+    points = session.ask("its map", session.world.get_map).get_spawn_points()
+    return [_place(point) for point in points]
+
+
+def _place(point: carla.Transform) -> VehicleState:
+    return VehicleState(point.location.x, -point.location.y, point.location.z, -math.radians(point.rotation.yaw), 0.0)
 
 
 def _kind(route: Route) -> Kind:

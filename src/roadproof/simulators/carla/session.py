@@ -13,6 +13,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+from jaxtyping import UInt8
+
 from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.simulators.town.roadmap import RoadMap
 
@@ -36,6 +39,10 @@ class Session:
         patience_s: longest wait for a call, and for a picture.
         loading_s: longest wait where a map is loaded or the weather changes.
 
+    Attributes:
+        where: HOST:PORT of the server.
+        painted: whether objects have textures that are not the map's own.
+
     Raises:
         SimulatorError: nobody answers there, or it is a server of another version.
     """
@@ -43,6 +50,8 @@ class Session:
     def __init__(self, host: str, port: int, *, dt_s: float, patience_s: float, loading_s: float) -> None:
         self.where, self.patience_s, self._loading_s = f"{host}:{port}", patience_s, loading_s
         self._lost = False
+        self.painted = False
+        self._last_paint: tuple[list[str], UInt8[np.ndarray, "h w 3"]] | None = None
         self._actors: list[carla.Actor] = []
         self._maps: dict[str, RoadMap] = {}
         self.client = carla.Client(host, port, worker_threads=1)
@@ -77,8 +86,14 @@ class Session:
                 "and port are right, and that no other client holds it in synchronous mode"
             ) from None
 
+    @property
+    def lost(self) -> bool:
+        """A call found no answer, or the session is closed."""
+        return self._lost
+
     def patiently(self, what: str, call: Callable[[], Result]) -> Result:
-        """The answer to a call that may take as long as loading a map."""
+        """The answer to a call that may take as long as loading a map, of a server that is there now."""
+        self.ask("its version", self.client.get_server_version)
         self.client.set_timeout(self._loading_s)
         try:
             return self.ask(what, call)
@@ -109,6 +124,39 @@ class Session:
                 self._maps[name] = RoadMap.from_opendrive(path)
         return self._maps[name]
 
+    def reload(self) -> None:
+        """Load the map anew: whatever was painted is as it was, and all actors are gone."""
+        self.clear()
+        self.world = self.patiently("its map", lambda: self.client.reload_world(False))
+        self._synchronise()
+        self.painted, self._last_paint = False, None
+
+    def library(self) -> carla.BlueprintLibrary:
+        """What can be spawned."""
+        return self.ask("its blueprints", self.world.get_blueprint_library)
+
+    def object_names(self) -> list[str]:
+        """The names of all objects that a texture can be put on."""
+        return list(self.ask("its objects", self.world.get_names_of_all_objects))
+
+    def paint(self, names: Sequence[str], picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Put a picture on objects until the map is loaded anew; the server says nothing of what it cannot paint."""
+        wanted = list(names)
+        last = self._last_paint
+        if last is not None and last[0] == wanted and np.array_equal(last[1], picture):
+            return
+        height, width = picture.shape[:2]
+        texture, put = carla.TextureColor(width, height), carla.Color(0, 0, 0, 255)
+        for row, line in enumerate(picture.tolist()):
+            for column, (put.r, put.g, put.b) in enumerate(line):
+                texture.set(column, row, put)
+        self.painted, self._last_paint = True, None
+        self.patiently(
+            "a texture",
+            lambda: self.world.apply_color_texture_to_objects(wanted, carla.MaterialParameter.Diffuse, texture),
+        )
+        self._last_paint = wanted, picture
+
     def keep(self, actor: carla.Actor) -> None:
         """Destroy an actor at the end of the drive."""
         self._actors.append(actor)
@@ -117,12 +165,19 @@ class Session:
         """Send commands; the ids of the actors.
 
         Raises:
-            SimulatorError: one of them is refused.
+            SimulatorError: one of them is refused; the actors that the others made are destroyed again.
         """
         answers = self.ask(what, lambda: self.client.apply_batch_sync(list(commands), tick))
-        for answer in answers:
-            if answer.error:
-                raise SimulatorError(f"the CARLA server at {self.where} refused {what}: {answer.error}")
+        refused = next((answer.error for answer in answers if answer.error), None)
+        if refused is not None:
+            pairs = zip(commands, answers, strict=True)
+            made = [
+                answer.actor_id
+                for command, answer in pairs
+                if isinstance(command, carla.command.SpawnActor) and not answer.error
+            ]
+            self.ask(what, lambda: self.client.apply_batch_sync([carla.command.DestroyActor(i) for i in made], False))
+            raise SimulatorError(f"the CARLA server at {self.where} refused {what}: {refused}")
         return [answer.actor_id for answer in answers]
 
     def clear(self) -> None:
@@ -132,7 +187,7 @@ class Session:
             self.batch("the end of a drive", commands)
 
     def close(self) -> None:
-        """Destroy what is left and put the settings back.
+        """Destroy what is left, load a painted map anew and put the settings back.
 
         A server that does not answer is told so too, without a wait: it does as told if it ever goes on.
         """
@@ -144,6 +199,9 @@ class Session:
                 self.client.apply_batch(commands)
             elif commands:
                 self.batch("the end of a drive", commands)
+        with contextlib.suppress(SimulatorError):
+            if self.painted and not lost:
+                self.reload()
         with contextlib.suppress(SimulatorError):
             self.ask("its settings", lambda: self.world.apply_settings(self._found))
         self._lost = True
@@ -164,6 +222,7 @@ class Session:
             )
         self.clear()
         self.world = self.patiently(f"the map {name}", lambda: self.client.load_world(name, False))
+        self.painted, self._last_paint = False, None
         self._synchronise()
 
     def _synchronise(self) -> None:

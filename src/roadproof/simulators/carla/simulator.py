@@ -12,18 +12,28 @@ from types import TracebackType
 import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
-from roadproof.errors import SimulatorError
-from roadproof.geometry import CANVAS_SIZE_PX, CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, Homography
+from roadproof.errors import RoadproofError, SimulatorError
+from roadproof.geometry import (
+    CANVAS_SIZE_PX,
+    CIL_CAMERA,
+    CIL_INPUT,
+    CameraModel,
+    CanvasPlacement,
+    CropResize,
+    Homography,
+)
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.actors import Crowd, carla_transform, spawn_driven, vehicle_state
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.collisions import Collisions
 from roadproof.simulators.carla.inject import Scene, painted
+from roadproof.simulators.carla.native import Ground, SeveralPiecesError, find_ground, lay
+from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch
 from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import carla_weather
-from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.judge import Judge
 from roadproof.simulators.town.maps import scenario_route
@@ -34,6 +44,9 @@ from roadproof.simulators.town.traffic import Traffic
 GOAL_M = 2.0
 SETTLE_TICKS = 10
 STOP = Control(0.0, brake=1.0)
+TRIED_M = 60.0
+# One of them lies on a single piece of road, if pieces are not much shorter than 20 m.
+TRIED_AT_M = (18.0, 24.0, 30.0, 36.0)
 
 
 @dataclass(slots=True, eq=False)
@@ -59,7 +72,8 @@ class _Drive:
 class CarlaSimulator:
     """A CARLA server, driven in synchronous mode.
 
-    A pattern is painted into the pictures, where the depth and semantic cameras see free road (`paint`).
+    A pattern is painted into the pictures, where the depth and semantic cameras see free road ("inject"), or on the
+    server's own road ("native").
 
     Args:
         host: of the server.
@@ -69,12 +83,8 @@ class CarlaSimulator:
         dt_s: seconds per step.
         patience_s: longest wait for a call or a picture.
         loading_s: longest wait where a map is loaded or the weather changes.
-
-    Attributes:
-        paint: how patterns come onto the road: "inject", into the pictures.
+        paint: "inject", "native", or "auto": native if it works on a straight stretch of the map that is loaded.
     """
-
-    paint = "inject"
 
     def __init__(
         self,
@@ -86,6 +96,7 @@ class CarlaSimulator:
         dt_s: float = 0.05,
         patience_s: float = 20.0,
         loading_s: float = 300.0,
+        paint: PaintChoice = "inject",
     ) -> None:
         """Nothing is connected before the simulator is entered.
 
@@ -99,8 +110,11 @@ class CarlaSimulator:
             )
         self._camera, self._input, self._dt_s = camera, input, dt_s
         self._host, self._port, self._patience_s, self._loading_s = host, port, patience_s, loading_s
+        self._choice: PaintChoice = paint
+        self._paint = PaintKind.NATIVE if paint == "native" else PaintKind.INJECT
         self._session: Session | None = None
         self._drive: _Drive | None = None
+        self._ground: tuple[str, CanvasPlacement, Ground] | None = None
 
     @property
     def camera(self) -> CameraModel:
@@ -116,6 +130,11 @@ class CarlaSimulator:
     def dt_s(self) -> float:
         """Simulated seconds per step."""
         return self._dt_s
+
+    @property
+    def paint(self) -> PaintKind:
+        """How patterns are put on the road; "auto" is decided when the simulator is entered."""
+        return self._paint
 
     @property
     def route(self) -> Route:
@@ -166,10 +185,11 @@ class CarlaSimulator:
         """What the cameras saw last, before paint.
 
         Raises:
-            SimulatorError: there was no reset with a pattern, so that there is but one camera.
+            SimulatorError: there was no reset with a pattern to be painted into pictures, so that there is but one
+                camera.
         """
         drive = self._running()
-        if drive.pattern is None:
+        if drive.pattern is None or self._paint is PaintKind.NATIVE:
             raise SimulatorError("depth and kinds are seen in drives with a pattern only; reset with one")
         return seen_by(self._camera, drive.images, drive.scenario.canvas.z_m)
 
@@ -186,12 +206,55 @@ class CarlaSimulator:
         self._session = Session(
             self._host, self._port, dt_s=self._dt_s, patience_s=self._patience_s, loading_s=self._loading_s
         )
+        if self._choice == "auto":
+            try:
+                self.prove_native()
+                self.paint_by(PaintKind.NATIVE)
+            except RoadproofError:
+                if self.session.lost:
+                    self.__exit__(None, None, None)
+                    raise
+                self.paint_by(PaintKind.INJECT)
         return self
+
+    def paint_by(self, paint: PaintKind) -> None:
+        """Change how patterns are put on the road, from the next reset on.
+
+        Raises:
+            SimulatorError: a CARLA server has no such way.
+        """
+        if paint is PaintKind.RENDERED:
+            raise SimulatorError(f"paint is {paint}, expected {PaintKind.INJECT} or {PaintKind.NATIVE}")
+        self._paint = paint
+
+    def prove_native(self) -> tuple[Scenario, Ground]:
+        """Find a piece of road that can be painted, on a straight stretch of the map that is loaded.
+
+        Returns:
+            A drive over a canvas on it, and the piece.
+
+        Raises:
+            RoadproofError: there is none; the message says what was seen.
+        """
+        session = self.session
+        name = session.map_name()
+        roads = session.road_map(name)
+        start, goal = straight_stretch(roads, spawn_places(session), TRIED_M)
+        self._drive = None
+        session.clear()
+        refused = SimulatorError(f"no place for a canvas was tried, expected one of {TRIED_AT_M}")
+        for at_m in TRIED_AT_M:
+            tried = scenario_between(roads, name, start, goal, canvas_at_m=at_m, name="tried")
+            try:
+                return tried, self._ground_of(tried)
+            except SeveralPiecesError as several:
+                refused = several
+        raise refused
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._drive = None
+        self._drive = self._ground = None
         if self._session is not None:
             self._session.close()
             self._session = None
@@ -224,13 +287,19 @@ class CarlaSimulator:
             traffic = Traffic(roads, cars=cars, pedestrians=pedestrians, seed=seed, ego=scenario.start)
         self._drive = None
         session.clear()
+        if self._paint is PaintKind.INJECT and session.painted:
+            session.reload()
+        if self._paint is PaintKind.NATIVE:
+            # The bare road as well: what is painted is compared with asphalt of the same make.
+            lay(session, self._ground_of(scenario), pattern)
         _set_weather(session, weather)
         ego = spawn_driven(session, scenario.start)
         crowd = None if traffic is None else Crowd(session, traffic)
         for _ in range(SETTLE_TICKS):
             self._order(session, ego, STOP)
             session.tick()
-        kinds = ("rgb",) if pattern is None else ("rgb", "depth", "semantic_segmentation")
+        inject = pattern is not None and self._paint is PaintKind.INJECT
+        kinds = ("rgb", "depth", "semantic_segmentation") if inject else ("rgb",)
         collisions = Collisions(session, ego)
         cameras = {kind: Camera(session, kind, self._camera, ego) for kind in kinds}
         for camera in cameras.values():
@@ -261,6 +330,14 @@ class CarlaSimulator:
             SimulatorError: there was no reset.
         """
         return self._running().image_from_canvas
+
+    def _ground_of(self, scenario: Scenario) -> Ground:
+        """The piece of road under a scenario's canvas; looked for where it is another one than before."""
+        here = (scenario.map_name, scenario.canvas)
+        if self._ground is None or self._ground[:2] != here:
+            self._ground = None
+            self._ground = (*here, find_ground(self.session, scenario.canvas))
+        return self._ground[2]
 
     def _running(self) -> _Drive:
         if self._drive is None:
@@ -294,7 +371,7 @@ class CarlaSimulator:
     def _observe(self, drive: _Drive, frame: int) -> Observation:
         session = self.session
         images = drive.images = {kind: camera.picture(frame) for kind, camera in drive.cameras.items()}
-        snapshot = session.world.get_snapshot()
+        snapshot = session.ask("where the car is", session.world.get_snapshot)
         if snapshot.frame != frame:
             raise SimulatorError(
                 f"the CARLA server at {session.where} is at frame {snapshot.frame}, expected {frame}; check that no "
@@ -305,7 +382,7 @@ class CarlaSimulator:
             image_from_world(self._camera, images["rgb"]) @ drive.scenario.canvas.world_from_canvas
         )
         picture = levels(images["rgb"])
-        if drive.pattern is not None:
+        if drive.pattern is not None and self._paint is PaintKind.INJECT:
             picture = painted(self.scene(), drive.image_from_canvas, drive.pattern)
         time_s = drive.steps * self._dt_s
         place = drive.route.locate(state.x_m, state.y_m, drive.arclength_m if drive.steps else None)

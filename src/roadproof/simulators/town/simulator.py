@@ -20,7 +20,7 @@ from roadproof.geometry import (
     homography_from_pose,
 )
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.protocol import PaintKind, PatternImage
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.engine import make_pipe
 from roadproof.simulators.town.judge import Judge
@@ -116,6 +116,11 @@ class TownSimulator:
     def dt_s(self) -> float:
         """Simulated seconds per step."""
         return self._dt_s
+
+    @property
+    def paint(self) -> PaintKind:
+        """How patterns are put on the road: rendered with it."""
+        return PaintKind.RENDERED
 
     @property
     def roads(self) -> RoadMap:
