@@ -42,14 +42,15 @@ class Ledger:
         folder: of the run.
         identity: tells this run from another.
         stages: there are.
+        paint: how the simulator puts paint on the road, see `simulators.protocol.PaintKind`.
 
     Raises:
-        RoadproofError: the folder is another run's.
+        RoadproofError: the folder is another run's, or one painted in another way.
         OutputError: it cannot be written.
     """
 
-    def __init__(self, folder: Path, identity: str, stages: Sequence[str]) -> None:
-        self._path, self._identity = folder / FILE, identity
+    def __init__(self, folder: Path, identity: str, stages: Sequence[str], *, paint: str = "rendered") -> None:
+        self._path, self._identity, self._paint = folder / FILE, identity, paint
         self._current, self._since = "", 0.0
         self.cost = {stage: StageCost() for stage in stages}
         if not self._path.exists():
@@ -58,6 +59,11 @@ class Ledger:
         stored = read_json(self._path, FORMAT, FORMAT_VERSION, RoadproofError)
         if stored.get("identity") != self._identity:
             raise RoadproofError(f"{folder} holds a run with other settings; choose another folder, or remove it")
+        before = stored.get("paint", "rendered")
+        if before != paint:
+            raise RoadproofError(
+                f"{folder} holds a run whose paint is {before}, here it is {paint}; choose another folder"
+            )
         self.cost |= _costs(stored, self._path)
 
     @contextmanager
@@ -89,6 +95,7 @@ class Ledger:
     def _write(self) -> None:
         cost = {stage: asdict(cost) for stage, cost in self.cost.items()}
         content = {"format": FORMAT, "version": FORMAT_VERSION, "identity": self._identity, "cost": cost}
+        content["paint"] = self._paint
         write_atomically(self._path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
 
 

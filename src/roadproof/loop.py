@@ -177,7 +177,7 @@ def stress_test(
     space = space or SearchSpace(figures=5)
     # What tells this run from another.
     told = (asdict(scenario), asdict(budget), asdict(space), seed, controller_name)
-    ledger = Ledger(folder, json.dumps(told, default=str), STAGES)
+    ledger = Ledger(folder, json.dumps(told, default=str), STAGES, paint=simulator.paint)
 
     def tell(stage: str, done: int, total: int, word: str) -> None:
         ledger.step()

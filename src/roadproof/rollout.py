@@ -26,7 +26,7 @@ from roadproof.errors import ControllerError, EpisodeError, SimulatorError
 from roadproof.files import write_atomically
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import PatternImage, Simulator
+from roadproof.simulators.protocol import PaintKind, PatternImage, Simulator
 
 FORMAT = "roadproof-episode"
 FORMAT_VERSION = 1
@@ -67,6 +67,7 @@ class Episode:
         scenario: its name.
         weather: of the drive.
         painted: whether there was a pattern on the canvas.
+        paint: how the simulator puts one there.
         cars: how many others were asked for.
         pedestrians: how many people were asked for.
         seed: of cars and people.
@@ -103,6 +104,7 @@ class Episode:
     steer: Float[np.ndarray, "..."]
     throttle: Float[np.ndarray, "..."]
     brake: Float[np.ndarray, "..."]
+    paint: PaintKind = PaintKind.RENDERED
 
     def __post_init__(self) -> None:
         count = self.time_s.size
@@ -164,6 +166,8 @@ class Episode:
                 seed=int(header["seed"]),
                 dt_s=float(header["dt_s"]),
                 ending=Ending(header["ending"]),
+                # Files that do not say it are older than the word, when the town alone was driven.
+                paint=PaintKind(header.get("paint", PaintKind.RENDERED)),
                 events=tuple(
                     Event(EventKind(event["kind"]), float(event["time_s"]), str(event["detail"]))
                     for event in header["events"]
@@ -243,6 +247,7 @@ def rollout(
         scenario=scenario.name,
         weather=Weather(weather),
         painted=pattern is not None,
+        paint=simulator.paint,
         cars=cars,
         pedestrians=pedestrians,
         seed=seed,

@@ -9,10 +9,12 @@ import pytest
 
 from browser import opened, until
 from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.evaluation.result import load_paint
 from roadproof.ledger import Ledger
 from roadproof.patterns import save_pattern
 from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.simulators.protocol import PaintKind
 from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run
 
 SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
@@ -235,6 +237,24 @@ def test_text_has_the_contrast_that_wcag_asks_for(run):
                 assert contrast(theme[ink], theme[ground]) >= 4.5, (ink, ground)
         for kind in ("bad", "mid", "good"):
             assert contrast(theme[kind], theme[f"{kind}-soft"]) >= 4.5, kind
+
+
+@pytest.mark.parametrize(
+    ("paint", "words"),
+    [
+        (PaintKind.RENDERED, "rendered with the road"),
+        (PaintKind.INJECT, "(paint: inject)"),
+        (PaintKind.NATIVE, "(paint: native)"),
+    ],
+)
+def test_the_page_its_numbers_and_commands_say_how_paint_was_put_on_the_road(tmp_path, paint, words):
+    evaluation = write_run(tmp_path)
+    folder = tmp_path / "evaluation"
+    dataclasses.replace(evaluation, paint=paint).save(folder, load_paint(folder))
+    page = write_report(tmp_path).read_text()
+    assert words in page
+    assert ("--simulator" in page) == (paint is not PaintKind.RENDERED)
+    assert read_result(tmp_path)["closed_loop"]["paint"] == paint
 
 
 @pytest.mark.slow

@@ -22,7 +22,9 @@ def calibrate(
             "colours, homographies from the poses; published: coloured points and 22 colours."
         ),
     ] = "two-paint",
-    simulator: Annotated[str, typer.Option(help="Where the drives were recorded: town.")] = "town",
+    simulator: Annotated[
+        str, typer.Option(help="Where the drives were recorded: town, or carla://HOST:PORT.")
+    ] = "town",
 ) -> None:
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209

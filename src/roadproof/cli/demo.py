@@ -31,7 +31,7 @@ def demo(
     rounds: Annotated[int, typer.Option(help="Rounds of searching on along the way that the attacked car took.")] = 0,
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town.")] = "town",
+    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
         "out/demo"

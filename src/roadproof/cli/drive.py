@@ -113,9 +113,9 @@ def _summarise(episode: Episode, out: Path) -> None:
     from rich.console import Console
 
     say = Console(soft_wrap=True, highlight=False, markup=False).print
-    road = "painted" if episode.painted else "bare"
+    road = f"painted road ({episode.paint})" if episode.painted else "bare road"
     say(
-        f"{episode.scenario}, {episode.weather}, {road} road, {episode.cars} cars, {episode.pedestrians} pedestrians: "
+        f"{episode.scenario}, {episode.weather}, {road}, {episode.cars} cars, {episode.pedestrians} pedestrians: "
         f"{episode.ending} after {episode.time_s[-1]:.1f} s, {len(episode.events) or 'no'} event"
         f"{'' if len(episode.events) == 1 else 's'}"
     )

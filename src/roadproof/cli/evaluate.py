@@ -154,5 +154,6 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: Reco
     elif recorded is not None:
         console.print("The recordings are not of this clean drive, so composites were not compared with renders")
     console.print(
-        f"{evaluation.simulator_calls} drives, {evaluation.seconds:.0f} s; results in {out}: evaluation.json, episodes"
+        f"{evaluation.simulator_calls} drives, paint {evaluation.paint}, {evaluation.seconds:.0f} s; "
+        f"results in {out}: evaluation.json, episodes"
     )

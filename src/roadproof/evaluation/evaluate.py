@@ -31,7 +31,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.rollout import Driver, Episode, rollout
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import PatternImage, Simulator
+from roadproof.simulators.protocol import PaintKind, PatternImage, Simulator
 
 PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 CLEAN = "clean"
@@ -144,6 +144,7 @@ def evaluate(
         trials=_judged(planned, scenario, work.folder),
         simulator_calls=len(drives),
         seconds=time.perf_counter() - started,
+        paint=world.paint,
     )
     evaluation.save(folder, paints[ATTACK])
     return evaluation
@@ -273,4 +274,6 @@ def _identity(simulator: Simulator, driver: AnyDriver, name: str, scenario: Scen
         "scenario": asdict(scenario) | {"map_name": map_file.name},
         "map": hashlib.sha256(map_file.read_bytes()).hexdigest() if map_file.is_file() else "",
     }
+    if simulator.paint is not PaintKind.RENDERED:
+        parts["paint"] = simulator.paint
     return json.dumps(parts, sort_keys=True, default=cast("Callable[[object], str]", str))

@@ -38,7 +38,7 @@ from roadproof.metrics import (
 from roadproof.patterns import read_paint
 from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
-from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.protocol import PaintKind, PatternImage
 
 FORMAT = "roadproof-evaluation"
 FORMAT_VERSION = 1
@@ -135,6 +135,7 @@ class Evaluation:
         trials: every drive over paint.
         simulator_calls: drives that all this takes, clean ones included.
         seconds: wall time of the drives made now; those found in the folder cost nothing.
+        paint: how the simulator puts a pattern on the road.
     """
 
     scenario: Scenario
@@ -147,6 +148,7 @@ class Evaluation:
     trials: tuple[Trial, ...]
     simulator_calls: int
     seconds: float
+    paint: PaintKind = PaintKind.RENDERED
 
     def of(self, pattern: str = ATTACK, *, traffic: bool, weather: Weather | None = None) -> tuple[Trial, ...]:
         """The trials of "attack" or "random" in one weather, or in all."""
@@ -207,6 +209,8 @@ class Evaluation:
                 weathers=tuple(Weather(name) for name in content["weathers"]),
                 trials=tuple(trial_from_json(each) for each in content["trials"]),
                 seconds=float(content["seconds"]),
+                # Files that do not say it are older than the word, when the town alone was driven.
+                paint=PaintKind(content.get("paint", PaintKind.RENDERED)),
                 **{
                     name: content[name]
                     for name in ("controller", "runs", "cars", "pedestrians", "seed", "simulator_calls")

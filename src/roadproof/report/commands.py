@@ -7,6 +7,7 @@ import shlex
 from roadproof.attacks import AttackResult
 from roadproof.evaluation import Evaluation
 from roadproof.report.run import Run
+from roadproof.simulators.protocol import PaintKind
 
 
 def commands_of(run: Run) -> tuple[str, ...]:
@@ -39,4 +40,10 @@ def _evaluate(evaluation: Evaluation) -> list[str]:
     options += ["--weathers", ",".join(evaluation.weathers), "--runs", str(evaluation.runs)]
     options += ["--cars", str(evaluation.cars), "--pedestrians", str(evaluation.pedestrians)]
     random = {trial.pattern for trial in evaluation.trials if trial.pattern.startswith("random")}
-    return [*options, "--random", str(len(random)), "--seed", str(evaluation.seed)]
+    # Where a server stood is nobody's to keep; that it was one is.
+    where = (
+        ["--simulator", f"carla://HOST:PORT?paint={evaluation.paint}"]
+        if evaluation.paint is not PaintKind.RENDERED
+        else []
+    )
+    return [*options, "--random", str(len(random)), "--seed", str(evaluation.seed), *where]

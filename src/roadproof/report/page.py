@@ -27,10 +27,18 @@ from roadproof.report.run import Judged, Run, read_run
 from roadproof.report.top_view import top_view
 from roadproof.report.verdict import verdict
 from roadproof.report.words import MISSING, mean_in_words
+from roadproof.simulators.protocol import PaintKind
 
 FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
 SHOWN_COMPOSITES = 3
+
+PAINTED = {
+    PaintKind.RENDERED: "It is part of the simulator’s world, rendered with the road.",
+    PaintKind.NATIVE: "It is part of the CARLA server’s world: the texture of a piece of its road (paint: native).",
+    PaintKind.INJECT: "It is put into the pictures of the car’s camera, where they show free road; the CARLA server’s "
+    "world is bare (paint: inject).",
+}
 
 Fields = dict[str, Any]
 
@@ -87,6 +95,7 @@ def result_of(run: Run) -> Fields:
         evaluation = run.judged.evaluation
         content["closed_loop"] = {
             "controller": evaluation.controller,
+            "paint": evaluation.paint,
             "trials": [asdict(trial) for trial in evaluation.trials],
             "rows": [asdict(row) for row in evaluation.rows()],
         }
@@ -207,6 +216,7 @@ def _pattern(run: Run) -> Fields | None:
     size = (canvas.width_m, canvas.length_m) if canvas is not None else None
     return {
         "picture": encoded(on_asphalt(paint, 480, size or (1.0, 1.0)), "PNG"),
+        "painted": "" if run.judged is None else PAINTED[run.judged.evaluation.paint],
         "size": f"{size[0]:.1f} × {size[1]:.1f} m" if size else "400 × 400 canvas pixels",
         "share": f"{(paint[..., 3] / 255).mean():.0%}",
         "figures": [] if pattern is None else _figures(pattern, size),
