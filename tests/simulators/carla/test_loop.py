@@ -28,6 +28,7 @@ from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Trial, compare_with_rendered, rendered_frames
 from roadproof.evaluation.result import episodes, judge, path_of
 from roadproof.geometry import CameraModel, CropResize
+from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.metrics import lateral_m
 from roadproof.recordings import load_recordings
 from roadproof.rollout import Episode, rollout
@@ -35,7 +36,6 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
-from roadproof.stress_test import Budget, StressTest, stress_test
 
 # Half of the published camera, and of what is cut from it: the controller's frame is as large as ever.
 CAMERA = CameraModel(width_px=400, height_px=300, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
