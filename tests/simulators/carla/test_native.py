@@ -93,9 +93,7 @@ def truth(street, canvas):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize("at_m", [50.0, 90.0])
+@pytest.mark.parametrize("at_m", [30.0, 50.0, 70.0])
 def test_the_piece_and_its_texture_are_found_by_looking(session, street, at_m):
     canvas = CanvasPlacement(x_m=at_m, y_m=0.0, width_m=6.0)
     ground = find_ground(session, canvas)
@@ -113,6 +111,7 @@ def test_it_keeps_what_a_simulator_promises(port):
     assert report.passed, str(report)
 
 
+@pytest.mark.slow
 def test_auto_takes_the_servers_road_where_it_can_be_painted_and_the_pictures_where_not(port, street, tmp_path):
     with open_simulator(f"carla://127.0.0.1:{port}?paint=auto") as simulator:
         assert simulator.paint is PaintKind.NATIVE
@@ -147,6 +146,7 @@ def test_a_texture_that_is_repeated_is_refused(street):
         opened.close()
 
 
+@pytest.mark.slow
 def test_the_road_is_as_it_was_after_the_simulator_is_left(port):
     white = np.full((400, 400, 4), 255, np.uint8)
 
