@@ -27,7 +27,7 @@ FIRST_STEP = {
     "report": ("evaluation/evaluation.json", "report.html"),
 }
 """What shows that a stage has done its first step, and what it leaves when it is done."""
-PATIENCE_S = 120.0
+PATIENCE_S = 600.0
 
 
 @pytest.fixture(scope="module")
