@@ -4,10 +4,12 @@ import sys
 
 import pytest
 
+from paint_shy import along_a_street
 from roadproof.attacks import Schedule
 from roadproof.cli import main
 from roadproof.datatypes import Weather
 from roadproof.loop import BUDGETS, Budget
+from roadproof.scenarios import save_scenarios
 
 TINY = Budget(frames=4, schedule=Schedule.stretched(2), restarts=1, select=1, weathers=(Weather.CLEAR_NOON,), runs=0)
 
@@ -28,16 +30,18 @@ def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch
     pytest.importorskip("panda3d", reason="panda3d is not installed")
     pytest.importorskip("av", reason="av is not installed")
     monkeypatch.setitem(BUDGETS, "quick", TINY)
+    file, out = tmp_path / "scenarios.toml", tmp_path / "run"
+    save_scenarios([along_a_street(tmp_path, 3.2)], file)
     for _ in range(2):  # the second finds all done
-        code, printed = demo("--figures", 1, "--out", tmp_path)
+        code, printed = demo("--scenarios", file, "--scenario", "street", "--figures", 1, "--out", out)
         assert code == 0, printed.err
-        assert "left-03" in printed.out
+        assert "street" in printed.out
         assert "record" in printed.out
-    page = (tmp_path / "report.html").read_text()
+    page = (out / "report.html").read_text()
     assert "pilotnet" in page
-    assert "roadproof demo --scenario left-03" in page
-    assert (tmp_path / "evaluation" / "film.mp4").stat().st_size > 10_000
-    assert (tmp_path / "evaluation" / "fidelity.npz").exists()
+    assert "roadproof demo --scenario street" in page
+    assert (out / "evaluation" / "film.mp4").stat().st_size > 10_000
+    assert (out / "evaluation" / "fidelity.npz").exists()
 
 
 def test_mistakes_are_one_clear_line(demo, tmp_path):

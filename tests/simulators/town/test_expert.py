@@ -51,10 +51,12 @@ def test_the_expert_completes_scenarios_in_traffic(town: TownSimulator) -> None:
 
 
 @pytest.mark.slow
-def test_the_expert_completes_all_scenarios(town: TownSimulator) -> None:
-    for agents, least in ((0, 40), (20, 38)):
-        drives = [driven(town, scenario, agents, 1) for scenario in SCENARIOS]
-        assert sum(arrived and not events for arrived, events, _ in drives) >= least
+def test_the_expert_completes_scenarios_of_every_kind_among_cars_and_people(town: TownSimulator) -> None:
+    # benchmarks/expert_drives.py drives them all.
+    for scenario in SCENARIOS[4::12]:
+        arrived, events, _ = driven(town, scenario, 20, 1)
+        assert arrived
+        assert events == []
 
 
 def test_the_expert_knows_the_car_it_drives() -> None:
