@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from roadproof.report.study.blocks import compared, overall
 from roadproof.report.study.folder import Found, History
@@ -112,6 +113,7 @@ def progress(results: Results, found: Sequence[Found]) -> Picture | None:
             for method, own in histories[figures].items():
                 _draw_course(axes, [axis(each) for each in own], own, plain(method), style(results, method))
             axes.set_xscale("log")
+            _plain_ticks(axes)
             axes.set_ylim(bottom=0.0)
             label(axes, name, "deviation of the best so far, m" if column == 0 else "")
             if row == 0:
@@ -124,6 +126,13 @@ def progress(results: Results, found: Sequence[Found]) -> Picture | None:
         "on composited frames is a point, where its answer was driven.",
         figure,
     )
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """1, 2, 5, 10 … in words, however few decades there are."""
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_course(
