@@ -15,10 +15,10 @@ def step():
     first, second = torch.ones(8 << 18), torch.ones(40 << 18)
     del first
     third = torch.ones(20 << 18)
-step()
-step()
+for _ in range(10):  # the heap grows to what is needed
+    step()
 before = faults()
-for _ in range(5):
+for _ in range(10):
     step()
 print(faults() - before)
 """
@@ -33,4 +33,4 @@ def page_faults(first: str) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
 def test_blocks_that_were_freed_are_used_again() -> None:
-    assert page_faults("keep_freed_memory()") < 0.5 * page_faults("")
+    assert page_faults("keep_freed_memory()") < 0.3 * page_faults("")
