@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,21 +23,15 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         OutputError: the folder cannot be made or written, or the disk is full; nothing is left behind.
     """
-    part: Path | None = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _writing(path):
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
         os.close(handle)
         part = Path(name)
-        write(part)
-        part.chmod(0o644)
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(
-            f"cannot write {path}: {error.strerror or error}; choose a folder that can be written"
-        ) from None
-    finally:
-        if part is not None:
+        try:
+            write(part)
+            part.chmod(0o644)
+            part.replace(path)
+        finally:
             part.unlink(missing_ok=True)
 
 
@@ -50,20 +45,26 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], object]) -> No
     Raises:
         OutputError: the folder cannot be made or written, or the disk is full; nothing is left behind.
     """
-    part: Path | None = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
+    with _writing(folder):
         part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-        write(part)
-        part.chmod(0o755)
-        part.replace(folder)
+        try:
+            write(part)
+            part.chmod(0o755)
+            part.replace(folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+@contextmanager
+def _writing(path: Path) -> Generator[None]:
+    """Make the folder that `path` is to be in; what the system refuses is an `OutputError`."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
     except OSError as error:
         raise OutputError(
-            f"cannot write {folder}: {error.strerror or error}; choose a folder that can be written"
+            f"cannot write {path}: {error.strerror or error}; choose a folder that can be written"
         ) from None
-    finally:
-        if part is not None:
-            shutil.rmtree(part, ignore_errors=True)
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:

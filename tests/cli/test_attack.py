@@ -12,7 +12,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from roadproof.attacks import AttackResult
-from roadproof.cli import app, main
+from roadproof.cli import app
 from roadproof.patterns import load_pattern
 from roadproof.recordings import save_recordings
 from scenes import recording_set
@@ -63,16 +63,8 @@ def command(*options, recordings="set", controller="own_controller:Linear"):
     return ["attack", str(recordings), "--controller", controller, *quick, *options]
 
 
-def run(monkeypatch, capsys, arguments):
-    """The installed command's exit code and what it printed."""
-    monkeypatch.setattr(sys, "argv", ["roadproof", *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    return stopped.value.code or 0, capsys.readouterr()
-
-
-def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, monkeypatch, capsys):
-    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "out")))
+def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke):
+    code, printed = invoke(*command("--out", str(tmp_path / "out")))
     assert code == 0, printed.err
     assert "Strongest for clean+" in printed.out
     assert "predicted" in printed.out
@@ -153,14 +145,14 @@ def _empty(tmp_path):
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_one_clear_line_and_exit_code_2(here, tmp_path, monkeypatch, capsys, name):
+def test_a_mistake_is_one_clear_line_and_exit_code_2(here, tmp_path, invoke, name):
     options, kwargs, message = MISTAKES[name]
     kwargs = dict(kwargs)
     if "damage" in kwargs:
         kwargs["recordings"] = damaged(here, tmp_path, kwargs.pop("damage"))
     if callable(kwargs.get("recordings")):
         kwargs["recordings"] = kwargs["recordings"](tmp_path)
-    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "out"), *options, **kwargs))
+    code, printed = invoke(*command("--out", str(tmp_path / "out"), *options, **kwargs))
     assert code == 2
     assert message in printed.err
     assert printed.err.startswith("roadproof: ")
@@ -168,26 +160,26 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(here, tmp_path, monkeypatch
     assert not (tmp_path / "out" / "result.json").exists()
 
 
-def test_cuda_that_is_absent_is_named(here, tmp_path, monkeypatch, capsys):
+def test_cuda_that_is_absent_is_named(here, tmp_path, invoke, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path), "--device", "cuda"))
+    code, printed = invoke(*command("--out", str(tmp_path), "--device", "cuda"))
     assert code == 2
     assert "cuda" in printed.err
 
 
-def test_an_output_folder_that_cannot_be_made_is_named_before_the_search(here, tmp_path, monkeypatch, capsys):
+def test_an_output_folder_that_cannot_be_made_is_named_before_the_search(here, tmp_path, invoke):
     (tmp_path / "file").write_text("")
-    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "file" / "out")))
+    code, printed = invoke(*command("--out", str(tmp_path / "file" / "out")))
     assert code == 2
     assert "cannot write" in printed.err
 
 
-def test_a_full_disk_is_named_and_leaves_nothing_half_written(here, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_is_named_and_leaves_nothing_half_written(here, tmp_path, invoke, monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("roadproof.attacks.result.json.dumps", full)
-    code, printed = run(monkeypatch, capsys, command("--out", str(tmp_path / "out")))
+    code, printed = invoke(*command("--out", str(tmp_path / "out")))
     assert code == 2
     assert "No space left" in printed.err
     assert not list((tmp_path / "out").glob(".result*"))

@@ -2,13 +2,11 @@
 
 import inspect
 import json
-import sys
 
 import pytest
 from PIL import Image
 
 from carla_serving import free_port, serving, straight_map
-from roadproof.cli import main
 from roadproof.datatypes import VehicleState
 from roadproof.evaluation import Evaluation
 from roadproof.geometry import CanvasPlacement
@@ -35,17 +33,14 @@ SHY = ["--controller", "paint_shy:paint_shy"]
 
 
 @pytest.fixture
-def call(tmp_path, monkeypatch, capsys):
+def call(tmp_path, invoke, monkeypatch):
     save_scenarios([STREET], tmp_path / "street.toml")
     Image.new("RGBA", (400, 400), (255, 0, 255, 255)).save(tmp_path / "magenta.png")
     monkeypatch.chdir(tmp_path)
 
     def run(*options, code=0):
-        monkeypatch.setattr(sys, "argv", ["roadproof", *options])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        said = capsys.readouterr()
-        assert stopped.value.code == code, said.err
+        left, said = invoke(*options)
+        assert left == code, said.err
         return said.err if code else said.out
 
     return run

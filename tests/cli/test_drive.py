@@ -11,7 +11,6 @@ import pytest
 import torch
 from PIL import Image
 
-from roadproof.cli import main
 from roadproof.coverage import Shape
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.rollout import Episode
@@ -62,17 +61,15 @@ def workplace(tmp_path_factory):
 
 
 @pytest.fixture
-def refused(workplace, tmp_path, monkeypatch, capsys):
+def refused(workplace, tmp_path, invoke, monkeypatch):
     """Calls the command in the workplace for something it refuses; gives what it said."""
     monkeypatch.chdir(workplace)
 
     def call(*options, out=tmp_path / "out"):
-        monkeypatch.setattr(sys, "argv", ["roadproof", "drive", "--out", str(out), *options])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        assert stopped.value.code == 2
+        code, said = invoke("drive", "--out", out, *options)
+        assert code == 2
         assert not out.exists() or list(out.iterdir()) == []
-        return capsys.readouterr().err
+        return said.err
 
     return call
 

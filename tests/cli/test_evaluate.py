@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 from paint_shy import just_before_the_canvas
-from roadproof.cli import main
 from roadproof.coverage import Shape
 from roadproof.evaluation import Evaluation
 from roadproof.patterns import Pattern, save_pattern
@@ -85,23 +84,19 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_one_clear_line(workplace, tmp_path, monkeypatch, capsys, name):
+def test_a_mistake_is_one_clear_line(workplace, tmp_path, invoke, monkeypatch, name):
     options, message = MISTAKES[name]
     monkeypatch.chdir(workplace)
     given = ["--controller", "expert", *options, "--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", ["roadproof", "evaluate", *given])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    said = capsys.readouterr().err
+    code, printed = invoke("evaluate", *given)
+    assert code == 2
+    said = printed.err
     assert message in said
     assert said.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_empty_run_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["roadproof", "report", str(tmp_path)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 2
-    assert "nothing to report yet" in capsys.readouterr().err
+def test_an_empty_run_is_refused_in_one_line(tmp_path, invoke):
+    code, said = invoke("report", tmp_path)
+    assert code == 2
+    assert "nothing to report yet" in said.err

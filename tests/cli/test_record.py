@@ -1,12 +1,10 @@
 """`roadproof record`, `calibrate` and `attack` one after another, as their users call them."""
 
 import json
-import sys
 import textwrap
 
 import pytest
 
-from roadproof.cli import main
 from roadproof.drives import load_drives
 from roadproof.recordings import load_recordings
 
@@ -38,15 +36,12 @@ def workplace(tmp_path_factory):
 
 
 @pytest.fixture
-def call(workplace, monkeypatch, capsys):
+def call(workplace, invoke, monkeypatch):
     monkeypatch.chdir(workplace)
 
     def run(*options, code=0):
-        monkeypatch.setattr(sys, "argv", ["roadproof", *options])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        said = capsys.readouterr()
-        assert stopped.value.code == code, said.err
+        left, said = invoke(*options)
+        assert left == code, said.err
         return said.err if code else said.out
 
     return run

@@ -1,25 +1,18 @@
 """`roadproof scenarios` as its users call it."""
 
 import dataclasses
-import sys
+import functools
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from roadproof.cli import main
 from roadproof.scenarios import builtin_scenarios, save_scenarios
 
 
 @pytest.fixture
-def scenarios(monkeypatch, capsys):
-    def call(*options):
-        monkeypatch.setattr(sys, "argv", ["roadproof", "scenarios", *map(str, options)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return stopped.value.code or 0, capsys.readouterr()
-
-    return call
+def scenarios(invoke):
+    return functools.partial(invoke, "scenarios")
 
 
 def test_all_40_are_listed_once(scenarios):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
+import functools
 
 import pytest
 
-from roadproof.cli import main
 from roadproof.study.rows import pandas, read_table
 from short_drive import write_plan
 
@@ -22,14 +21,8 @@ method = [{ name = "chance", search = "random", calls = 1 }]
 
 
 @pytest.fixture
-def study(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["roadproof", "study", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return stopped.value.code or 0, capsys.readouterr()
-
-    return call
+def study(invoke):
+    return functools.partial(invoke, "study")
 
 
 @pytest.fixture

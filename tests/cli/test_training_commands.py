@@ -1,24 +1,11 @@
 """`roadproof controllers`, `check-controller` and `train` as their users call them."""
 
 import dataclasses
-import sys
 
 import pytest
 
-from roadproof.cli import main
 from roadproof.controllers import CIL, load_controller, model_card, shipped_names
 from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
-
-
-@pytest.fixture
-def roadproof(monkeypatch, capsys):
-    def call(*options):
-        monkeypatch.setattr(sys, "argv", ["roadproof", *map(str, options)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return stopped.value.code or 0, capsys.readouterr()
-
-    return call
 
 
 @pytest.fixture
@@ -29,53 +16,53 @@ def short(tmp_path):
     return tmp_path / "short.toml"
 
 
-def test_every_shipped_controller_is_listed(roadproof):
-    code, printed = roadproof("controllers")
+def test_every_shipped_controller_is_listed(invoke):
+    code, printed = invoke("controllers")
     assert code == 0, printed.err
     for name in shipped_names():
         assert name in printed.out.split()
 
 
-def test_a_card_is_shown_whole(roadproof):
-    code, printed = roadproof("controllers", "cil")
+def test_a_card_is_shown_whole(invoke):
+    code, printed = invoke("controllers", "cil")
     assert code == 0, printed.err
     for text in (model_card("cil").cannot, model_card("cil").data):
         assert " ".join(text.split()) in " ".join(printed.out.split())
 
 
-def test_an_unknown_controller_is_one_line(roadproof):
+def test_an_unknown_controller_is_one_line(invoke):
     for command in ("controllers", "check-controller"):
-        code, printed = roadproof(command, "cill")
+        code, printed = invoke(command, "cill")
         assert code == 2
         assert printed.err == "roadproof: no controller called 'cill' comes with roadproof; did you mean 'cil'?\n"
 
 
-def test_promises_are_checked_without_driving(roadproof):
-    code, printed = roadproof("check-controller", "cil", "--no-drive")
+def test_promises_are_checked_without_driving(invoke):
+    code, printed = invoke("check-controller", "cil", "--no-drive")
     assert code == 0, printed.err
     assert "ok  gradients" in printed.out
     assert "scenarios clean" not in printed.out
 
 
-def test_scenarios_that_are_not_clean_are_named(roadproof, short):
+def test_scenarios_that_are_not_clean_are_named(invoke, short):
     pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
-    code, printed = roadproof("check-controller", "cil", "--scenarios", short, "--processes", 1)
+    code, printed = invoke("check-controller", "cil", "--scenarios", short, "--processes", 1)
     assert code == 0, printed.err
     assert "0 of 2 scenarios clean" in printed.out
     assert "left-11: did not arrive" in printed.out
 
 
-def test_a_controller_is_trained_from_the_command_line(roadproof, tmp_path):
+def test_a_controller_is_trained_from_the_command_line(invoke, tmp_path):
     pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
     options = ["--out", tmp_path, "--width", 0.05, "--drives", 1, "--samples", 128, "--rounds", 0, "--processes", 1]
-    code, printed = roadproof("train", *options, "--collect-only")
+    code, printed = invoke("train", *options, "--collect-only")
     assert code == 0, printed.err
     assert "1 drives in" in printed.out
-    code, printed = roadproof("train", *options)
+    code, printed = invoke("train", *options)
     assert code == 0, printed.err
     assert "check-controller" in printed.out
     assert isinstance(load_controller(tmp_path / "cil.safetensors"), CIL)
-    code, printed = roadproof("train", *options[:-2], "--seed", 3)
+    code, printed = invoke("train", *options[:-2], "--seed", 3)
     assert code == 2
     assert "was begun with seed = 0, now it is 3" in printed.err
 
@@ -89,8 +76,8 @@ def test_a_controller_is_trained_from_the_command_line(roadproof, tmp_path):
         (["--start", "none.safetensors"], "none.safetensors does not exist"),
     ],
 )
-def test_mistakes_are_one_line_before_anything_is_driven(roadproof, tmp_path, options, message):
-    code, printed = roadproof("train", "--out", tmp_path / "out", *options)
+def test_mistakes_are_one_line_before_anything_is_driven(invoke, tmp_path, options, message):
+    code, printed = invoke("train", "--out", tmp_path / "out", *options)
     assert code == 2
     assert message in printed.err
     assert printed.err.count("\n") == 1

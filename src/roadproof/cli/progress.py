@@ -16,41 +16,27 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-_HOURS_S = 6 * 3600.0
+_SECONDS_S, HOURS_S = 30.0, 6 * 3600.0
 
 
 @contextmanager
-def progress(title: str, total: int, value: str = "best {:.3f}") -> Generator[Callable[[int, float], None]]:
+def progress(
+    title: str, total: int, value: str = "best {:.3f}", *, begun: int = 0, remember_s: float = _SECONDS_S
+) -> Generator[Callable[[int, float], None]]:
     """A bar on standard error, and the function that moves it.
 
     Args:
         title: what is going on.
         total: steps there are.
         value: how the number beside the bar is shown.
-
-    Yields:
-        What to call with the steps done and that number.
-    """
-    with _bars() as bar:
-        task = bar.add_task(title, total=total, value=value.format(0.0))
-        yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
-
-
-@contextmanager
-def long_progress(title: str, total: int, begun: int, value: str) -> Generator[Callable[[int, float], None]]:
-    """A bar for steps that take minutes each, some of which may be done already.
-
-    Args:
-        title: what is going on.
-        total: steps there are.
         begun: how many of them were done before; they say nothing on the time left.
-        value: how the number beside the bar is shown.
+        remember_s: how far back the steps go from which the time left is told; `HOURS_S` where each takes minutes.
 
     Yields:
         What to call with the steps done and that number.
     """
-    with _bars(remember_s=_HOURS_S) as bar:
-        task = bar.add_task(title, total=total, completed=begun, value=value.format(0))
+    with _bars(remember_s) as bar:
+        task = bar.add_task(title, total=total, completed=begun, value=value.format(0.0))
         yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
 
 
@@ -72,7 +58,7 @@ def stages() -> Generator[Callable[[str, int, int, str], None]]:
         yield show
 
 
-def _bars(remember_s: float = 30.0) -> Progress:
+def _bars(remember_s: float = _SECONDS_S) -> Progress:
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),

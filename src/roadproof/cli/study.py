@@ -30,7 +30,7 @@ def run(
     # Torch takes seconds to import; `--help` should not.
     from rich.console import Console
 
-    from roadproof.cli.progress import long_progress
+    from roadproof.cli.progress import HOURS_S, progress
     from roadproof.study.job import run_job
     from roadproof.study.plan import load_study
     from roadproof.study.rows import is_done, records
@@ -40,7 +40,7 @@ def run(
     chosen = load_study(plan)
     begun = sum(is_done(job, out) for job in chosen.jobs)
     failed = 0
-    with long_progress("Jobs", len(chosen.jobs), begun, "{:.0f} failed") as show:
+    with progress("Jobs", len(chosen.jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
 
         def told(done: int, _: Job, result: JobResult) -> None:
             nonlocal failed
@@ -69,7 +69,7 @@ def transfer(
     """Drive other controllers over the patterns a study found."""
     from rich.console import Console
 
-    from roadproof.cli.progress import long_progress
+    from roadproof.cli.progress import HOURS_S, progress
     from roadproof.study.plan import load_study
     from roadproof.study.rows import records
     from roadproof.study.summary import matrix
@@ -77,7 +77,7 @@ def transfer(
 
     chosen = load_study(plan)
     specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
-    with long_progress("Patterns", len(chosen.jobs) * len(specs), 0, "") as show:
+    with progress("Patterns", len(chosen.jobs) * len(specs), "", remember_s=HOURS_S) as show:
         rows = records(run_transfer(chosen, out, specs, on_pattern=lambda done, _total: show(done, 0.0)))
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     for line in matrix(rows):

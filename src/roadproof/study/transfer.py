@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,8 +57,7 @@ def transfer(
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
     rows: list[Row] = []
-    with ExitStack() as stack:
-        world = stack.enter_context(open_simulator(study.simulator))
+    with open_simulator(study.simulator) as world:
         for spec, driver in drivers.items():
             for job in found:
                 rows.append(_row(job, folder, world, spec, driver))

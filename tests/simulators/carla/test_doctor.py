@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from carla_serving import free_port, serving, straight_map
+from carla_serving import free_port, serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
@@ -44,17 +44,6 @@ sensors.depth_levels = lambda depth_m: right(1.1 * depth_m)
 from roadproof.cli import main
 main()
 """
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    return straight_map(tmp_path_factory.mktemp("maps"))
-
-
-@pytest.fixture(scope="module")
-def port(street):
-    with serving("--map", street) as (_, opened):
-        yield opened
 
 
 @pytest.mark.slow

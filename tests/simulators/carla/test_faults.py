@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carla_serving import serving, straight_map
+from carla_serving import serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
@@ -40,11 +40,6 @@ STREET = Scenario(
 AHEAD = Control(0.0, throttle=0.6)
 PATIENCE_S = 3.0
 MAIN = "from roadproof.cli import main; main()"
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    return straight_map(tmp_path_factory.mktemp("maps"))
 
 
 def small(port):

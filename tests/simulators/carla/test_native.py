@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from carla_serving import serving, straight_map
+from carla_serving import serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
@@ -52,17 +52,6 @@ pieces.Piece.pattern = lambda self, picture: once(self, np.tile(picture, (4, 4, 
 from roadproof.cli import main
 main()
 """
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    return straight_map(tmp_path_factory.mktemp("maps"))
-
-
-@pytest.fixture(scope="module")
-def port(street):
-    with serving("--map", street) as (_, opened):
-        yield opened
 
 
 @pytest.fixture

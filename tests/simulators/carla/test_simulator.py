@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from carla_serving import free_port, serving, straight_map
+from carla_serving import free_port, serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
@@ -43,17 +43,6 @@ STREET = Scenario(
     time_limit_s=30.0,
 )
 AHEAD = Control(0.0, throttle=0.6)
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    return straight_map(tmp_path_factory.mktemp("maps"))
-
-
-@pytest.fixture(scope="module")
-def port(street):
-    with serving("--map", street) as (_, opened):
-        yield opened
 
 
 @pytest.fixture

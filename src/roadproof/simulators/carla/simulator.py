@@ -14,7 +14,6 @@ import numpy as np
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import (
-    CANVAS_SIZE_PX,
     CIL_CAMERA,
     CIL_INPUT,
     CameraModel,
@@ -23,6 +22,7 @@ from roadproof.geometry import (
     Homography,
 )
 from roadproof.scenarios import Scenario
+from roadproof.simulators.arguments import check_crop, check_pattern
 from roadproof.simulators.carla.actors import Crowd, carla_transform, spawn_driven, vehicle_state
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.collisions import Collisions
@@ -103,11 +103,7 @@ class CarlaSimulator:
         Raises:
             SimulatorError: the crop leaves the camera picture.
         """
-        if input.right_px > camera.width_px or input.bottom_px > camera.height_px:
-            raise SimulatorError(
-                f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
-                f"{camera.width_px}×{camera.height_px} pixels"
-            )
+        check_crop(camera, input)
         self._camera, self._input, self._dt_s = camera, input, dt_s
         self._host, self._port, self._patience_s, self._loading_s = host, port, patience_s, loading_s
         self._choice: PaintChoice = paint
@@ -279,7 +275,7 @@ class CarlaSimulator:
         """
         session = self.session
         weather = Weather(weather)
-        _check_pattern(pattern)
+        check_pattern(pattern)
         roads = session.road_map(scenario.map_name)
         route = scenario_route(scenario, roads)
         traffic = None
@@ -397,14 +393,6 @@ class CarlaSimulator:
             events=drive.judge.watch(state, time_s, drive.collisions.contacts(drive.crowd), people),
             done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
             picture=picture if drive.full_pictures else None,
-        )
-
-
-def _check_pattern(pattern: PatternImage | None) -> None:
-    expected = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
-    if pattern is not None and (pattern.shape != expected or pattern.dtype != np.uint8):
-        raise SimulatorError(
-            f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {expected} (RGBA)"
         )
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
 from roadproof.geometry import (
-    CANVAS_SIZE_PX,
     CIL_CAMERA,
     CIL_INPUT,
     CameraModel,
@@ -20,6 +19,7 @@ from roadproof.geometry import (
     homography_from_pose,
 )
 from roadproof.scenarios import Scenario
+from roadproof.simulators.arguments import check_crop, check_pattern
 from roadproof.simulators.protocol import PaintKind, PatternImage
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.engine import make_pipe
@@ -92,11 +92,7 @@ class TownSimulator:
         substeps = dt_s / SUBSTEP_S
         if not (math.isfinite(dt_s) and round(substeps) >= 1 and abs(substeps - round(substeps)) < 1e-6):
             raise SimulatorError(f"dt_s is {dt_s}, expected a positive multiple of {SUBSTEP_S}")
-        if input.right_px > camera.width_px or input.bottom_px > camera.height_px:
-            raise SimulatorError(
-                f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
-                f"{camera.width_px}×{camera.height_px} pixels"
-            )
+        check_crop(camera, input)
         self._camera, self._input, self._dt_s = camera, replace(input, resampling="area"), dt_s
         self._open = False
         self._town: _Town | None = None
@@ -211,7 +207,7 @@ class TownSimulator:
         if not self._open:
             raise SimulatorError("the simulator is closed; use it in a with-block")
         weather = Weather(weather)
-        _check_pattern(pattern)
+        check_pattern(pattern)
         town = self._town_of(scenario)
         route = scenario_route(scenario, town.roads)
         self._end_drive()
@@ -299,14 +295,6 @@ class TownSimulator:
             events=events,
             done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
             picture=picture,
-        )
-
-
-def _check_pattern(pattern: PatternImage | None) -> None:
-    expected = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
-    if pattern is not None and (pattern.shape != expected or pattern.dtype != np.uint8):
-        raise SimulatorError(
-            f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {expected} (RGBA)"
         )
 
 
