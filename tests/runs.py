@@ -15,8 +15,9 @@ from roadproof.coverage import Shape
 from roadproof.datatypes import Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window
 from roadproof.drives.drives import Settings, write_drive, write_settings
-from roadproof.evaluation import Evaluation
+from roadproof.evaluation import Evaluation, Selection
 from roadproof.evaluation.result import judge
+from roadproof.evaluation.selection import Driven
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Push, save_recordings
@@ -120,6 +121,26 @@ def write_attack(folder):
         restarts=2,
         seed=0,
     ).save(folder)  # fmt: skip
+
+
+def write_selection(folder, *aside_m, chosen):
+    """Candidates that go so far aside when driven."""
+    scenario = find_scenario("left-03", builtin_scenarios())
+    clean = driven(scenario)
+    trials = [
+        judge(
+            clean,
+            driven(scenario, metres, painted=True),
+            scenario.canvas,
+            pattern=f"candidate-{rank}",
+            clean_file="clean.npz",
+            painted_file=f"candidate-{rank}.npz",
+        )
+        for rank, metres in enumerate(aside_m, 1)
+    ]
+    candidates = tuple(Driven(group="clean+left", rank=rank, trial=trial) for rank, trial in enumerate(trials, 1))
+    Selection(pattern=PATTERN, driven=candidates, chosen=chosen, simulator_calls=1 + len(trials)).save(folder)
+    return trials
 
 
 def write_strip(folder):

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
-import sys
+import functools
 
 import pytest
 
 from paint_shy import along_a_street
 from roadproof.attacks import Schedule
-from roadproof.cli import main
 from roadproof.datatypes import Weather
 from roadproof.loop import BUDGETS, Budget
 from roadproof.scenarios import save_scenarios
@@ -15,14 +14,8 @@ TINY = Budget(frames=4, schedule=Schedule.stretched(2), restarts=1, select=1, we
 
 
 @pytest.fixture
-def demo(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["roadproof", "demo", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return stopped.value.code or 0, capsys.readouterr()
-
-    return call
+def demo(invoke):
+    return functools.partial(invoke, "demo")
 
 
 @pytest.mark.slow
@@ -48,6 +41,8 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
     for options, message in (
         (["--budget", "endless"], "--budget is 'endless'"),
         (["--scenario", "left-99"], "did you mean"),
+        (["--attack-weathers", "clear-noon,rainy"], "--attack-weathers is 'rainy'"),
+        (["--attack-weathers", "clear-noon,rainy-noon", "--budget", "paper"], "choose two-paint"),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
     ):

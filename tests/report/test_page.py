@@ -15,7 +15,7 @@ from roadproof.patterns import save_pattern
 from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.simulators.protocol import PaintKind
-from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run
+from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run, write_selection
 
 SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
 HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)>"&'{{7*7}}$\\frac{1}{2}$"""
@@ -117,6 +117,28 @@ def test_the_figures_listed_are_those_of_the_pattern_that_was_chosen(tmp_path):
     assert "#e5cc1a" not in report_of(tmp_path).text, "the attack's strongest is not what was painted"
     save_pattern(PATTERN, tmp_path / "pattern.json")
     assert "#e5cc1a" in report_of(tmp_path).text
+
+
+def test_every_candidate_that_was_driven_is_shown_and_the_one_that_was_kept(tmp_path):
+    write_run(tmp_path)
+    assert "Chosen by driving" not in report_of(tmp_path).text
+    first = write_selection(tmp_path / "selection", 0.4, 0.9, chosen=1)
+    again = write_selection(tmp_path / "round-1" / "selection", 1.3, 0.2, chosen=0)
+    write_selection(tmp_path / "round-2" / "selection", 0.5, chosen=0)
+    text = report_of(tmp_path).text
+    for trial in (*first, *again):
+        assert f"{trial.deviation_m:.2f} {abs(trial.lateral_m):.2f} 0" in text
+    assert text.count(", chosen") == 1
+    assert f"round 1, chosen clean+left 1 {again[0].deviation_m:.2f}" in text
+    assert text.index("the search") < text.index("round 1") < text.index("round 2")
+
+
+def test_a_damaged_choice_is_named(tmp_path):
+    write_run(tmp_path)
+    write_selection(tmp_path / "selection", 0.4, chosen=0)
+    (tmp_path / "selection" / "selection.json").write_text('{"format": "roadproof-selection", "version": 1}')
+    with pytest.raises(RoadproofError, match=r"selection\.json is incomplete or damaged"):
+        write_report(tmp_path)
 
 
 def test_the_page_needs_nothing_from_outside(run):

@@ -29,6 +29,9 @@ def demo(
     ] = "pilotnet",
     budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
     rounds: Annotated[int, typer.Option(help="Rounds of searching on along the way that the attacked car took.")] = 0,
+    attack_weathers: Annotated[
+        str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
+    ] = "clear-noon",
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
     simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
@@ -39,7 +42,7 @@ def demo(
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice
+    from roadproof.cli.options import choice, weathers_of
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.files import write_atomically
@@ -49,7 +52,8 @@ def demo(
     from roadproof.simulators.loading import open_simulator
 
     tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
-    spent = replace(BUDGETS[choice(budget, "budget", tuple(BUDGETS))], rounds=rounds)
+    spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
+    spent = replace(spent, rounds=rounds, attack_weathers=weathers_of(attack_weathers, "attack-weathers"))
     space = SearchSpace(figures=figures)
     who = load_controller(controller, device=device)
     with open_simulator(simulator) as world:
@@ -68,7 +72,16 @@ def demo(
             )
         _film(world, who, result, out)
     given = ["--scenario", scenario, "--controller", controller, "--budget", budget, "--rounds", str(rounds)]
-    given += ["--figures", str(figures), "--seed", str(seed), "--simulator", simulator]
+    given += [
+        "--attack-weathers",
+        attack_weathers,
+        "--figures",
+        str(figures),
+        "--seed",
+        str(seed),
+        "--simulator",
+        simulator,
+    ]
     given += ["--scenarios", str(scenarios)] if scenarios else []
     command = shlex.join(["roadproof", "demo", *given, "--out", str(out)])
     write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))

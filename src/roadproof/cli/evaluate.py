@@ -53,10 +53,9 @@ def evaluate(
 ) -> None:
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice, driver_of
+    from roadproof.cli.options import driver_of, weathers_of
     from roadproof.cli.progress import progress
     from roadproof.controllers import Controller
-    from roadproof.datatypes import Weather
     from roadproof.errors import PatternError
     from roadproof.evaluation import evaluate as run
     from roadproof.evaluation import random_patterns
@@ -67,7 +66,7 @@ def evaluate(
     from roadproof.simulators.loading import open_simulator
 
     driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
-    skies = [Weather(choice(name.strip(), "weathers", tuple(Weather))) for name in weathers.split(",")]
+    skies = weathers_of(weathers, "weathers")
     figures = load_pattern(pattern) if pattern.suffix == ".json" else None
     paint = read_paint(pattern)
     if figures is None and (random or recordings):

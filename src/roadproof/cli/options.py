@@ -10,6 +10,7 @@ from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
+    from roadproof.datatypes import Weather
     from roadproof.rollout import Policy
     from roadproof.simulators.loading import MappedSimulator
 
@@ -28,6 +29,17 @@ def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:
     near = difflib.get_close_matches(value, allowed, 1)
     hint = f"; did you mean {near[0]}?" if near else ""
     raise RoadproofError(f"--{option} is {value!r}, expected one of {', '.join(allowed)}{hint}")
+
+
+def weathers_of(names: str, option: str) -> tuple[Weather, ...]:
+    """The weathers of a list with commas between.
+
+    Raises:
+        RoadproofError: one of them is none; the message names the nearest.
+    """
+    from roadproof.datatypes import Weather
+
+    return tuple(Weather(choice(name.strip(), option, tuple(Weather))) for name in names.split(","))
 
 
 def driver_of(spec: str, device: str) -> Controller | Callable[[MappedSimulator], Policy]:

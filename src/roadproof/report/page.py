@@ -22,6 +22,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.report import charts
 from roadproof.report.asphalt import on_asphalt
 from roadproof.report.commands import commands_of
+from roadproof.report.driven import driven_candidates
 from roadproof.report.html import data_url, encoded, environment
 from roadproof.report.run import Judged, Run, read_run
 from roadproof.report.top_view import top_view
@@ -77,6 +78,7 @@ def render(run: Run) -> str:
             judged=_judged(run.judged),
             pattern=_pattern(run),
             attack=_attack(run),
+            driven=driven_candidates(run.selections),
             fidelity=_fidelity(run.judged),
             recorded=_recorded(run),
             calibration=_calibration(run),

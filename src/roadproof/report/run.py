@@ -3,6 +3,8 @@
 RUN/record/DRIVE/episode.npz   recorded drives
 RUN/recordings/                the same, calibrated (`roadproof.recordings`)
 RUN/attack/                    what the attack found (`roadproof.attacks`)
+RUN/selection/                 optional: its candidates, driven (`roadproof.evaluation`)
+RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.rounds`)
 RUN/evaluation/                what driving over it showed (`roadproof.evaluation`)
 RUN/pattern.json               optional: the pattern that was chosen in the end
 RUN/run.json                   optional: what the stages took (`roadproof.ledger`)
@@ -22,7 +24,7 @@ from roadproof.calibration.report import CalibrationReport, load_report
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.evaluation import Evaluation, Fidelity, Trial
+from roadproof.evaluation import Evaluation, Fidelity, Selection, Trial
 from roadproof.evaluation.result import load_paint
 from roadproof.ledger import StageCost, read_cost
 from roadproof.patterns import Pattern, load_pattern
@@ -71,6 +73,7 @@ class Run:
         recordings: the calibrated set.
         calibration: what the calibration says of itself.
         attack: the attack's result.
+        selections: candidates that were driven, of the search and of each round, in that order.
         judged: the evaluation.
         pattern: that was chosen in the end; the attack's own where the run says nothing else.
         cost: of each stage since the run began; empty where the run keeps no ledger.
@@ -82,6 +85,7 @@ class Run:
     recordings: RecordingSet | None
     calibration: CalibrationReport | None
     attack: AttackResult | None
+    selections: tuple[Selection, ...]
     judged: Judged | None
     pattern: Pattern | None
     cost: dict[str, StageCost]
@@ -104,6 +108,7 @@ def read_run(folder: Path) -> Run:
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
         calibration=load_report(report) if (report := folder / "calibration" / "report.json").exists() else None,
         attack=attack,
+        selections=_selections(folder),
         judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,
         pattern=chosen,
         cost=read_cost(folder),
@@ -114,6 +119,12 @@ def read_run(folder: Path) -> Run:
             f"{folder} has neither record, recordings, attack nor evaluation in it; nothing to report yet"
         )
     return run
+
+
+def _selections(folder: Path) -> tuple[Selection, ...]:
+    rounds = sorted(folder.glob("round-*/selection"), key=lambda place: int(place.parent.name.removeprefix("round-")))
+    places = (folder / "selection", *rounds)
+    return tuple(Selection.load(place) for place in places if (place / "selection.json").exists())
 
 
 def _commands(path: Path) -> tuple[str, ...]:
