@@ -52,6 +52,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 
 SCENARIOS = ("left-03", "right-05", "straight-04", "left-07", "right-02", "straight-09")
 METHODS = ("no paint", "random", "T=1", "T=3 published", "T=3 metres", "+ driven", "+ rounds", "+ weathers")
+OTHERS = ("T=1", "T=3 published", "+ weathers")
 FOUND_BY = ("record", "calibrate", "attack")
 SCHEDULE = replace(
     Schedule.in_heats(24),
@@ -71,6 +72,7 @@ class Cell:
         figures: K.
         rounds: of re-recording.
         noise_deg: of the published perturbation.
+        others: which of the methods are tried that search on recordings of their own.
         keep: the study's folder.
     """
 
@@ -80,6 +82,7 @@ class Cell:
     figures: int
     rounds: int
     noise_deg: tuple[int, int]
+    others: tuple[str, ...]
     keep: Path
 
     @property
@@ -181,6 +184,8 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
         ),
     }  # fmt: skip
     for method, budget in others.items():
+        if method not in cell.others:
+            continue
         name = method.strip("+ ").replace(" ", "-").replace("=", "")
         try:
             result = run(name, budget)
@@ -270,6 +275,7 @@ def main() -> None:
     parser.add_argument("--figures", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--noise-deg", type=int, nargs=2, default=(0, 10), help="of the published perturbation")
+    parser.add_argument("--others", nargs="*", choices=OTHERS, default=OTHERS, help="searches on their own recordings")
     parser.add_argument("--processes", type=int, default=1)
     arguments = parser.parse_args()
     cells = [
@@ -280,6 +286,7 @@ def main() -> None:
             figures=arguments.figures,
             rounds=arguments.rounds,
             noise_deg=(arguments.noise_deg[0], arguments.noise_deg[1]),
+            others=tuple(arguments.others),
             keep=arguments.keep,
         )
         for seed in arguments.seeds.split(",")
