@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import torch
+from PIL import Image
 
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
@@ -133,4 +134,6 @@ def write_made_up_study(folder, study, *, failing=(), seed=0):
         place = folder / "jobs" / job.key
         save_pattern(pattern, place / "pattern.json")
         np.savez(place / "paths.npz", **paths)
+        for shade, weather in enumerate(job.weathers, 1):
+            Image.new("RGB", (400, 300), (60 * shade,) * 3).save(place / f"view-{weather}.jpg")
     return write_table(study.jobs, folder)

@@ -39,6 +39,23 @@ def test_every_method_stays_in_the_cube_and_is_the_same_again(method, quick):
     assert not torch.equal(first.unit, search(method, calls=calls, seed=4).unit)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_points_of_another_search_come_first_and_are_gone_on_from(method, quick, tmp_path):
+    first = (TARGET + 0.02 * torch.arange(3).view(3, 1, 1)).expand(3, 1, 4)
+    file, options = tmp_path / "trials.safetensors", {"first": first, "seed": 3, "checkpoint": tmp_path / "t"}
+    whole = search(method, calls=12, **options)
+    assert torch.equal(whole.unit[:3], first.double())
+    assert torch.equal(whole.value[:3], bowl(first).double())
+    if method == "cma-es":
+        assert float(whole.unit[3:].sub(TARGET).abs().max()) < 0.2, "it looks near what was good"
+    # Cut off among the points given, and after them.
+    for calls in (2, 7, 12):
+        again = search(method, calls=calls, **options | {"checkpoint": file})
+    assert torch.equal(again.unit, whole.unit)
+    other = search(method, calls=3, **options | {"first": None})
+    assert not torch.equal(other.unit, first.double()), "a search that began with others is another search"
+
+
 @pytest.mark.parametrize(("method", "calls"), [("gp", 30), ("tpe", 120), ("cma-es", 120)])
 def test_what_learns_beats_what_draws(method, calls):
     learnt = np.median([float(search(method, calls=calls, seed=seed).value.max()) for seed in range(3)])

@@ -12,8 +12,11 @@ import time
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file
 
-from roadproof.attacks import Schedule, proposals
+from roadproof.attacks import AttackResult, Schedule, proposals
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme
@@ -81,14 +84,20 @@ def test_gradopt_finds_and_is_judged_in_every_condition(tmp_path):
     assert history["best"] == sorted(history["best"])
     assert history["driven"]["calls"] == [5]
     assert history["driven"]["best"] == [first["deviation_m"]]
-    check_files(result, figures=1)
+    check_files(result, figures=1, weathers=("clear-noon", "rainy-noon"))
 
 
-def check_files(result, figures):
+def check_files(result, figures, weathers=("clear-noon",)):
     stored = np.load(io.BytesIO(result.files["paths.npz"]))
     assert stored["clean_xy"].shape[1] == stored["painted_xy"].shape[1] == 2
     assert np.ptp(stored["clean_xy"], 0).max() > 20
-    assert set(result.files) == {"pattern.json", "pattern.png", "paths.npz", "history.json"}
+    views = {f"view-{weather}.jpg" for weather in weathers}
+    assert set(result.files) == {"pattern.json", "pattern.png", "paths.npz", "history.json"} | views
+    for name in views:
+        with Image.open(io.BytesIO(result.files[name])) as picture:
+            assert picture.size == (400, 300)
+            assert np.asarray(picture).std() > 10
+    assert len({result.files[name] for name in views}) == len(views), "every weather looks different"
     assert len(json.loads(result.files["pattern.json"])["figures"]) == figures
 
 
@@ -104,6 +113,26 @@ def test_the_published_baseline_is_driven_and_judged(tmp_path, monkeypatch):
     assert (history["kind"], history["measure"], history["calls"]) == ("closed loop", "steering", [2, 3, 4])
     assert history["best"] == sorted(history["best"])
     assert history["deviation_m"][-1] == row["deviation_m"] > 0
+    check_files(result, figures=1)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_town")
+def test_a_black_box_search_may_begin_with_what_gradients_found(tmp_path):
+    hybrid = dataclasses.replace(
+        GRADOPT, name="hybrid", search="random", start="gradopt", calls=2, objective="deviation"
+    )
+    result = run_job(job_of(hybrid), tmp_path)
+    (row,) = result.rows
+    # One drive recorded and two to calibrate; then a clean one and two over patterns.
+    assert row["search_calls"] == 6
+    history = json.loads(result.files["history.json"])
+    assert (history["kind"], history["calls"]) == ("closed loop", [5, 6])
+    assert history["seconds"][0] > 1, "what came before counts"
+    found = AttackResult.load(tmp_path / "start" / "attack")
+    trials = load_file(tmp_path / "trials.safetensors")["unit"]
+    first = space_of(job_of(hybrid)).pattern(trials[:1].float())
+    assert torch.allclose(first.boxes[0], found.pattern.boxes, atol=1e-3)
     check_files(result, figures=1)
 
 

@@ -68,6 +68,7 @@ def blackbox_search(
     random_calls: int = PUBLISHED_RANDOM,
     seed: int = 0,
     at_once: int = 1,
+    first: Float[Tensor, "f k n"] | None = None,
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], object] = lambda _calls, _best: None,
 ) -> Trials:
@@ -81,6 +82,7 @@ def blackbox_search(
         random_calls: "published-bo" only: how many of them are random, before the model guides.
         seed: of everything random.
         at_once: how many points are proposed before their values are asked for, for simulators side by side.
+        first: points to begin with, as those of another search; the method goes on from what they are worth.
         checkpoint: a file that keeps the trials after every call of the objective; a search that finds its own goes on.
         on_step: told how many points have been tried, and the best value.
 
@@ -94,15 +96,19 @@ def blackbox_search(
         raise RoadproofError(
             f"at_once is {at_once}, but published-bo proposes one point at a time; run several scenarios side by side"
         )
-    propose = _proposer(method, space, random_calls, seed)
-    identity = repr((space, method, random_calls, seed, at_once))
+    propose = _proposer(method, space, random_calls, seed, 0 if first is None else len(first))
+    identity = repr((space, method, random_calls, seed, at_once, None if first is None else first.tolist()))
     trials = _resumed(checkpoint, space, identity)
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
     while len(trials) < calls:
         flat, value = trials.unit.flatten(1).numpy(), trials.value.numpy()
-        proposed = propose(flat, value, min(at_once, calls - len(trials)))
-        unit = torch.as_tensor(proposed).view(-1, space.figures, len(space.names))
+        wanted = min(at_once, calls - len(trials))
+        if first is not None and len(trials) < len(first):
+            unit = first[len(trials) : len(trials) + wanted].double()
+        else:
+            proposed = propose(flat, value, wanted)
+            unit = torch.as_tensor(proposed).view(-1, space.figures, len(space.names))
         found = objective(unit.float()).double().cpu()
         if not bool(found.isfinite().all()):
             raise RoadproofError(f"the objective is NaN or infinite at call {len(trials) + 1}; check the controller")
@@ -117,7 +123,7 @@ def blackbox_search(
     return trials
 
 
-def _proposer(method: Method, space: SearchSpace, random_calls: int, seed: int) -> proposals.Propose:
+def _proposer(method: Method, space: SearchSpace, random_calls: int, seed: int, given: int) -> proposals.Propose:
     dimensions = space.figures * len(space.names)
     match method:
         case "random":
@@ -127,7 +133,7 @@ def _proposer(method: Method, space: SearchSpace, random_calls: int, seed: int) 
         case "gp" | "tpe":
             return proposals.optuna(method, dimensions, seed)
         case "cma-es":
-            return proposals.cma_es(dimensions, seed)
+            return proposals.cma_es(dimensions, seed, given)
 
 
 def _resumed(checkpoint: Path | None, space: SearchSpace, identity: str) -> Trials:

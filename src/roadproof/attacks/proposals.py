@@ -27,6 +27,7 @@ PUBLISHED_ACQUISITION: dict[str, Any] = {"n_random": 100_000, "n_smart": 250}
 
 _COLOUR_RANGE = 250.0
 _CMA_SIGMA = 1 / 6
+_CMA_SIGMA_NEAR = 1 / 30
 
 
 def random(space: SearchSpace, seed: int) -> Propose:
@@ -130,8 +131,15 @@ def optuna(sampler: Literal["gp", "tpe"], dimensions: int, seed: int) -> Propose
     return propose
 
 
-def cma_es(dimensions: int, seed: int) -> Propose:
-    """Covariance matrix adaptation, begun at the centre of the cube with a sixth of its side."""
+def cma_es(dimensions: int, seed: int, given: int = 0) -> Propose:
+    """Covariance matrix adaptation, begun at the centre of the cube with a sixth of its side.
+
+    Args:
+        dimensions: of the cube.
+        seed: of what it draws.
+        given: how many of the trials come first and are another search's; it then begins at the best of them with a
+            thirtieth of the side.
+    """
     try:
         from cmaes import CMA
     except ImportError as error:
@@ -141,7 +149,10 @@ def cma_es(dimensions: int, seed: int) -> Propose:
         tried: Float[np.ndarray, "t d"], value: Float[np.ndarray, " t"], count: int
     ) -> Float[np.ndarray, "b d"]:
         bounds = np.tile([0.0, 1.0], (dimensions, 1))
-        search: Any = CMA(mean=np.full(dimensions, 0.5), sigma=_CMA_SIGMA, bounds=bounds, seed=seed)
+        middle = tried[value[:given].argmax()] if given else np.full(dimensions, 0.5)
+        sigma = _CMA_SIGMA_NEAR if given else _CMA_SIGMA
+        tried, value = tried[given:], value[given:]
+        search: Any = CMA(mean=middle, sigma=sigma, bounds=bounds, seed=seed)
         size = search.population_size
         # Its state follows from its seed and the trials: all generations are gone through again, in milliseconds.
         for first in range(0, len(tried) - size + 1, size):

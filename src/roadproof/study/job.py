@@ -15,8 +15,8 @@ A row is one drive over the pattern against the same drive without it. Its colum
     clean_leaderboard             the same without
     first_event_s       s         when something first went wrong with paint; none where nothing did
     ending                        why the painted drive ended
-    search_calls        drives    of the simulator before the evaluation: recording, calibration and selection, or one
-                                  for each pattern tried and a clean one
+    search_calls        drives    of the simulator before the evaluation: recording, calibration and selection; in a
+                                  black-box search one for each pattern tried and a clean one, and what its start took
     search_seconds      s         that finding the pattern took
     evaluation_calls    drives    of the evaluation, clean ones included
     seconds             s         of the whole job; of an evaluation that was interrupted, only of what was left
@@ -26,6 +26,7 @@ All numbers of a row but the costs are of driving. Files beside the rows:
     pattern.json, .png  what was painted
     paths.npz           clean_xy and painted_xy, metres in the world: both drives alone in the first weather
     history.json        how the search went, see `history`
+    view-WEATHER.jpg    what the car's camera sees of the pattern, from one place before it, see `study.views`
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
+import torch
 
 from roadproof.attacks import Schedule
 from roadproof.attacks.blackbox import Method as BlackBox
@@ -49,6 +51,7 @@ from roadproof.drives import Scheme
 from roadproof.evaluation import DrivenObjective, Evaluation, evaluate
 from roadproof.evaluation.objective import Measure
 from roadproof.evaluation.result import Trial, episodes, path_of
+from roadproof.evaluation.selection import first_of_each_group
 from roadproof.loop import Budget, stress_test
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.search_space import SearchSpace
@@ -56,6 +59,7 @@ from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.plan import BLACK, Job, MethodPlan
 from roadproof.study.rows import JobResult, Row, job_columns
+from roadproof.study.views import views
 
 SWERVES_M = (1.5, 0.8, 1.2)
 """How far the first, second and third pair of perturbed drives are pushed aside."""
@@ -117,6 +121,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         search = _by_gradient if job.method.search == "gradopt" else _by_black_box
         found = search(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
+        (clean,) = episodes(scratch / "evaluation", [parts[0].shown().clean])
+        seen = views(world, job.scenario, found.pattern, clean, job.weathers)
     costs = {
         "search_calls": found.calls,
         "search_seconds": found.seconds,
@@ -131,7 +137,7 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     save_pattern(found.pattern, scratch / "pattern.json")
     files = {name: (scratch / name).read_bytes() for name in ("pattern.json", "pattern.png")}
     files |= {"paths.npz": _paths(parts[0], scratch / "evaluation"), "history.json": _json(found.history)}
-    return JobResult(tuple(rows), files)
+    return JobResult(tuple(rows), files | seen)
 
 
 def measured(trial: Trial) -> Row:
@@ -238,6 +244,8 @@ def _by_gradient(job: Job, world: Simulator, controller: Controller, folder: Pat
 
 def _by_black_box(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
     space = space_of(job)
+    start = _started(job, world, controller, folder / "start") if job.method.start else None
+    calls_before, seconds_before = (start.calls, start.seconds) if start else (0, 0.0)
     objective = DrivenObjective(
         world,
         controller,
@@ -255,24 +263,55 @@ def _by_black_box(job: Job, world: Simulator, controller: Controller, folder: Pa
         calls=job.method.calls,
         random_calls=job.method.random_calls,
         seed=job.seed,
+        first=torch.stack([space.point(pattern) for pattern in start.patterns]) if start else None,
         checkpoint=folder / "trials.safetensors",
     )
     patterns = space.pattern(trials.unit.float())
     best = [int(trials.value[: count + 1].argmax()) for count in range(len(trials))]
-    seconds = cast("list[float]", trials.seconds.tolist())
+    seconds = cast("list[float]", (seconds_before + trials.seconds).tolist())
     return _Answer(
         patterns[trials.best],
-        1 + len(trials),
+        calls_before + 1 + len(trials),
         seconds[-1],
         0.0,
         history(
             "closed loop",
-            range(2, len(trials) + 2),
+            [calls_before + 2 + count for count in range(len(trials))],
             seconds,
             cast("list[float]", trials.best_so_far.tolist()),
             measure=job.method.objective,
             deviation_m=[objective.effect(patterns[index]).deviation for index in best],
         ),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """What a black-box search begins with, and what finding it took."""
+
+    patterns: tuple[Pattern, ...]
+    calls: int
+    seconds: float
+
+
+def _started(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Start:
+    """Record, calibrate and search; the candidates are for the black box to drive."""
+    found = stress_test(
+        world,
+        controller,
+        job.scenario,
+        folder,
+        budget=replace(budget_of(job.method, job.weathers[0]), select=0),
+        space=space_of(job),
+        seed=job.seed,
+        controller_name=job.controller,
+    )
+    chosen = first_of_each_group(found.attack.candidates, job.method.select)
+    costs = [cost for stage, cost in found.cost.items() if stage != "evaluate"]
+    return _Start(
+        tuple(candidate.pattern for _, candidate in chosen),
+        sum(cost.simulator_calls for cost in costs),
+        sum(cost.seconds for cost in costs),
     )
 
 

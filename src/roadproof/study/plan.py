@@ -33,6 +33,8 @@ search = "published-bo"
 calls = 1000                              # black box: how many patterns are tried, each in a whole drive
 random_calls = 400
 objective = "steering"                    # as published, or "deviation": what is reported
+start = "gradopt"                         # left out as published: the patterns that are tried first are GradOpt's, with
+                                          # the settings above; `select` of them
 """
 
 from __future__ import annotations
@@ -81,6 +83,7 @@ class MethodPlan:
         calibration: gradopt: how recorded drives are calibrated, a `calibration.Method`.
         frames: gradopt: kept of every recorded drive, at most.
         objective: black box: what a drive is judged by, an `evaluation.objective.Measure`.
+        start: black box: "gradopt" tries `select` patterns first that a gradopt search of these settings found.
     """
 
     name: str
@@ -96,6 +99,7 @@ class MethodPlan:
     calibration: str = "two-paint"
     frames: int = 24
     objective: str = "steering"
+    start: str = ""
 
     def __post_init__(self) -> None:
         # Late, since torch comes with it; a process that only passes plans on is spared.
@@ -109,9 +113,12 @@ class MethodPlan:
         _one_of(self.schedule, "schedule", SCHEDULES)
         _one_of(self.calibration, "calibration", CALIBRATIONS)
         _one_of(self.objective, "objective", MEASURES)
+        _one_of(self.start, "start", ("", "gradopt"))
         for name in ("restarts", "iterations", "calls", "random_calls", "frames"):
             _at_least(getattr(self, name), name, 1)
         _at_least(self.select, "select", 0)
+        if self.start and (self.search == "gradopt" or not self.select):
+            raise StudyError(f"start is {self.start!r}, expected it with a black-box search and select of 1 or more")
         if self.trajectories not in COUNTS:
             raise StudyError(f"trajectories is {self.trajectories}, expected {', '.join(map(str, COUNTS))}")
 

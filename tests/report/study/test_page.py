@@ -39,7 +39,8 @@ def test_every_file_is_there(finished):
         path.relative_to(folder / "tables").as_posix() for path in (folder / "tables").rglob("*") if path.is_file()
     }
     assert {"tables.html", "tables.md", "overall-bo.tex", "missing.tex"} <= names
-    assert {f"figures/{name}.png" for name in ("by-figures", "progress", "trajectories", "patterns")} <= names
+    drawn = ("by-figures", "progress", "trajectories", "patterns", "weathers")
+    assert {f"figures/{name}.png" for name in drawn} <= names
     for name in names:
         if name.endswith(".png"):
             with Image.open(folder / "tables" / name) as drawn:
@@ -52,7 +53,7 @@ def test_the_page_escapes_and_needs_nothing_else(finished):
     assert "&lt;b&gt;_all_ 100% $x" in page
     assert not re.search(r"<script|src=\"(?!data:)|https?://(?!www\.w3\.org)", page)
     assert page.count("<table") == page.count("</table>") > 8
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
 
 
 def test_what_failed_is_in_every_kind_of_file(finished):
@@ -67,6 +68,24 @@ def test_the_same_rows_give_the_same_tables(finished, tmp_path):
     again = write_study(records, folder, tmp_path)
     assert (tmp_path / "tables.md").read_text() == (page.parent / "tables.md").read_text()
     assert again.read_text() == page.read_text()
+
+
+def test_a_weather_never_names_a_file_elsewhere(finished):
+    folder, records, _ = finished
+    job = next(each for each in read_found(folder, records).values() if each.view("clear-noon") is not None)
+    assert (job.view("rainy-noon"), job.view("hard-rain-noon")) == (pytest.approx(180, abs=3), None)
+    other = next(each for each in job.folder.parent.iterdir() if each != job.folder)
+    (job.folder / "view-").mkdir()
+    assert job.view(f"/../../{other.name}/view-clear-noon") is None
+
+
+def test_a_damaged_view_is_named(finished, tmp_path):
+    folder, records, _ = finished
+    shutil.copytree(folder / "jobs", tmp_path / "jobs")
+    job = next(each for each in read_found(tmp_path, records).values() if each.view("clear-noon") is not None)
+    (job.folder / "view-clear-noon.jpg").write_bytes(b"no picture")
+    with pytest.raises(StudyError, match=r"view-clear-noon\.jpg is damaged"):
+        job.view("clear-noon")
 
 
 def test_a_folder_of_an_older_plan_is_not_taken(finished, tmp_path):

@@ -1,10 +1,11 @@
 """What the jobs of a study left in its folder besides rows: patterns, paths, the course of each search.
 
-DIR/jobs/KEY/job.json       what was to be done
-DIR/jobs/KEY/rows.json      what came of it
-DIR/jobs/KEY/pattern.json   the pattern
-DIR/jobs/KEY/paths.npz      clean_xy, painted_xy in metres, alone in the first weather
-DIR/jobs/KEY/history.json   how the search went, against simulator calls and seconds
+DIR/jobs/KEY/job.json           what was to be done
+DIR/jobs/KEY/rows.json          what came of it
+DIR/jobs/KEY/pattern.json       the pattern
+DIR/jobs/KEY/view-WEATHER.jpg   what the car's camera sees of it
+DIR/jobs/KEY/paths.npz          clean_xy, painted_xy in metres, alone in the first weather
+DIR/jobs/KEY/history.json       how the search went, against simulator calls and seconds
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from PIL import Image
 
 from roadproof.errors import StudyError
 from roadproof.files import read_json
@@ -96,6 +98,21 @@ class Found:
             if each.ndim != 2 or each.shape[1] != 2 or not len(each) or not np.isfinite(each).all():
                 raise StudyError(f"{path} holds {each.shape}, expected finite x, y; remove its folder and run again")
         return clean, painted
+
+    def view(self, weather: str) -> UInt8[np.ndarray, "h w 3"] | None:
+        """What the car's camera sees of the pattern in a weather; None where the job kept no picture of it.
+
+        Raises:
+            StudyError: the file is damaged.
+        """
+        path = self.folder / f"view-{weather}.jpg"
+        if path.parent != self.folder or not path.exists():
+            return None
+        try:
+            with Image.open(path) as picture:
+                return np.asarray(picture.convert("RGB"))
+        except OSError as error:
+            raise StudyError(f"{path} is damaged ({error}); remove its folder and run the study again") from None
 
     def history(self) -> History | None:
         """The driven course of the search; None where the job kept none.

@@ -19,7 +19,7 @@ from roadproof.report.study.blocks import DEVIATION, PENALTY
 from roadproof.report.study.charts import Picture, by_figures, progress
 from roadproof.report.study.folder import Found, read_found
 from roadproof.report.study.layouts import paper_tables
-from roadproof.report.study.pictures import gallery, trajectories
+from roadproof.report.study.pictures import gallery, in_weathers, trajectories
 from roadproof.report.study.results import BLACK, Method, Record, Results, results_of, words
 from roadproof.report.study.table import Table, in_latex, in_markdown, markdown_text
 from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
@@ -47,7 +47,7 @@ def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Se
     results = results_of(rows, methods.values())
     drawn = (by_figures(results), progress(results, tuple(found.values())), trajectories(results, found))
     matrices = [transfer_of(transfer, metric) for metric in (DEVIATION, PENALTY)] if transfer else []
-    shown = (*drawn, gallery(results, found), *map(transfer_map, matrices))
+    shown = (*drawn, gallery(results, found), in_weathers(results, found), *map(transfer_map, matrices))
     pictures = [picture for picture in shown if picture is not None]
     for picture in pictures:
         save(picture.figure, out / "figures" / f"{picture.name}.png")

@@ -1,4 +1,4 @@
-"""Pictures of what a study found: paths past the canvas, and the patterns, for some of its scenarios."""
+"""Pictures of what a study found, for some of its scenarios: paths past the canvas, the patterns, what the car sees."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from roadproof.report.asphalt import on_asphalt
 from roadproof.report.study.blocks import compared, reference
 from roadproof.report.study.charts import INK, MUTED, Picture, legend, plain, style
 from roadproof.report.study.folder import Found
-from roadproof.report.study.results import JobId, Results
+from roadproof.report.study.results import JobId, Results, words
 from roadproof.report.top_view import Ground, around_canvas, draw_road
 from roadproof.scenarios import KINDS
 from roadproof.simulators.town.maps import load_map
@@ -25,6 +25,7 @@ from roadproof.simulators.town.roadmap import RoadMap
 
 PANELS = 6
 ROWS, COLUMNS = 8, 12
+VIEWS = 4
 BEFORE_M, AFTER_M, BESIDE_M = 12.0, 26.0, 10.5
 GROUND = Ground(sidewalk="#d8d4c9", asphalt="#b9bcc0", marking="#f6f4ee")
 GRASS = "#e4e9d9"
@@ -117,7 +118,7 @@ def gallery(results: Results, found: Mapping[JobId, Found]) -> Picture | None:
                 continue
             size = (job.canvas.width_m, job.canvas.length_m)
             axes.imshow(np.asarray(on_asphalt(raster(pattern, PICTURE_PX), PICTURE_PX, size)))
-            reached = _deviation(results, job.job)
+            reached = _deviation(results, job.job, results.home)
             axes.set_xlabel("not driven" if reached is None else f"{reached:.2f} m", fontsize=9, color=INK, labelpad=2)
             drawn += 1
     if not drawn:
@@ -126,6 +127,39 @@ def gallery(results: Results, found: Mapping[JobId, Found]) -> Picture | None:
         "patterns",
         f"The patterns found, as they lie on the road, seed {seed}; the far edge is above. Under each the deviation it "
         "caused, driven alone in the weather in which it was found.",
+        figure,
+    )
+
+
+def in_weathers(results: Results, found: Mapping[JobId, Found]) -> Picture | None:
+    """What the car's camera sees of the reference method's patterns, a row a scenario and a column each weather."""
+    figures, seed, method = results.figures[-1], results.seeds[0], reference(results.methods).name
+    jobs = [job for name in examples(results, VIEWS) if (job := found.get(JobId(name, figures, method, seed)))]
+    seen = {job.job: {weather: job.view(weather) for weather in results.weathers} for job in jobs}
+    shown = [job for job, views in seen.items() if any(view is not None for view in views.values())]
+    if not shown:
+        return None
+    size = (2.6 * len(results.weathers) + 0.4, 2.25 * len(shown) + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
+    grid: Any = figure.subplots(len(shown), len(results.weathers), squeeze=False)
+    for row, job in enumerate(shown):
+        for column, weather in enumerate(results.weathers):
+            axes: Axes = grid[row, column]
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+            if row == 0:
+                axes.set_title(plain(words(weather)), fontsize=10, color=INK)
+            if column == 0:
+                axes.set_ylabel(plain(job.scenario), fontsize=9.5, color=INK)
+            view = seen[job][weather]
+            if view is not None:
+                axes.imshow(view)
+            reached = _deviation(results, job, weather)
+            axes.set_xlabel("not driven" if reached is None else f"{reached:.2f} m", fontsize=9, color=INK, labelpad=2)
+    return Picture(
+        "weathers",
+        f"What the car’s camera sees of {method}’s patterns, K = {figures}, seed {seed}, a few metres before them. "
+        "Under each the deviation in that weather, driven alone.",
         figure,
     )
 
@@ -172,7 +206,7 @@ def _road(map_name: str) -> RoadMap | None:
         return None
 
 
-def _deviation(results: Results, job: JobId) -> float | None:
+def _deviation(results: Results, job: JobId, weather: str) -> float | None:
     alone = not results.has(traffic=False)
-    values = results.values("deviation_m", job.method, job.figures, weather=results.home, traffic=alone)
+    values = results.values("deviation_m", job.method, job.figures, weather=weather, traffic=alone)
     return values.get((job.scenario, str(job.seed)))
