@@ -127,8 +127,8 @@ def imitate(
         plan: how.
         checkpoint: file to go on from where it is there, and to keep up to date; None keeps none.
         device: "cpu" or "cuda".
-        every: steps between two reports, and ten times that between two checkpoints.
-        on_progress: told of them.
+        every: steps between two reports, and between two checkpoints.
+        on_progress: told of the reports.
 
     Returns:
         The average of the weights, in eval mode.
@@ -170,7 +170,7 @@ def imitate(
                 mean = sums / counted
                 on_progress(Progress(step + 1, plan.steps, float(mean[0]), float(mean[1])))
             sums, counted = torch.zeros(2), 0
-        if checkpoint is not None and ((step + 1) % (10 * every) == 0 or step + 1 == plan.steps):
+        if checkpoint is not None and ((step + 1) % every == 0 or step + 1 == plan.steps):
             _keep(checkpoint, plan, step + 1, network, average, optimiser)
     return average
 
