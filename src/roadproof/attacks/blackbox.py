@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 import torch
 from jaxtyping import Float
@@ -96,8 +96,9 @@ def blackbox_search(
         raise RoadproofError(
             f"at_once is {at_once}, but published-bo proposes one point at a time; run several scenarios side by side"
         )
-    propose = _proposer(method, space, random_calls, seed, 0 if first is None else len(first))
-    identity = repr((space, method, random_calls, seed, at_once, None if first is None else first.tolist()))
+    given = None if first is None else cast("list[Any]", first.tolist())
+    propose = _proposer(method, space, random_calls, seed, len(given or ()))
+    identity = repr((space, method, random_calls, seed, at_once, given))
     trials = _resumed(checkpoint, space, identity)
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
