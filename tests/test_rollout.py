@@ -144,6 +144,8 @@ def test_full_pictures_are_shown_where_they_are_asked_for(town):
     very_short = dataclasses.replace(LEFT, time_limit_s=0.1)
     rollout(town, expert, very_short, full_pictures=True, on_step=lambda seen, _: shown.append(seen.picture.shape))
     assert shown == [(600, 800, 3)] * 3
+    rollout(town, expert, very_short, full_pictures=frozenset({1}), on_step=lambda seen, _: shown.append(seen.picture))
+    assert [picture is not None for picture in shown[3:]] == [False, True, False]
 
 
 def test_what_a_driver_gets_wrong_is_named(town):

@@ -26,7 +26,7 @@ from roadproof.errors import ControllerError, EpisodeError, SimulatorError
 from roadproof.files import write_atomically
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import PaintKind, PatternImage, Simulator
+from roadproof.simulators.protocol import PaintKind, PatternImage, Pictures, Simulator
 
 FORMAT = "roadproof-episode"
 FORMAT_VERSION = 1
@@ -189,7 +189,7 @@ def rollout(
     cars: int = 0,
     pedestrians: int = 0,
     seed: int = 0,
-    full_pictures: bool = False,
+    full_pictures: Pictures = False,
     on_step: OnStep | None = None,
     until: Callable[[Observation], bool] | None = None,
 ) -> Episode:
@@ -204,7 +204,7 @@ def rollout(
         cars: others on the road.
         pedestrians: people about.
         seed: of cars and people.
-        full_pictures: also show the full camera picture to driver and `on_step`.
+        full_pictures: which observations show the full camera picture to driver and `on_step`.
         on_step: told of each step; the simulator still is where the observation was made.
         until: stops the drive at the first observation it says yes to.
 

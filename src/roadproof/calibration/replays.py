@@ -120,7 +120,7 @@ class Replays:
             settings.scenario,
             weather=settings.weather,
             pattern=paint,
-            full_pictures=full_pictures,
+            full_pictures=frozenset(wanted) if full_pictures else False,
             on_step=keep,
             until=lambda _: step > last,
         )

@@ -30,6 +30,9 @@ class PaintKind(StrEnum):
     """Put into the pictures of the car's camera."""
 
 
+Pictures: TypeAlias = bool | frozenset[int]
+"""Which observations of a drive have the full camera picture: all, none, or those after so many steps."""
+
 PaintChoice: TypeAlias = Literal["inject", "native", "auto"]
 """What can be asked of a CARLA server; "auto" is the second if it works there, else the first."""
 
@@ -77,7 +80,7 @@ class Simulator(Protocol):
         cars: int = 0,
         pedestrians: int = 0,
         seed: int = 0,
-        full_pictures: bool = False,
+        full_pictures: Pictures = False,
     ) -> Observation:
         """Begin a drive: nothing of the one before is left.
 
@@ -88,7 +91,8 @@ class Simulator(Protocol):
             cars: other cars on the road.
             pedestrians: people about.
             seed: of the other cars and the people.
-            full_pictures: also give the full camera picture with every observation.
+            full_pictures: which observations have the full camera picture too; where steps are given, others may have
+                it as well.
 
         Raises:
             SimulatorError: it is not open, or an argument does not fit.

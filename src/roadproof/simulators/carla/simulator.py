@@ -33,7 +33,7 @@ from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import carla_weather
-from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage
+from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage, Pictures
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.judge import Judge
 from roadproof.simulators.town.maps import scenario_route
@@ -61,7 +61,7 @@ class _Drive:
     cameras: dict[str, Camera]
     collisions: Collisions
     pattern: PatternImage | None
-    full_pictures: bool
+    full_pictures: Pictures
     state: VehicleState
     image_from_canvas: Homography = field(default_factory=lambda: np.eye(3))
     images: dict[str, carla.Image] = field(default_factory=dict[str, carla.Image])
@@ -264,7 +264,7 @@ class CarlaSimulator:
         cars: int = 0,
         pedestrians: int = 0,
         seed: int = 0,
-        full_pictures: bool = False,
+        full_pictures: Pictures = False,
     ) -> Observation:
         """Begin a drive; see `roadproof.simulators.protocol.Simulator.reset`.
 
