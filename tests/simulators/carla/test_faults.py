@@ -50,10 +50,10 @@ def straight_on(_):
     return lambda seen: Control(-0.5 * seen.state.yaw_rad, throttle=0.5)
 
 
-def recorded(world, folder, on_drive=lambda _: None):
+def recorded(world, folder, controller=straight_on, on_drive=lambda _: None):
     return record(
         world,
-        straight_on,
+        controller,
         STREET,
         trajectories=Trajectories(count=3, perturbation=Swerve((0.5,))),
         window=Window(frames=3, least_px=5),
@@ -66,18 +66,23 @@ def recorded(world, folder, on_drive=lambda _: None):
 def test_a_server_killed_in_mid_episode_keeps_the_recordings_so_far_and_the_rest_is_recorded_later(street, tmp_path):
     threads = threading.active_count()
     with serving("--map", street) as (process, port):
-        doomed = threading.Timer(0.5, process.kill)
-        begin = []
+        done, killed = [], []
 
-        def kill_soon(done):
-            if done == 1:
-                begin.append(time.monotonic())
-                doomed.start()
+        def until_killed(scenario):
+            steer = straight_on(scenario)
+
+            def act(seen):
+                if 1 in done and not killed:
+                    killed.append(time.monotonic())
+                    process.kill()
+                return steer(seen)
+
+            return act
 
         with pytest.raises(SimulatorError, match=r"did not answer|sent no picture"), small(port) as world:
-            recorded(world, tmp_path, kill_soon)
+            recorded(world, tmp_path, until_killed, done.append)
         # The call that found nobody, and the farewells.
-        assert time.monotonic() - begin[0] < 5 * PATIENCE_S
+        assert time.monotonic() - killed[0] < 5 * PATIENCE_S
     (kept,) = tmp_path.rglob("episode.npz")
     before = kept.stat().st_mtime_ns
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
