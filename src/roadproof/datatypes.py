@@ -130,3 +130,8 @@ class Observation:
     events: tuple[Event, ...] = ()
     done: bool = False
     picture: UInt8[np.ndarray, "hc wc 3"] | None = None
+
+    @property
+    def shown(self) -> UInt8[np.ndarray, "hs ws 3"]:
+        """The most there is to see: the full camera picture, or the frame where there is none."""
+        return self.frame if self.picture is None else self.picture

@@ -124,6 +124,10 @@ class Episode:
         """How many observations there are."""
         return self.time_s.size
 
+    def state(self, step: int) -> VehicleState:
+        """Where the car was at an observation, and how fast."""
+        return VehicleState(*(float(getattr(self, name)[step]) for name in VehicleState.__slots__))
+
     def save(self, path: Path) -> None:
         """Write the episode to one file, all or nothing.
 

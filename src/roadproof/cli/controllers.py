@@ -30,4 +30,5 @@ def controllers(
     say = Console(highlight=False, markup=False).print
     say(f"{card.name}: {card.summary}")
     for title in ("network", "data", "training", "can", "cannot"):
-        say(f"\n{title.capitalize()}\n{getattr(card, title)}")
+        # The card's own line ends would meet those of a narrow terminal.
+        say(f"\n{title.capitalize()}\n{' '.join(getattr(card, title).split())}")

@@ -71,19 +71,20 @@ def demo(
                 on_progress=show,
             )
         _film(world, who, result, out)
-    given = ["--scenario", scenario, "--controller", controller, "--budget", budget, "--rounds", str(rounds)]
-    given += [
-        "--attack-weathers",
-        attack_weathers,
-        "--figures",
-        str(figures),
-        "--seed",
-        str(seed),
-        "--simulator",
-        simulator,
-    ]
-    given += ["--scenarios", str(scenarios)] if scenarios else []
-    command = shlex.join(["roadproof", "demo", *given, "--out", str(out)])
+    given = {
+        "scenario": scenario,
+        "controller": controller,
+        "budget": budget,
+        "rounds": rounds,
+        "attack-weathers": attack_weathers,
+        "figures": figures,
+        "seed": seed,
+        "simulator": simulator,
+        **({"scenarios": scenarios} if scenarios else {}),
+        "out": out,
+    }
+    words = [word for option, value in given.items() for word in (f"--{option}", str(value))]
+    command = shlex.join(["roadproof", "demo", *words])
     write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))
     _report(result, out)
 

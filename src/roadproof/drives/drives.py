@@ -66,9 +66,7 @@ class Drive:
     @property
     def states(self) -> tuple[VehicleState, ...]:
         """Where the car was at each kept frame."""
-        names = VehicleState.__slots__
-        rows = np.stack([getattr(self.episode, name)[self.frame_number] for name in names], 1)
-        return tuple(VehicleState(*map(float, row)) for row in rows)
+        return tuple(self.episode.state(step) for step in self.frame_number.tolist())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

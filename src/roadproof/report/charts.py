@@ -22,6 +22,7 @@ from roadproof.evaluation.fidelity import Fidelity
 from roadproof.evaluation.result import path_of
 from roadproof.geometry import CanvasPlacement
 from roadproof.metrics import HORIZON_M, lateral_m
+from roadproof.report.words import in_words
 from roadproof.rollout import Episode
 
 VARIABLES = {
@@ -126,7 +127,7 @@ def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacem
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     for k, (name, clean, painted) in enumerate(drives):
         beside = -lateral_m(path_of(clean), path_of(painted))
-        label, colour = name.replace("-", " "), SERIES[k % len(SERIES)]
+        label, colour = in_words(name), SERIES[k % len(SERIES)]
         where = metres_past(painted, canvas)
         axes.plot(where, beside, color=colour, linestyle=_STYLES[k % 4], linewidth=1.8, label=label)
     axes.set_xlim(-HORIZON_M - 2, None)
@@ -152,7 +153,7 @@ def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str]) -> Chart:
 
 def told(events: Sequence[Event]) -> list[tuple[str, str, str]]:
     """Events as time, kind and detail in words."""
-    return [(f"{event.time_s:.1f} s", str(event.kind).replace("-", " "), event.detail) for event in events]
+    return [(f"{event.time_s:.1f} s", in_words(event.kind), event.detail) for event in events]
 
 
 def _axes(x: str, y: str) -> tuple[Figure, Axes]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from roadproof.evaluation import Selection
+from roadproof.report.words import in_words
 
 
 def driven_candidates(selections: Sequence[Selection]) -> dict[str, Any] | None:
@@ -18,7 +19,7 @@ def driven_candidates(selections: Sequence[Selection]) -> dict[str, Any] | None:
         return None
     best = max(selections, key=lambda each: each.deviation_m)
     return {
-        "weather": selections[0].driven[0].trial.weather.replace("-", " "),
+        "weather": in_words(selections[0].driven[0].trial.weather),
         "rounds": len(selections) > 1,
         "rows": [
             {

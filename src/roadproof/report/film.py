@@ -18,6 +18,7 @@ from roadproof.datatypes import Control, Observation
 from roadproof.evaluation.result import Evaluation, episodes, path_of
 from roadproof.files import write_atomically
 from roadproof.metrics import lateral_m, passage
+from roadproof.report.words import in_words
 from roadproof.rollout import Episode, replay, rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -115,7 +116,7 @@ def _pictures(simulator: Simulator, scenario: Scenario, episode: Episode, paint:
     kept: list[bytes] = []
 
     def keep(seen: Observation, _: Control | None) -> None:
-        picture = Image.fromarray(seen.frame if seen.picture is None else seen.picture)
+        picture = Image.fromarray(seen.shown)
         file = io.BytesIO()
         picture.resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
         kept.append(file.getvalue())
@@ -184,7 +185,7 @@ class _Pages:
     def _tell(self, pen: ImageDraw.ImageDraw, episode: Episode, now_s: float, right: int) -> None:
         """What has just happened; or, for a while, that the drive is over."""
         fresh = [event for event in episode.events if 0 <= now_s - event.time_s < EVENT_SHOWN_S]
-        words = str(fresh[-1].kind).replace("-", " ") if fresh else ""
+        words = in_words(fresh[-1].kind) if fresh else ""
         if now_s >= episode.time_s[-1]:
             words = words or str(episode.ending)
         pen.text((right, 14), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")

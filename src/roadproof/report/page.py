@@ -27,7 +27,7 @@ from roadproof.report.html import data_url, encoded, environment
 from roadproof.report.run import Judged, Run, read_run
 from roadproof.report.top_view import top_view
 from roadproof.report.verdict import verdict
-from roadproof.report.words import MISSING, mean_in_words
+from roadproof.report.words import MISSING, in_words, mean_in_words
 from roadproof.simulators.protocol import PaintKind
 
 FORMAT = "roadproof-report"
@@ -134,7 +134,7 @@ def _key_figures(run: Run) -> list[Fields]:
         {
             "value": f"{abs(furthest.lateral_m):.2f} m",
             "label": "furthest from the clean path",
-            "note": f"to the {'left' if furthest.lateral_m > 0 else 'right'}, {_words(furthest.weather)}",
+            "note": f"to the {'left' if furthest.lateral_m > 0 else 'right'}, {in_words(furthest.weather)}",
         },
         {
             "value": f"{np.mean([t.deviation_m for t in alone]):.2f} m",
@@ -162,7 +162,7 @@ def _judged(judged: Judged | None) -> Fields | None:
     strip = judged.strip
     return {
         "controller": evaluation.controller,
-        "weather": _words(shown.weather),
+        "weather": in_words(shown.weather),
         "traffic": f"{evaluation.cars} cars and {evaluation.pedestrians} people",
         "film": data_url("video/mp4", judged.film),
         "poster": data_url("image/jpeg", judged.poster),
@@ -186,7 +186,7 @@ def _judged(judged: Judged | None) -> Fields | None:
         "rows": [
             {
                 "pattern": row.pattern,
-                "weather": "all weathers" if row.weather is None else _words(row.weather),
+                "weather": "all weathers" if row.weather is None else in_words(row.weather),
                 "all": row.weather is None,
                 "traffic": "in traffic" if row.traffic else "alone",
                 "count": row.points.count,
@@ -376,10 +376,6 @@ def _costs(run: Run) -> list[Fields]:
 
 def _aside(left_m: float) -> str:
     return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "on its path"
-
-
-def _words(weather: str) -> str:
-    return weather.replace("-", " ")
 
 
 def _picture(pixels: np.ndarray, *, lossless: bool = False) -> str:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import zipfile
 from dataclasses import dataclass
+from itertools import chain, count, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -122,9 +123,9 @@ def read_run(folder: Path) -> Run:
 
 
 def _selections(folder: Path) -> tuple[Selection, ...]:
-    rounds = sorted(folder.glob("round-*/selection"), key=lambda place: int(place.parent.name.removeprefix("round-")))
-    places = (folder / "selection", *rounds)
-    return tuple(Selection.load(place) for place in places if (place / "selection.json").exists())
+    places = chain((folder,), (folder / f"round-{number}" for number in count(1)))
+    chosen = (place / "selection" for place in places)
+    return tuple(map(Selection.load, takewhile(lambda place: (place / "selection.json").exists(), chosen)))
 
 
 def _commands(path: Path) -> tuple[str, ...]:

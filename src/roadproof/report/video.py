@@ -121,8 +121,7 @@ class DriveVideo:
         self._driven.append((seen.state.x_m, seen.state.y_m))
         self._events += seen.events
         page = Image.new("RGB", SIZE, PAPER)
-        picture = seen.frame if seen.picture is None else seen.picture
-        page.paste(_fitted(picture, (VIEW[2], VIEW[3])), VIEW[:2])
+        page.paste(_fitted(seen.shown, (VIEW[2], VIEW[3])), VIEW[:2])
         page.paste(self._above(seen, cars, people), (VIEW[2], 0))
         page.paste(_fitted(seen.frame, (200, 88)), (VIEW[2] + 140, ABOVE_PX + 26))
         pen = ImageDraw.Draw(page)

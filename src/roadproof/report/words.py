@@ -1,10 +1,15 @@
-"""Numbers as people read them."""
+"""Names and numbers as people read them."""
 
 from __future__ import annotations
 
 from roadproof.metrics import Mean
 
 MISSING = "–"
+
+
+def in_words(name: str) -> str:
+    """A weather, a kind of scenario or of event as people write it: "clear-noon" is clear noon."""
+    return name.replace("-", " ")
 
 
 def mean_in_words(mean: Mean | None, digits: int) -> str:

@@ -52,7 +52,7 @@ from roadproof.evaluation import DrivenObjective, Evaluation, evaluate
 from roadproof.evaluation.objective import Measure
 from roadproof.evaluation.result import Trial, episodes, path_of
 from roadproof.evaluation.selection import first_of_each_group
-from roadproof.loop import Budget, stress_test
+from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
@@ -205,18 +205,7 @@ def space_of(job: Job) -> SearchSpace:
 
 def _by_gradient(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
     # Its own evaluation, one pair of drives, is the first of the study's conditions and kept where those are.
-    found = stress_test(
-        world,
-        controller,
-        job.scenario,
-        folder,
-        budget=budget_of(job.method, job.weathers[0]),
-        space=space_of(job),
-        seed=job.seed,
-        controller_name=job.controller,
-    )
-    costs = [cost for stage, cost in found.cost.items() if stage != "evaluate"]
-    calls, seconds = sum(cost.simulator_calls for cost in costs), sum(cost.seconds for cost in costs)
+    found, calls, seconds = _searched(job, world, controller, folder, select=job.method.select)
     strongest = found.attack.history.max((1, 2))
     before = [found.cost[stage] for stage in ("record", "calibrate")]
     # All steps cost much the same, so the time of the search is spread evenly over them.
@@ -240,6 +229,24 @@ def _by_gradient(job: Job, world: Simulator, controller: Controller, folder: Pat
             },
         ),
     )
+
+
+def _searched(
+    job: Job, world: Simulator, controller: Controller, folder: Path, *, select: int
+) -> tuple[StressTest, int, float]:
+    """A gradopt search with so many candidates driven; its simulator calls and seconds without the evaluation."""
+    found = stress_test(
+        world,
+        controller,
+        job.scenario,
+        folder,
+        budget=replace(budget_of(job.method, job.weathers[0]), select=select),
+        space=space_of(job),
+        seed=job.seed,
+        controller_name=job.controller,
+    )
+    costs = [cost for stage, cost in found.cost.items() if stage != "evaluate"]
+    return found, sum(cost.simulator_calls for cost in costs), sum(cost.seconds for cost in costs)
 
 
 def _by_black_box(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
@@ -296,23 +303,9 @@ class _Start:
 
 def _started(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Start:
     """Record, calibrate and search; the candidates are for the black box to drive."""
-    found = stress_test(
-        world,
-        controller,
-        job.scenario,
-        folder,
-        budget=replace(budget_of(job.method, job.weathers[0]), select=0),
-        space=space_of(job),
-        seed=job.seed,
-        controller_name=job.controller,
-    )
+    found, calls, seconds = _searched(job, world, controller, folder, select=0)
     chosen = first_of_each_group(found.attack.candidates, job.method.select)
-    costs = [cost for stage, cost in found.cost.items() if stage != "evaluate"]
-    return _Start(
-        tuple(candidate.pattern for _, candidate in chosen),
-        sum(cost.simulator_calls for cost in costs),
-        sum(cost.seconds for cost in costs),
-    )
+    return _Start(tuple(candidate.pattern for _, candidate in chosen), calls, seconds)
 
 
 def _evaluate(

@@ -38,9 +38,8 @@ def views(
     files: dict[str, bytes] = {}
     for weather in weathers:
         seen = simulator.reset(there, weather=weather, pattern=paint, full_pictures=True)
-        picture = Image.fromarray(seen.frame if seen.picture is None else seen.picture)
         packed = io.BytesIO()
-        picture.resize(SIZE_PX, Image.Resampling.LANCZOS).save(packed, format="JPEG", quality=90)
+        Image.fromarray(seen.shown).resize(SIZE_PX, Image.Resampling.LANCZOS).save(packed, format="JPEG", quality=90)
         files[f"view-{weather}.jpg"] = packed.getvalue()
     return files
 
@@ -50,4 +49,4 @@ def _place(clean: Episode, scenario: Scenario) -> VehicleState:
     away_m = np.hypot(clean.x_m - scenario.canvas.x_m, clean.y_m - scenario.canvas.y_m)
     coming = away_m[: int(away_m.argmin()) + 1]
     at = int(np.abs(coming - BEFORE_M).argmin())
-    return VehicleState(*(float(getattr(clean, name)[at]) for name in VehicleState.__slots__))
+    return clean.state(at)

@@ -17,8 +17,9 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from roadproof.report.study.blocks import compared, overall
 from roadproof.report.study.folder import Found, History
-from roadproof.report.study.results import Results, words
+from roadproof.report.study.results import Results
 from roadproof.report.study.statistics import mean_over_scenarios
+from roadproof.report.words import in_words
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -84,7 +85,7 @@ def by_figures(results: Results) -> Picture:
     how = f"penalty {'in traffic' if blocks[1].traffic else 'alone on the road'}"
     return Picture(
         "by-figures",
-        f"Deviation and infraction penalty for each K at {words(results.home)}, driven, {how}: means over scenarios "
+        f"Deviation and infraction penalty for each K at {in_words(results.home)}, driven, {how}: means over scenarios "
         "with 95 % bootstrap intervals.",
         figure,
     )

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from roadproof.metrics import Mean
 from roadproof.report.study.blocks import DEVIATION, PENALTY, Block, Metric, overall, reference, rivals
 from roadproof.report.study.notes import note
-from roadproof.report.study.results import Method, Results, words
+from roadproof.report.study.results import Method, Results
 from roadproof.report.study.statistics import Paired, mean_over_scenarios, paired
 from roadproof.report.study.table import Cell, Estimate, Heading, Table, slug
-from roadproof.report.words import MISSING
+from roadproof.report.words import MISSING, in_words
 from roadproof.scenarios import KINDS
 
 SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}
@@ -47,7 +47,7 @@ def _against(results: Results, ours: str, theirs: str, name: str) -> list[Table]
         return compare_table(results, ours, theirs, blocks, name=f"{kind}-{name}", title=f"{both}: {title}")
 
     tables = [
-        table("overall", f"all scenarios, {words(home)}", overall(results)),
+        table("overall", f"all scenarios, {in_words(home)}", overall(results)),
         paired_table(
             results, ours, theirs, overall(results), name=f"paired-{name}", title=f"{both}: differences pair by pair"
         ),
@@ -65,11 +65,11 @@ def _against(results: Results, ours: str, theirs: str, name: str) -> list[Table]
     others = results.weathers[1:]
     if others:
         blocks = [_penalty_at(results, weather, busy) for weather in others]
-        tables.append(table("weathers", f"infraction penalty in other weathers than {words(home)}", blocks))
+        tables.append(table("weathers", f"infraction penalty in other weathers than {in_words(home)}", blocks))
         tables += [
             table(
                 f"{weather}-alone",
-                f"all scenarios, {words(weather)}, {'in traffic' if alone else 'alone on the road'}",
+                f"all scenarios, {in_words(weather)}, {'in traffic' if alone else 'alone on the road'}",
                 [Block(each.title, each, weather, alone) for each in (DEVIATION, PENALTY)],
             )
             for weather in others
@@ -177,7 +177,7 @@ def ablation_table(results: Results, variants: Sequence[Method], metric: Metric)
     spans = {scheme: sum(method.scheme == scheme for method in ordered) for scheme in SCHEMES}
     return Table(
         name=f"ablation-{slug(metric.title)}",
-        title=f"Variants of GradOpt: {metric.title.lower()}, {words(results.home)}",
+        title=f"Variants of GradOpt: {metric.title.lower()}, {in_words(results.home)}",
         note=note(results, [block], names, "Each row is over the cases that all variants have."),
         header=(
             (Heading(""), *(Heading(SCHEMES[scheme], span) for scheme, span in spans.items() if span)),
@@ -210,7 +210,7 @@ def methods_table(results: Results) -> Table:
             ))  # fmt: skip
     return Table(
         name="methods",
-        title=f"What each method found and what it cost, {words(results.home)}",
+        title=f"What each method found and what it cost, {in_words(results.home)}",
         note=note(
             results,
             blocks,
@@ -244,7 +244,7 @@ def gaps_table(results: Results) -> Table | None:
 def _penalty_at(results: Results, weather: str, busy: bool) -> Block:
     """The penalty in a weather; a study may have traffic in its first one alone, which is then said."""
     traffic = results.has(traffic=True, weather=weather)
-    heading = words(weather).capitalize() + (" (alone)" if busy and not traffic else "")
+    heading = in_words(weather).capitalize() + (" (alone)" if busy and not traffic else "")
     return Block(heading, PENALTY, weather, traffic)
 
 

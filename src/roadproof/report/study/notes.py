@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from roadproof.report.study.blocks import PENALTY, Block
-from roadproof.report.study.results import Results, words
+from roadproof.report.study.results import Results
+from roadproof.report.words import in_words
 
 SHOWN_GAPS = 3
 ENOUGH = 10
@@ -54,7 +55,7 @@ def _bare_road(results: Results, blocks: Sequence[Block], methods: Sequence[str]
                 for each in results.instances
                 if each.job.method in methods and (each.weather, each.traffic) == (block.weather, block.traffic)
             ]
-            said += [f"{sum(clean) / len(clean):.2f} at {words(block.weather)}"] if clean else []
+            said += [f"{sum(clean) / len(clean):.2f} at {in_words(block.weather)}"] if clean else []
     return [f"Penalty of the same drives on the bare road: {', '.join(said)}."] if said else []
 
 

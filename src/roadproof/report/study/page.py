@@ -20,9 +20,10 @@ from roadproof.report.study.charts import Picture, by_figures, progress
 from roadproof.report.study.folder import Found, read_found
 from roadproof.report.study.layouts import paper_tables
 from roadproof.report.study.pictures import gallery, in_weathers, trajectories
-from roadproof.report.study.results import BLACK, Method, Record, Results, results_of, words
+from roadproof.report.study.results import BLACK, Method, Record, Results, results_of
 from roadproof.report.study.table import Table, in_latex, in_markdown, markdown_text
 from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
+from roadproof.report.words import in_words
 
 
 def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Sequence[Record] = ()) -> Path:
@@ -116,7 +117,7 @@ def _sentence(results: Results, found: Iterable[Found]) -> str:
     """What the study was, in a sentence."""
     controllers = list(dict.fromkeys(job.controller for job in found))
     scenarios = f"{len(results.kinds)} scenario{'s' if len(results.kinds) != 1 else ''}"
-    weathers = [words(weather) for weather in results.weathers]
+    weathers = [in_words(weather) for weather in results.weathers]
     also = f", judged also at {', '.join(weathers[1:])}" if weathers[1:] else ""
     traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
     seeds = (

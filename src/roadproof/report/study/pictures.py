@@ -17,8 +17,9 @@ from roadproof.report.asphalt import on_asphalt
 from roadproof.report.study.blocks import compared, reference
 from roadproof.report.study.charts import INK, MUTED, Picture, legend, plain, style
 from roadproof.report.study.folder import Found
-from roadproof.report.study.results import JobId, Results, words
+from roadproof.report.study.results import JobId, Results
 from roadproof.report.top_view import Ground, around_canvas, draw_road
+from roadproof.report.words import in_words
 from roadproof.scenarios import KINDS
 from roadproof.simulators.town.maps import load_map
 from roadproof.simulators.town.roadmap import RoadMap
@@ -148,7 +149,7 @@ def in_weathers(results: Results, found: Mapping[JobId, Found]) -> Picture | Non
             axes.set(xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
             if row == 0:
-                axes.set_title(plain(words(weather)), fontsize=10, color=INK)
+                axes.set_title(plain(in_words(weather)), fontsize=10, color=INK)
             if column == 0:
                 axes.set_ylabel(plain(job.scenario), fontsize=9.5, color=INK)
             view = seen[job][weather]

@@ -12,6 +12,7 @@ import numpy as np
 
 from roadproof.errors import StudyError
 from roadproof.report.study.statistics import Case
+from roadproof.report.words import in_words
 
 Record: TypeAlias = Mapping[Any, Any]
 """A row of rows.parquet."""
@@ -179,7 +180,7 @@ class Results:
             elif lacking:
                 found[job] = "; ".join(
                     f"{own.get((weather, traffic), 0)} of {most[weather, traffic]} drives at "
-                    f"{words(weather)}{' in traffic' if traffic else ''}"
+                    f"{in_words(weather)}{' in traffic' if traffic else ''}"
                     for weather, traffic in lacking
                 )
         return found
@@ -240,11 +241,6 @@ def results_of(records: Iterable[Record], methods: Iterable[Method] = ()) -> Res
         seeds=tuple(sorted({int(row["seed"]) for row in rows})),
         weathers=tuple(dict.fromkeys(each.weather for each in instances)),
     )
-
-
-def words(name: str) -> str:
-    """A weather or kind as people write it."""
-    return name.replace("-", " ")
 
 
 def _by_number(figures: str) -> tuple[int, str]:

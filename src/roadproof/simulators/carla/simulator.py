@@ -32,7 +32,7 @@ from roadproof.simulators.carla.places import scenario_between, spawn_places, st
 from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
-from roadproof.simulators.carla.weather import carla_weather
+from roadproof.simulators.carla.weather import set_weather
 from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage, Pictures
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.judge import Judge
@@ -288,7 +288,7 @@ class CarlaSimulator:
         if self._paint is PaintKind.NATIVE:
             # The bare road as well: what is painted is compared with asphalt of the same make.
             lay(session, self._ground_of(scenario), pattern)
-        _set_weather(session, weather)
+        set_weather(session, weather)
         ego = spawn_driven(session, scenario.start)
         crowd = None if traffic is None else Crowd(session, traffic)
         for _ in range(SETTLE_TICKS):
@@ -394,9 +394,3 @@ class CarlaSimulator:
             done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
             picture=picture if drive.full_pictures else None,
         )
-
-
-def _set_weather(session: Session, weather: Weather) -> None:
-    session.patiently("the weather", lambda: session.world.set_weather(carla_weather(weather)))
-    # Setting it gives no answer; asking for it does, once it is set.
-    session.patiently("the weather", session.world.get_weather)

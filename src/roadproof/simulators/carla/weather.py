@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from roadproof.datatypes import Weather
-from roadproof.simulators.carla.session import carla
+from roadproof.simulators.carla.session import Session, carla
 
 PRESETS = {
     Weather.CLEAR_NOON: "ClearNoon",
@@ -15,6 +15,13 @@ PRESETS = {
     Weather.HARD_RAIN_NOON: "HardRainNoon",
 }
 """By name, since CARLA has no preset with fog."""
+
+
+def set_weather(session: Session, weather: Weather) -> None:
+    """Have a server show a weather."""
+    session.patiently("the weather", lambda: session.world.set_weather(carla_weather(weather)))
+    # Setting it gives no answer; asking for it does, once it is set.
+    session.patiently("the weather", session.world.get_weather)
 
 
 def carla_weather(weather: Weather) -> carla.WeatherParameters:
