@@ -58,6 +58,13 @@ def check_folder(folder, result):
     assert deviations[result.selection.chosen] == max(deviations)
 
 
+@pytest.mark.parametrize("processes", [0, 2])
+def test_processes_that_have_no_simulator_are_refused_before_anything_is_driven(town, tmp_path, processes):
+    with pytest.raises(RoadproofError, match=f"{processes} processes; expected 1, or more with a function"):
+        run(town, tmp_path / "run", processes=processes)
+    assert not (tmp_path / "run").exists()
+
+
 def test_budgets_say_what_they_spend():
     assert BUDGETS["paper"].trajectories == 3
     assert BUDGETS["paper"].restarts * BUDGETS["paper"].schedule.iterations == 1000

@@ -28,7 +28,7 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, Scheme, SteeringNoise, Swerve, Trajectories, Window, record
 from roadproof.errors import RoadproofError
-from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Selection, evaluate, select_by_driving
+from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Opening, Selection, evaluate, select_by_driving
 from roadproof.files import check_writable
 from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
@@ -154,6 +154,8 @@ def stress_test(
     seed: int = 0,
     controller_name: str = "",
     device: str = "cpu",
+    another: Opening | None = None,
+    processes: int = 1,
     on_progress: OnProgress = lambda _stage, _done, _total, _word: None,
 ) -> StressTest:
     """Find the paint that makes a controller leave its lane in one scenario, and say how bad it is.
@@ -168,11 +170,17 @@ def stress_test(
         seed: of recording, search and traffic.
         controller_name: what reports call it.
         device: where to search.
+        another: opens one more simulator of the same kind; needed for several processes.
+        processes: drives of the evaluation made at once; the controller must be picklable where there are several.
         on_progress: told of every step of every stage.
 
     Raises:
         RoadproofError: the folder holds a run of something else, or a stage refuses; the message says why.
     """
+    if processes < 1 or (processes > 1 and another is None):
+        raise RoadproofError(
+            f"{processes} processes; expected 1, or more with a function that opens another simulator for each"
+        )
     check_writable(folder)
     space = space or SearchSpace(figures=5)
     # What tells this run from another.
@@ -219,7 +227,7 @@ def stress_test(
     pattern = _chosen(found, selection, rounds)
     save_pattern(pattern, folder / "pattern.json")
     with ledger.stage("evaluate"):
-        evaluation = _evaluate(run, pattern)
+        evaluation = _evaluate(run, pattern, simulator if another is None or processes == 1 else another, processes)
         ledger.calls("evaluate", evaluation.simulator_calls)
     return StressTest(attack=found, selection=selection, rounds=rounds, evaluation=evaluation, cost=ledger.cost)
 
@@ -343,9 +351,9 @@ def _select(run: _Run, found: AttackResult) -> Selection:
     )
 
 
-def _evaluate(run: _Run, pattern: Pattern) -> Evaluation:
+def _evaluate(run: _Run, pattern: Pattern, simulator: Opening | Simulator, processes: int) -> Evaluation:
     return evaluate(
-        run.simulator,
+        simulator,
         run.controller,
         run.scenario,
         pattern,
@@ -354,6 +362,7 @@ def _evaluate(run: _Run, pattern: Pattern) -> Evaluation:
         weathers=run.budget.weathers,
         runs=run.budget.runs,
         seed=run.seed,
+        processes=processes,
         on_drive=lambda done, total: run.on_progress("Evaluating", done, total, ""),
     )
 

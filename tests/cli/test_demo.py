@@ -26,7 +26,8 @@ def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch
     file, out = tmp_path / "scenarios.toml", tmp_path / "run"
     save_scenarios([along_a_street(tmp_path, 3.2)], file)
     for _ in range(2):  # the second finds all done
-        code, printed = demo("--scenarios", file, "--scenario", "street", "--figures", 1, "--out", out)
+        where = ("--scenarios", file, "--scenario", "street")
+        code, printed = demo(*where, "--figures", 1, "--processes", 2, "--out", out)
         assert code == 0, printed.err
         assert "street" in printed.out
         assert "record" in printed.out
@@ -45,6 +46,7 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
         (["--attack-weathers", "clear-noon,rainy-noon", "--budget", "paper"], "choose two-paint"),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
+        (["--processes", "0"], "0 processes; expected 1"),
     ):
         code, printed = demo(*options, "--out", tmp_path)
         assert code == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,6 +37,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
     simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
     device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    processes: Annotated[int, typer.Option(help="Drives of the evaluation made at once.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
         "out/demo"
     ),
@@ -68,6 +70,8 @@ def demo(
                 seed=seed,
                 controller_name=controller,
                 device=device,
+                another=partial(open_simulator, simulator),
+                processes=processes,
                 on_progress=show,
             )
         _film(world, who, result, out)

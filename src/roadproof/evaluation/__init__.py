@@ -1,6 +1,7 @@
 """Driving over a painted pattern and judging what came of it."""
 
 from roadproof.evaluation.evaluate import PAPER_WEATHERS as PAPER_WEATHERS
+from roadproof.evaluation.evaluate import Opening as Opening
 from roadproof.evaluation.evaluate import evaluate as evaluate
 from roadproof.evaluation.evaluate import random_patterns as random_patterns
 from roadproof.evaluation.fidelity import Fidelity as Fidelity
