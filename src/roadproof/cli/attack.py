@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import ControllerSpec, Device, choice
+
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult, ShownDrive
     from roadproof.search_space import SearchSpace
@@ -14,14 +16,7 @@ if TYPE_CHECKING:
 
 def attack(
     recordings: Annotated[Path, typer.Argument(help="Folder with a set of recorded drives.", show_default=False)],
-    controller: Annotated[
-        str,
-        typer.Option(
-            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE "
-            "or module:factory.",
-            show_default=False,
-        ),
-    ],
+    controller: ControllerSpec,
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
     family: Annotated[
         str, typer.Option(help="Where figures may lie: published, published-canvas-centre or free.")
@@ -50,7 +45,7 @@ def attack(
         int, typer.Option(help="Random patterns a group that the self-check compares with; 0 for none.")
     ] = 100,
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    device: Annotated[str, typer.Option(help="cpu, cuda or cuda:N.")] = "cpu",
+    device: Device = "cpu",
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/attack"),
 ) -> None:
@@ -58,7 +53,6 @@ def attack(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks import GRADIENTS, Schedule, show_pattern
     from roadproof.attacks import attack as run
-    from roadproof.cli.options import choice
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.controllers.precision import multiplies_bfloat16

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import SimulatorSpec, choice
+
 if TYPE_CHECKING:
     from roadproof.calibration import CalibrationReport
 
@@ -22,16 +24,13 @@ def calibrate(
             "colours, homographies from the poses; published: coloured points and 22 colours."
         ),
     ] = "two-paint",
-    simulator: Annotated[
-        str, typer.Option(help="Where the drives were recorded: town, or carla://HOST:PORT.")
-    ] = "town",
+    simulator: SimulatorSpec = "town",
 ) -> None:
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.calibration import METHODS, Calibrated, replays_needed
     from roadproof.calibration import calibrate as run
-    from roadproof.cli.options import choice
     from roadproof.cli.progress import progress
     from roadproof.drives import load_drives
     from roadproof.errors import CalibrationError, RecordingError

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from roadproof.cli.options import ScenarioFile, WeatherName, choice
 
 if TYPE_CHECKING:
     from roadproof.controllers import ControllerReport
@@ -21,18 +22,14 @@ def check_controller(
             "pilotnet:FILE or module:factory."
         ),
     ],
-    scenarios: Annotated[
-        Path | None,
-        typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
-    ] = None,
-    weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
+    scenarios: ScenarioFile = None,
+    weather: WeatherName = "clear-noon",
     cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
     pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
     processes: Annotated[int, typer.Option(help="Simulators that drive at once; 0: one a core.")] = 0,
     drive: Annotated[bool, typer.Option(help="Also drive the scenarios.")] = True,
 ) -> None:
     """Check what attacks rely on, then drive every scenario and count those without any event."""
-    from roadproof.cli.options import choice
     from roadproof.cli.progress import progress
     from roadproof.controllers import check_controller as check
     from roadproof.controllers import load_controller

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import ControllerSpec, Device, ScenarioFile, ScenarioName, SimulatorSpec, choice, weathers_of
+
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.loop import StressTest
@@ -17,17 +19,9 @@ if TYPE_CHECKING:
 
 
 def demo(
-    scenario: Annotated[str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")] = "left-03",
-    scenarios: Annotated[
-        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
-    ] = None,
-    controller: Annotated[
-        str,
-        typer.Option(
-            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
-            "pilotnet:FILE or module:factory."
-        ),
-    ] = "pilotnet",
+    scenario: ScenarioName = "left-03",
+    scenarios: ScenarioFile = None,
+    controller: ControllerSpec = "pilotnet",
     budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
     rounds: Annotated[int, typer.Option(help="Rounds of searching on along the way that the attacked car took.")] = 0,
     attack_weathers: Annotated[
@@ -35,8 +29,8 @@ def demo(
     ] = "clear-noon",
     figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
-    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    simulator: SimulatorSpec = "town",
+    device: Device = "cpu",
     processes: Annotated[int, typer.Option(help="Drives of the evaluation made at once.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
         "out/demo"
@@ -44,7 +38,6 @@ def demo(
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice, weathers_of
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.files import write_atomically

@@ -9,6 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import (
+    Device,
+    DriverSpec,
+    ScenarioFile,
+    ScenarioName,
+    SimulatorSpec,
+    WeatherName,
+    choice,
+    driver_of,
+)
+
 if TYPE_CHECKING:
     from roadproof.datatypes import Control, Observation
     from roadproof.report.video import DriveVideo
@@ -17,20 +28,10 @@ if TYPE_CHECKING:
 
 
 def drive(
-    scenario: Annotated[str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")] = "left-03",
-    scenarios: Annotated[
-        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
-    ] = None,
-    driver: Annotated[
-        str,
-        typer.Option(
-            "--controller",
-            "--driver",
-            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
-            "file, cil:FILE, pilotnet:FILE or module:factory.",
-        ),
-    ] = "expert",
-    weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
+    scenario: ScenarioName = "left-03",
+    scenarios: ScenarioFile = None,
+    driver: DriverSpec = "expert",
+    weather: WeatherName = "clear-noon",
     pattern: Annotated[
         Path | None,
         typer.Option(help="pattern.json of an attack, or a 400×400 picture, painted on the road.", show_default=False),
@@ -38,13 +39,12 @@ def drive(
     cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
     pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
     seed: Annotated[int, typer.Option(help="Of the other cars and the people.")] = 0,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
-    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    simulator: SimulatorSpec = "town",
+    device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),
 ) -> None:
     """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice, driver_of
     from roadproof.datatypes import Weather
     from roadproof.files import check_writable
     from roadproof.patterns import read_paint

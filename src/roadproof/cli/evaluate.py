@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import Device, DriverSpec, ScenarioFile, ScenarioName, SimulatorSpec, driver_of, weathers_of
+
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.evaluation import Evaluation, Fidelity
@@ -20,17 +22,9 @@ def evaluate(
     pattern: Annotated[
         Path, typer.Argument(help="pattern.json of an attack, or a 400×400 picture.", show_default=False)
     ],
-    controller: Annotated[
-        str,
-        typer.Option(
-            help="A shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
-            "pilotnet:FILE, module:factory, or expert."
-        ),
-    ] = "cil",
-    scenario: Annotated[str, typer.Option(help="Name of a scenario; `roadproof scenarios` lists them.")] = "left-03",
-    scenarios: Annotated[
-        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
-    ] = None,
+    controller: DriverSpec = "cil",
+    scenario: ScenarioName = "left-03",
+    scenarios: ScenarioFile = None,
     weathers: Annotated[
         str, typer.Option(help="Weathers, with commas between; the paper's four by default.")
     ] = "clear-noon,cloudy-noon,rainy-noon,clear-sunset",
@@ -44,16 +38,15 @@ def evaluate(
     ] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
     processes: Annotated[int, typer.Option(help="Drives made at once.")] = 1,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
+    simulator: SimulatorSpec = "town",
     seed: Annotated[int, typer.Option(help="Of the first run with traffic; the others count on.")] = 0,
-    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
         "out/evaluation"
     ),
 ) -> None:
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import driver_of, weathers_of
     from roadproof.cli.progress import progress
     from roadproof.controllers import Controller
     from roadproof.errors import PatternError

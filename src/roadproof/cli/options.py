@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
+
+import typer
 
 from roadproof.errors import RoadproofError
 
@@ -15,6 +18,23 @@ if TYPE_CHECKING:
     from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
+
+_CONTROLLERS = (
+    "a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
+    "module:factory."
+)
+ControllerSpec: TypeAlias = Annotated[str, typer.Option("--controller", help=f"What is tested: {_CONTROLLERS}")]
+DriverSpec: TypeAlias = Annotated[
+    str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {_CONTROLLERS}")
+]
+ScenarioName: TypeAlias = Annotated[str, typer.Option(help="One of those that `roadproof scenarios` lists.")]
+ScenarioFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
+]
+WeatherName: TypeAlias = Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")]
+SimulatorSpec: TypeAlias = Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")]
+Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
 
 def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:

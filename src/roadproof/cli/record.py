@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import Device, DriverSpec, ScenarioFile, SimulatorSpec, WeatherName, choice, driver_of
+
 if TYPE_CHECKING:
     from roadproof.drives import Drives
 
@@ -15,19 +17,9 @@ def record(
     names: Annotated[
         list[str], typer.Argument(help="Scenarios; `roadproof scenarios` lists them.", show_default=False)
     ],
-    scenarios: Annotated[
-        Path | None, typer.Option(help="TOML file with scenarios of your own.", show_default=False)
-    ] = None,
-    driver: Annotated[
-        str,
-        typer.Option(
-            "--controller",
-            "--driver",
-            help="expert, or a controller: a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx "
-            "file, cil:FILE, pilotnet:FILE or module:factory.",
-        ),
-    ] = "expert",
-    weather: Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")] = "clear-noon",
+    scenarios: ScenarioFile = None,
+    driver: DriverSpec = "expert",
+    weather: WeatherName = "clear-noon",
     trajectories: Annotated[int, typer.Option(help="T, how many drives: 1, 3, 5 or 7.")] = 3,
     scheme: Annotated[
         str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
@@ -45,13 +37,12 @@ def record(
     horizon_m: Annotated[float, typer.Option(help="Keep frames from so far before the canvas.")] = 25.0,
     frames: Annotated[int, typer.Option(help="Keep at most so many a drive.")] = 24,
     seed: Annotated[int, typer.Option(help="Of the perturbations.")] = 0,
-    simulator: Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")] = "town",
-    device: Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")] = "cpu",
+    simulator: SimulatorSpec = "town",
+    device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
 ) -> None:
     """Record drives past the canvas: clean, and pushed to the side. A second call goes on where the first ended."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.options import choice, driver_of
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Weather
     from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window

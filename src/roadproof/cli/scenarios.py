@@ -7,12 +7,11 @@ from typing import Annotated
 
 import typer
 
+from roadproof.cli.options import ScenarioFile
+
 
 def scenarios(
-    file: Annotated[
-        Path | None,
-        typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
-    ] = None,
+    file: ScenarioFile = None,
     out: Annotated[Path | None, typer.Option(help="Picture to draw them to on their map.", show_default=False)] = None,
 ) -> None:
     """List the scenarios, and draw them on their map."""
