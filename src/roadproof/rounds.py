@@ -138,6 +138,7 @@ def search_on(
             best=best,
             weather=drives.settings.weather,
             folder=place / "selection",
+            driver_name=drives.settings.driver,
             clean=last.bare(),
             on_drive=lambda n, far, tell=tell: tell(found.schedule.iterations + n - 1, f"{far:.2f} m"),
         )

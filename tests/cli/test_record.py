@@ -1,11 +1,13 @@
 """`roadproof record`, `calibrate` and `attack` one after another, as their users call them."""
 
 import json
+import shutil
 import textwrap
 
 import pytest
 
 from roadproof.drives import load_drives
+from roadproof.evaluation import Selection
 from roadproof.recordings import load_recordings
 
 pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
@@ -22,7 +24,7 @@ CONTROLLER = textwrap.dedent(
             return frames[..., :100].mean((1, 2, 3)) - frames[..., 100:].mean((1, 2, 3))
 
         def act(self, frame, speed_mps, command):
-            return Control(0.0)
+            return Control(0.0, throttle=0.7)
     """
 )
 RECORD = ["record", "straight-04", "--trajectories", "1", "--frames", "3", "--out", "runs"]
@@ -63,6 +65,28 @@ def test_a_recorded_and_calibrated_run_is_attacked_as_it_is(run, call, workplace
     assert sorted(path.name for path in run.iterdir()) == ["calibration", "record", "recordings"]
     assert len(load_recordings(run / "recordings").recordings[0].frames) == 3
     assert json.loads((run / "calibration" / "report.json").read_text())["calls"] == 3
+
+
+def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call, workplace):
+    place = shutil.copytree(run, workplace / "driven")
+    bright = ["--controller", "own_bright:Bright"]
+    select = ["select", "driven", *bright, "--best", "2"]
+    assert "driven/attack holds no attack; make it with: roadproof attack driven/recordings" in call(*select, code=2)
+    assert "--best is 0, expected 1 or more" in call(*select[:-1], "0", code=2)
+    small = ["--groups", "all", "--figures", "1", "--iterations", "1", "--restarts", "2", "--random-patterns", "0"]
+    call("attack", "driven/recordings", *bright, *small, "--out", "driven/attack")
+    said = call(*select)
+    assert "3 drives; the strongest is driven/pattern.json" in said
+    selection = Selection.load(place / "selection")
+    deviations = [each.trial.deviation_m for each in selection.driven]
+    assert selection.deviation_m == max(deviations)
+    assert said.splitlines()[selection.chosen].endswith("kept")
+    chosen = place / "attack" / "candidates" / f"{selection.driven[selection.chosen].rank}.json"
+    assert (place / "pattern.json").read_text() == chosen.read_text()
+    before = {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")}
+    assert call(*select) == said
+    assert {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")} == before
+    assert "holds a choice for another attack" in call(*select[:-1], "1", code=2)
 
 
 def test_a_second_call_goes_on_where_the_first_ended(run, call):

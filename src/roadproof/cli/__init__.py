@@ -23,6 +23,7 @@ from roadproof.cli.evaluate import evaluate
 from roadproof.cli.record import record
 from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
+from roadproof.cli.select import select
 from roadproof.cli.study import study
 from roadproof.cli.train import train
 from roadproof.errors import RoadproofError
@@ -34,7 +35,20 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
-VERBS = (demo, record, calibrate, attack, evaluate, report, drive, scenarios, controllers, check_controller, train)
+VERBS = (
+    demo,
+    record,
+    calibrate,
+    attack,
+    select,
+    evaluate,
+    report,
+    drive,
+    scenarios,
+    controllers,
+    check_controller,
+    train,
+)
 for verb in VERBS:
     app.command()(verb)
 app.add_typer(carla, name="carla")

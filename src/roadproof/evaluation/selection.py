@@ -3,10 +3,13 @@
 SELECTION/selection.json      every candidate driven, with what came of it
 SELECTION/pattern.json, .png  the one that was chosen
 SELECTION/episodes/*.npz      the drives: clean, and one for each candidate
+
+Every drive is kept under a name that ends in a hash of what it depends on, as those of an evaluation.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,7 +21,7 @@ from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError
 from roadproof.evaluation.result import Trial, judge, trial_from_json
 from roadproof.files import read_json, write_atomically
-from roadproof.patterns import Pattern, load_pattern, save_pattern
+from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.rollout import Driver, Episode, rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
@@ -114,6 +117,7 @@ def select_by_driving(
     best: int,
     weather: Weather = Weather.CLEAR_NOON,
     folder: Path,
+    driver_name: str = "",
     clean: Episode | None = None,
     on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
 ) -> Selection:
@@ -129,38 +133,45 @@ def select_by_driving(
         best: how many are driven; every group gets its share, since the surrogate does not know which side gives way.
         weather: of the drives.
         folder: keeps every drive and the choice; what it holds is not done again.
+        driver_name: what tells this controller from others that may have driven in the folder.
         clean: the drive over the bare road, where it was made already.
         on_drive: told after each drive how many are done, and the largest deviation so far.
 
     Raises:
-        RoadproofError: there is nothing to drive, or the folder is damaged.
+        RoadproofError: there is nothing to drive, the folder is damaged, or it holds a choice among others.
         SimulatorError, ControllerError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
-    if (folder / "selection.json").exists():
-        return Selection.load(folder)
     chosen = first_of_each_group(candidates, best)
     if not chosen:
         raise RoadproofError(f"{len(candidates)} candidates and {best} of them to drive; expected at least one")
-    drive = _Drives(simulator, controller, scenario, weather, folder)
-    calls = int(clean is None)
-    if clean is not None and not drive.path("clean").exists():
-        clean.save(drive.path("clean"))
-    clean = drive("clean", None)
+    drive = _Drives(simulator, controller, scenario, weather, folder, driver_name)
+    files = [drive.file(f"candidate-{rank}", candidate.pattern) for rank, candidate in chosen]
+    if (folder / "selection.json").exists():
+        kept = Selection.load(folder)
+        if [each.trial.painted for each in kept.driven] != files:
+            raise RoadproofError(
+                f"{folder} holds a choice for another attack, controller or scenario, or among more or fewer "
+                "candidates; remove it to choose again"
+            )
+        return kept
+    calls, clean_file = int(clean is None), drive.file("clean", None)
+    if clean is not None and not drive.path(clean_file).exists():
+        clean.save(drive.path(clean_file))
+    clean = drive(clean_file, None)
     on_drive(1, 0.0)
     driven: list[Driven] = []
-    for done, (rank, candidate) in enumerate(chosen, 2):
-        name = f"candidate-{rank}"
+    for (rank, candidate), file in zip(chosen, files, strict=True):
         trial = judge(
             clean,
-            drive(name, candidate.pattern),
+            drive(file, candidate.pattern),
             scenario.canvas,
-            pattern=name,
-            clean_file="clean.npz",
-            painted_file=f"{name}.npz",
+            pattern=f"candidate-{rank}",
+            clean_file=clean_file,
+            painted_file=file,
         )
         driven.append(Driven(group=candidate.group, rank=rank, trial=trial))
-        on_drive(done, max(each.trial.deviation_m for each in driven))
+        on_drive(1 + len(driven), max(each.trial.deviation_m for each in driven))
     winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
     selection = Selection(
         pattern=chosen[winner][1].pattern,
@@ -192,13 +203,20 @@ class _Drives:
     scenario: Scenario
     weather: Weather
     folder: Path
+    driver_name: str
 
-    def path(self, name: str) -> Path:
-        """Where a drive is kept."""
-        return self.folder / "episodes" / f"{name}.npz"
+    def file(self, name: str, pattern: Pattern | None) -> str:
+        """What a drive is called."""
+        painted = b"" if pattern is None else raster(pattern).tobytes()
+        inputs = [asdict(self.scenario), self.weather, self.driver_name, hashlib.sha256(painted).hexdigest()]
+        return f"{name}-{hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]}.npz"
 
-    def __call__(self, name: str, pattern: Pattern | None) -> Episode:
-        path = self.path(name)
+    def path(self, file: str) -> Path:
+        """Where it is kept."""
+        return self.folder / "episodes" / file
+
+    def __call__(self, file: str, pattern: Pattern | None) -> Episode:
+        path = self.path(file)
         if path.exists():
             return Episode.load(path)
         episode = rollout(self.simulator, self.driver, self.scenario, weather=self.weather, pattern=pattern)

@@ -1,0 +1,80 @@
+"""`roadproof select`: what an attack found, driven over; the strongest of it is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from roadproof.cli.options import ControllerSpec, Device, SimulatorSpec
+
+if TYPE_CHECKING:
+    from roadproof.attacks import AttackResult
+    from roadproof.evaluation import Selection
+
+
+def select(
+    run: Annotated[Path, typer.Argument(help="A run that was recorded, calibrated and attacked.", show_default=False)],
+    controller: ControllerSpec,
+    best: Annotated[int, typer.Option(help="How many of the attack's candidates are driven, once each.")] = 6,
+    simulator: SimulatorSpec = "town",
+    device: Device = "cpu",
+) -> None:
+    """Drive over the best candidates of an attack, which composites rank only coarsely, and keep the strongest."""
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.attacks import AttackResult
+    from roadproof.cli.progress import progress
+    from roadproof.controllers import load_controller
+    from roadproof.drives import load_drives
+    from roadproof.errors import RoadproofError
+    from roadproof.evaluation import select_by_driving
+    from roadproof.files import check_writable
+    from roadproof.patterns import save_pattern
+    from roadproof.simulators.loading import open_simulator
+
+    if best < 1:
+        raise RoadproofError(f"--best is {best}, expected 1 or more")
+    recorded = load_drives(run / "record").settings
+    place = run / "attack"
+    if not (place / "result.json").exists():
+        raise RoadproofError(
+            f"{place} holds no attack; make it with: roadproof attack {run / 'recordings'} --controller {controller} "
+            f"--out {place}"
+        )
+    found = AttackResult.load(place)
+    check_writable(run)
+    who = load_controller(controller, device=device)
+    total = 1 + min(best, len(found.candidates))
+    with (
+        open_simulator(simulator) as world,
+        progress(f"Driving {recorded.scenario.name}", total, "drives, {:.2f} m") as show,
+    ):
+        selection = select_by_driving(
+            world,
+            who,
+            recorded.scenario,
+            found.candidates,
+            best=best,
+            weather=recorded.weather,
+            folder=run / "selection",
+            driver_name=controller,
+            on_drive=show,
+        )
+    save_pattern(selection.pattern, run / "pattern.json")
+    _summarise(selection, found, run)
+
+
+def _summarise(selection: Selection, found: AttackResult, run: Path) -> None:
+    from rich.console import Console
+
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    for k, each in enumerate(selection.driven):
+        predicted = found.candidates[each.rank - 1].surrogate_shift
+        say(
+            f"  {each.rank:2} {each.group:12} predicted {predicted:+.3f}, driven: deviation "
+            f"{each.trial.deviation_m:.2f} m, {abs(each.trial.lateral_m):.2f} m aside, {each.trial.points:g} points"
+            f"{'  <- kept' if k == selection.chosen else ''}"
+        )
+    pattern = run / "pattern.json"
+    say(f"{selection.simulator_calls} drives; the strongest is {pattern}; next: roadproof evaluate {pattern} ...")
