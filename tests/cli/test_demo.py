@@ -26,8 +26,7 @@ def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch
     file, out = tmp_path / "scenarios.toml", tmp_path / "run"
     save_scenarios([along_a_street(tmp_path, 3.2)], file)
     for _ in range(2):  # the second finds all done
-        where = ("--scenarios", file, "--scenario", "street")
-        code, printed = demo(*where, "--figures", 1, "--processes", 2, "--out", out)
+        code, printed = demo("--scenarios", file, "--scenario", "street", "--figures", 1, "--out", out)
         assert code == 0, printed.err
         assert "street" in printed.out
         assert "record" in printed.out

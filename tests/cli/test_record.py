@@ -67,16 +67,16 @@ def test_a_recorded_and_calibrated_run_is_attacked_as_it_is(run, call, workplace
     assert json.loads((run / "calibration" / "report.json").read_text())["calls"] == 3
 
 
-def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call, workplace):
-    place = shutil.copytree(run, workplace / "driven")
+def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call, tmp_path):
+    place = shutil.copytree(run, tmp_path / "driven")
     bright = ["--controller", "own_bright:Bright"]
-    select = ["select", "driven", *bright, "--best", "2"]
-    assert "driven/attack holds no attack; make it with: roadproof attack driven/recordings" in call(*select, code=2)
+    select = ["select", place, *bright, "--best", "2"]
+    assert f"{place}/attack holds no attack; make it with: roadproof attack" in call(*select, code=2)
     assert "--best is 0, expected 1 or more" in call(*select[:-1], "0", code=2)
     small = ["--groups", "all", "--figures", "1", "--iterations", "1", "--restarts", "2", "--random-patterns", "0"]
-    call("attack", "driven/recordings", *bright, *small, "--out", "driven/attack")
+    call("attack", place / "recordings", *bright, *small, "--out", place / "attack")
     said = call(*select)
-    assert "3 drives; the strongest is driven/pattern.json" in said
+    assert f"3 drives; the strongest is {place}/pattern.json" in said
     selection = Selection.load(place / "selection")
     deviations = [each.trial.deviation_m for each in selection.driven]
     assert selection.deviation_m == max(deviations)

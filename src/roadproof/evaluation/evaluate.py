@@ -29,7 +29,7 @@ from roadproof.errors import EpisodeError, PatternError
 from roadproof.evaluation.result import ATTACK, Evaluation, Trial, judge
 from roadproof.patterns import Pattern, raster
 from roadproof.rollout import Driver, Episode, rollout
-from roadproof.scenarios import Scenario
+from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PaintKind, PatternImage, Simulator
 
@@ -263,7 +263,6 @@ def _identity(simulator: Simulator, driver: AnyDriver, name: str, scenario: Scen
             frame = np.repeat(np.repeat(coarse, -(-size[0] // 6), 0), -(-size[1] // 8), 1)[: size[0], : size[1]]
             control = driver.act(np.ascontiguousarray(frame), 6.0, 2)
             answers.append(tuple(round(value, 4) for value in (control.steer, control.throttle, control.brake)))
-    map_file = Path(scenario.map_name)
     parts: dict[str, object] = {
         "version": roadproof.__version__,
         "simulator": f"{type(simulator).__module__}.{type(simulator).__qualname__}",
@@ -271,8 +270,7 @@ def _identity(simulator: Simulator, driver: AnyDriver, name: str, scenario: Scen
         "input": asdict(view),
         "dt_s": simulator.dt_s,
         "driver": [name, answers],
-        "scenario": asdict(scenario) | {"map_name": map_file.name},
-        "map": hashlib.sha256(map_file.read_bytes()).hexdigest() if map_file.is_file() else "",
+        "scenario": identity(scenario),
     }
     if simulator.paint is not PaintKind.RENDERED:
         parts["paint"] = simulator.paint

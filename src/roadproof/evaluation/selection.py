@@ -23,7 +23,7 @@ from roadproof.evaluation.result import Trial, judge, trial_from_json
 from roadproof.files import read_json, write_atomically
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.rollout import Driver, Episode, rollout
-from roadproof.scenarios import Scenario
+from roadproof.scenarios import Scenario, identity
 from roadproof.simulators.protocol import Simulator
 
 FORMAT = "roadproof-selection"
@@ -208,7 +208,7 @@ class _Drives:
     def file(self, name: str, pattern: Pattern | None) -> str:
         """What a drive is called."""
         painted = b"" if pattern is None else raster(pattern).tobytes()
-        inputs = [asdict(self.scenario), self.weather, self.driver_name, hashlib.sha256(painted).hexdigest()]
+        inputs = [identity(self.scenario), self.weather, self.driver_name, hashlib.sha256(painted).hexdigest()]
         return f"{name}-{hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]}.npz"
 
     def path(self, file: str) -> Path:
