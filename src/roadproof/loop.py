@@ -227,7 +227,7 @@ def stress_test(
     pattern = _chosen(found, selection, rounds)
     save_pattern(pattern, folder / "pattern.json")
     with ledger.stage("evaluate"):
-        evaluation = _evaluate(run, pattern, simulator if another is None or processes == 1 else another, processes)
+        evaluation = _evaluate(run, pattern, another if another and processes > 1 else simulator, processes)
         ledger.calls("evaluate", evaluation.simulator_calls)
     return StressTest(attack=found, selection=selection, rounds=rounds, evaluation=evaluation, cost=ledger.cost)
 

@@ -84,7 +84,6 @@ controller = "pilotnet"
 scenario_file = "short.toml"
 scenarios = ["short"]
 figures = [1]
-weathers = ["clear-noon"]
 
 [[method]]
 name = "GradOpt"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import SimulatorSpec, choice
+from roadproof.cli.options import choice
 
 if TYPE_CHECKING:
     from roadproof.calibration import CalibrationReport
@@ -24,7 +24,9 @@ def calibrate(
             "colours, homographies from the poses; published: coloured points and 22 colours."
         ),
     ] = "two-paint",
-    simulator: SimulatorSpec = "town",
+    simulator: Annotated[
+        str, typer.Option(help="Where the drives were recorded: town, or carla://HOST:PORT.")
+    ] = "town",
 ) -> None:
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import ScenarioFile, WeatherName, choice
+from roadproof.cli.options import CONTROLLERS, ScenarioFile, WeatherName, choice
 
 if TYPE_CHECKING:
     from roadproof.controllers import ControllerReport
@@ -15,13 +15,7 @@ if TYPE_CHECKING:
 
 
 def check_controller(
-    spec: Annotated[
-        str,
-        typer.Argument(
-            help="A shipped controller (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, "
-            "pilotnet:FILE or module:factory."
-        ),
-    ],
+    spec: Annotated[str, typer.Argument(help=f"What is checked: {CONTROLLERS}")],
     scenarios: ScenarioFile = None,
     weather: WeatherName = "clear-noon",
     cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 Word = TypeVar("Word", bound=str)
 
-_CONTROLLERS = (
+CONTROLLERS = (
     "a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
     "module:factory."
 )
-ControllerSpec: TypeAlias = Annotated[str, typer.Option("--controller", help=f"What is tested: {_CONTROLLERS}")]
+ControllerSpec: TypeAlias = Annotated[str, typer.Option("--controller", help=f"What is tested: {CONTROLLERS}")]
 DriverSpec: TypeAlias = Annotated[
-    str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {_CONTROLLERS}")
+    str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {CONTROLLERS}")
 ]
 ScenarioName: TypeAlias = Annotated[str, typer.Option(help="One of those that `roadproof scenarios` lists.")]
 ScenarioFile: TypeAlias = Annotated[
