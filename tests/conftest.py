@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+import needs
+
 # Workers side by side have a core each; torch reads this when it is first imported.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -39,3 +41,19 @@ def pilotnet_data() -> Path:
 def opendrive_data() -> Path:
     """CARLA's Town01 and Town02 as OpenDRIVE."""
     return _shared("opendrive")
+
+
+@pytest.fixture(scope="session")
+def town():
+    """The town, opened once a worker: every reset makes it new."""
+    needs.town()
+    from roadproof.simulators.town.simulator import TownSimulator
+
+    with TownSimulator() as simulator:
+        yield simulator
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first, so that workers end at the same time."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

@@ -9,12 +9,13 @@ import time
 import numpy as np
 import pytest
 
+import needs
 from roadproof.attacks import AttackResult
 from roadproof.evaluation import Evaluation, Selection
 from roadproof.ledger import read_cost
 from roadproof.report.run import read_run
 
-pytest.importorskip("panda3d", reason="panda3d is not installed")
+needs.town()
 pytest.importorskip("av", reason="av is not installed")
 
 FIRST_STEP = {

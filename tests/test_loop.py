@@ -18,15 +18,6 @@ from roadproof.search_space import SearchSpace
 TINY = Budget(frames=4, schedule=Schedule.stretched(3), restarts=2, select=2, weathers=(Weather.CLEAR_NOON,), runs=0)
 
 
-@pytest.fixture(scope="module")
-def town():
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
-    from roadproof.simulators.town.simulator import TownSimulator
-
-    with TownSimulator() as world:
-        yield world
-
-
 def run(town, folder, **options):
     scenario = find_scenario("left-03", builtin_scenarios())
     options = {"budget": TINY, "space": SearchSpace(figures=1), "controller_name": "pilotnet"} | options

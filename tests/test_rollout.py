@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import needs
 from roadproof.controllers import Controller
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Event, EventKind, Weather
@@ -15,8 +16,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.rollout import Ending, Episode, replay, rollout
 from roadproof.scenarios import builtin_scenarios, find_scenario
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
-from roadproof.simulators.town.simulator import TownSimulator
+needs.town()
 from roadproof.training.expert import expert
 
 LEFT = find_scenario("left-03", builtin_scenarios())
@@ -39,12 +39,6 @@ class Straight:
     def act(self, frame, speed_mps, command):
         self.seen.append((frame, speed_mps, command))
         return Control(self._steer, throttle=0.6)
-
-
-@pytest.fixture(scope="module")
-def town():
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives.drives import read_drive
 from roadproof.errors import CalibrationError, RoadproofError
-from roadproof.evaluation.result import episodes
+from roadproof.evaluation.episodes import load_episodes
 from roadproof.loop import Budget, stress_test
 from roadproof.recordings import Push
 from roadproof.search_space import SearchSpace
@@ -30,15 +30,6 @@ BUDGET = Budget(
     runs=0,
     rounds=2,
 )
-
-
-@pytest.fixture(scope="module")
-def town():
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
-    from roadproof.simulators.town.simulator import TownSimulator
-
-    with TownSimulator() as world:
-        yield world
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +52,7 @@ def done(town, street, tmp_path_factory):
 def test_a_round_records_the_bare_road_where_the_attacked_car_went(done):
     folder, result, _ = done
     chosen = result.selection.driven[result.selection.chosen].trial
-    (attacked,) = episodes(folder / "selection", [chosen.painted])
+    (attacked,) = load_episodes(folder / "selection", [chosen.painted])
     drive = read_drive("round-1", folder / "round-1")
     steps = drive.frame_number
     np.testing.assert_allclose(drive.episode.x_m[steps], attacked.x_m[steps], atol=1e-6)

@@ -347,7 +347,6 @@ def _select(run: _Run, found: AttackResult) -> Selection:
         best=run.budget.select,
         weather=run.budget.recorded_in[0],
         folder=run.folder / "selection",
-        driver_name=run.controller_name,
         on_drive=lambda done, best: run.on_progress("Choosing by driving", done, total, f"{best:.2f} m"),
     )
 

@@ -25,7 +25,7 @@ from roadproof.controllers import Controller
 from roadproof.drives import Drives, record_along
 from roadproof.errors import CalibrationError, RecordingError
 from roadproof.evaluation import Selection, select_by_driving
-from roadproof.evaluation.result import episodes
+from roadproof.evaluation.episodes import load_episodes
 from roadproof.objectives import Direction, Group, parse_groups
 from roadproof.recordings import Recording, RecordingSet
 from roadproof.rollout import Episode
@@ -138,7 +138,6 @@ def search_on(
             best=best,
             weather=drives.settings.weather,
             folder=place / "selection",
-            driver_name=drives.settings.driver,
             clean=last.bare(),
             on_drive=lambda n, far, tell=tell: tell(found.schedule.iterations + n - 1, f"{far:.2f} m"),
         )
@@ -157,11 +156,11 @@ class _Driven:
 
     def bare(self) -> Episode:
         """The drive without paint."""
-        return episodes(self.folder, [self.selection.driven[0].trial.clean])[0]
+        return load_episodes(self.folder, [self.selection.driven[0].trial.clean])[0]
 
     def over_chosen(self) -> Episode:
         """The drive over the pattern that was chosen."""
-        return episodes(self.folder, [self.selection.driven[self.selection.chosen].trial.painted])[0]
+        return load_episodes(self.folder, [self.selection.driven[self.selection.chosen].trial.painted])[0]
 
 
 def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Candidate]]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import needs
 from roadproof.calibration import Method, calibrate, load_report, replays_needed
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
@@ -18,16 +19,10 @@ from roadproof.rollout import replay, rollout
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.training.expert import expert
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
 SCENE = find_scenario("straight-04", builtin_scenarios())
-
-
-@pytest.fixture(scope="module")
-def town():
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import json
 import pytest
 from PIL import Image
 
+import needs
 from carla_serving import free_port, serving, straight_map
 from roadproof.datatypes import VehicleState
 from roadproof.evaluation import Evaluation
@@ -15,7 +16,7 @@ from roadproof.scenarios import Scenario, save_scenarios
 from roadproof.simulators.protocol import PaintKind
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 pytest.importorskip("av", reason="films need the extra roadproof[video]")
 

@@ -4,6 +4,7 @@ import functools
 
 import pytest
 
+import needs
 from paint_shy import along_a_street
 from roadproof.attacks import Schedule
 from roadproof.datatypes import Weather
@@ -20,13 +21,15 @@ def demo(invoke):
 
 @pytest.mark.slow
 def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch):
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    needs.town()
     pytest.importorskip("av", reason="av is not installed")
     monkeypatch.setitem(BUDGETS, "quick", TINY)
     file, out = tmp_path / "scenarios.toml", tmp_path / "run"
     save_scenarios([along_a_street(tmp_path, 3.2)], file)
     for _ in range(2):  # the second finds all done
-        code, printed = demo("--scenarios", file, "--scenario", "street", "--figures", 1, "--out", out)
+        code, printed = demo(
+            "--scenarios", file, "--scenario", "street", "--figures", 1, "--processes", 2, "--out", out
+        )
         assert code == 0, printed.err
         assert "street" in printed.out
         assert "record" in printed.out
@@ -45,7 +48,8 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
         (["--attack-weathers", "clear-noon,rainy-noon", "--budget", "paper"], "choose two-paint"),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
-        (["--processes", "0"], "0 processes; expected 1"),
+        (["--processes", "0"], "--processes is 0, expected 1 or more"),
+        (["--processes", "2", "--simulator", "carla://localhost:2000"], "would step the one server"),
     ):
         code, printed = demo(*options, "--out", tmp_path)
         assert code == 2

@@ -11,12 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
+import needs
 from roadproof.coverage import Shape
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.rollout import Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
 
 CONTROLLERS = textwrap.dedent(

@@ -9,13 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
+import needs
 from paint_shy import just_before_the_canvas
 from roadproof.coverage import Shape
 from roadproof.evaluation import Evaluation
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.scenarios import save_scenarios
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
 
 TESTS = Path(__file__).parents[1]
@@ -80,6 +81,10 @@ MISTAKES = {
     "picture with random": (["magenta.png", "--random", "2"], "magenta.png is a picture"),
     "missing recordings": (["pattern.json", "--recordings", "nowhere"], "no folder nowhere"),
     "runs without traffic": (["pattern.json", "--runs", "2", "--cars", "0", "--pedestrians", "0"], "ask for some"),
+    "one server for two": (
+        ["pattern.json", "--processes", "2", "--simulator", "carla://localhost:2000"],
+        "would step the one server",
+    ),
 }
 
 

@@ -6,11 +6,12 @@ import textwrap
 
 import pytest
 
+import needs
 from roadproof.drives import load_drives
 from roadproof.evaluation import Selection
 from roadproof.recordings import load_recordings
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 
 CONTROLLER = textwrap.dedent(
     """

@@ -6,6 +6,7 @@ import functools
 
 import pytest
 
+import needs
 from roadproof.study.rows import pandas, read_table
 from short_drive import write_plan
 
@@ -32,7 +33,7 @@ def plan(tmp_path):
 
 @pytest.mark.slow
 def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_path):
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    needs.town()
     for _ in range(2):
         code, printed = study("run", plan, "--out", tmp_path / "out")
         assert code == 0, printed.err + printed.out

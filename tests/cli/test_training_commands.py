@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+import needs
 from roadproof.controllers import CIL, load_controller, model_card, shipped_names
 from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
 
@@ -45,7 +46,7 @@ def test_promises_are_checked_without_driving(invoke):
 
 
 def test_scenarios_that_are_not_clean_are_named(invoke, short):
-    pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+    needs.town()
     code, printed = invoke("check-controller", "cil", "--scenarios", short, "--processes", 1)
     assert code == 0, printed.err
     assert "0 of 2 scenarios clean" in printed.out
@@ -53,7 +54,7 @@ def test_scenarios_that_are_not_clean_are_named(invoke, short):
 
 
 def test_a_controller_is_trained_from_the_command_line(invoke, tmp_path):
-    pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+    needs.town()
     options = ["--out", tmp_path, "--width", 0.05, "--drives", 1, "--samples", 128, "--rounds", 0, "--processes", 1]
     code, printed = invoke("train", *options, "--collect-only")
     assert code == 0, printed.err

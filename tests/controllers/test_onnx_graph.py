@@ -7,12 +7,12 @@ import pytest
 import torch
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
-from onnx import TensorProto, helper, numpy_helper  # noqa: E402
-from onnx.reference import ReferenceEvaluator  # noqa: E402
+from onnx import TensorProto, helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
 
-from roadproof.controllers.onnx_graph import OnnxGraph  # noqa: E402
-from roadproof.controllers.onnx_operators import OPERATORS  # noqa: E402
-from roadproof.errors import ControllerError  # noqa: E402
+from roadproof.controllers.onnx_graph import OnnxGraph
+from roadproof.controllers.onnx_operators import OPERATORS
+from roadproof.errors import ControllerError
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.normal(size=(2, 4, 7, 9)).astype(np.float32)

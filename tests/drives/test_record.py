@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+import needs
 from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
@@ -14,18 +15,11 @@ from roadproof.recordings import Push
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.training.expert import expert
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
-from roadproof.simulators.town.simulator import TownSimulator
+needs.town()
 
 LEFT = find_scenario("left-03", builtin_scenarios())
 WANTED = Trajectories(count=3, perturbation=Swerve((1.2,)))
 ASKED = {"trajectories": WANTED, "window": Window(frames=5), "weather": Weather.CLOUDY_NOON, "seed": 4}
-
-
-@pytest.fixture(scope="module")
-def town():
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 @pytest.fixture(scope="module")

@@ -7,29 +7,25 @@ import numpy as np
 import pytest
 import torch
 
+import needs
 from paint_shy import PaintShy, just_before_the_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.evaluation import Evaluation, evaluate, random_patterns
-from roadproof.evaluation.result import episodes, load_paint, path_of
+from roadproof.evaluation.episodes import load_episodes
+from roadproof.evaluation.result import load_paint, path_of
 from roadproof.metrics import deviation_m, infraction_points, lateral_m, passage
 from roadproof.patterns import Pattern, raster
 from roadproof.rollout import Episode, rollout
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
 SHORT = just_before_the_canvas(2.5)
 MAGENTA = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON)
 CONDITIONS = {"weathers": WEATHERS, "runs": 2, "cars": 2, "pedestrians": 2, "seed": 3}
-
-
-@pytest.fixture(scope="module")
-def town():
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +63,7 @@ def test_every_condition_is_driven_bare_and_over_every_pattern(done):
 def test_trials_are_the_metrics_of_their_two_episodes(done):
     folder, evaluation, _ = done
     for trial in evaluation.trials:
-        clean, painted = episodes(folder, (trial.clean, trial.painted))
+        clean, painted = load_episodes(folder, (trial.clean, trial.painted))
         assert (clean.painted, painted.painted) == (False, True)
         assert (clean.weather, clean.cars, clean.seed) == (painted.weather, painted.cars, painted.seed)
         assert (clean.weather, clean.cars > 0, clean.seed) == (trial.weather, trial.traffic, trial.seed)
@@ -90,7 +86,7 @@ def test_the_paint_moves_the_car_to_where_the_driver_flees(done):
 def test_an_episode_is_the_plain_rollout_of_its_conditions(done, town):
     folder, evaluation, _ = done
     trial = evaluation.of("attack", traffic=True, weather=Weather.CLOUDY_NOON)[1]
-    (kept,) = episodes(folder, [trial.painted])
+    (kept,) = load_episodes(folder, [trial.painted])
     again = rollout(
         town, PaintShy(), SHORT, weather=Weather.CLOUDY_NOON, pattern=MAGENTA, cars=2, pedestrians=2, seed=4
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import needs
 from paint_shy import PaintShy, just_before_the_canvas
 from roadproof.coverage import Shape
 from roadproof.errors import EpisodeError, RecordingError
@@ -15,7 +16,7 @@ from roadproof.photometry import ColourTransform, pixel_maps_from_two_paints
 from roadproof.recordings import Push, Recording, RecordingSet
 from roadproof.rollout import rollout
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
 SHORT = just_before_the_canvas(1.0)

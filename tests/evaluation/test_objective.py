@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import needs
 from roadproof.controllers import load_controller
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import DrivenObjective
@@ -48,7 +49,7 @@ def test_deviation_is_the_one_that_evaluations_report():
 
 @pytest.mark.slow
 def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(tmp_path, monkeypatch):
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    needs.town()
     from roadproof.simulators.town.simulator import TownSimulator
 
     controller = load_controller("pilotnet")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import needs
 import roadproof.loop
 from references import approach
 from roadproof.attacks import Schedule
@@ -50,7 +51,7 @@ def test_a_recording_of_ones_own_is_attacked(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    needs.town()
     tiny = dataclasses.replace(
         roadproof.loop.QUICK,
         frames=5,

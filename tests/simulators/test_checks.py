@@ -3,20 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+import needs
 from roadproof.datatypes import Control, VehicleState
 from roadproof.scenarios import builtin_scenarios, find_scenario
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.checks import check_simulator
-from roadproof.simulators.town.simulator import TownSimulator
 
 SCENARIO = find_scenario("straight-01", builtin_scenarios())
-
-
-@pytest.fixture(scope="module")
-def town():
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 class Altered:

@@ -1,12 +1,13 @@
 import pytest
 
+import needs
 from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.scenarios import builtin_scenarios
 from roadproof.simulators.loading import open_simulator
 
 
 def test_the_town_is_opened_by_its_name_and_closed_again():
-    pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+    needs.town()
     with open_simulator("town") as simulator:
         assert simulator.road_map("town").lanes
         with pytest.raises(ScenarioError, match="no map 'elsewhere'"):

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+import needs
 from roadproof.attacks import AttackResult, Schedule, proposals
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
@@ -60,7 +61,7 @@ def timeless(rows):
 
 @pytest.fixture
 def _town():
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    needs.town()
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import needs
 from roadproof.errors import StudyError
 from roadproof.study.job import run_job
 from roadproof.study.plan import load_study
@@ -104,7 +105,7 @@ calls = 2
 @pytest.mark.slow
 def test_a_cluster_finds_and_drives_as_this_machine_does(tmp_path):
     pytest.importorskip("ray", reason="ray is not installed")
-    pytest.importorskip("panda3d", reason="panda3d is not installed")
+    needs.town()
     there = on_two_workers(DRIVEN, run_job, tmp_path)
     here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", run_job, workers=2)
     assert here["error"].isna().all()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import needs
 from roadproof.controllers import CIL, save_controller
 from roadproof.errors import TrainingError
 from roadproof.scenarios import builtin_scenarios
@@ -10,7 +11,7 @@ from roadproof.training.collection import CollectionPlan, collect, record_drive
 from roadproof.training.shards import Shard
 from roadproof.training.workers import Seat
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 
 
 @pytest.fixture(scope="module")

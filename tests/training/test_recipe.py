@@ -4,11 +4,12 @@ import json
 
 import pytest
 
+import needs
 from roadproof.controllers import CIL, ConditionalPilotNet, load_controller
 from roadproof.errors import TrainingError
 from roadproof.training.recipe import Recipe, follow, gather
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 
 TINY = Recipe(width=0.05, seed=4, drives=1, samples=256, rounds=1, round_drives=1, round_samples=256)
 

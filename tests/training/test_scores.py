@@ -4,12 +4,13 @@ import dataclasses
 
 import pytest
 
+import needs
 from roadproof.datatypes import Control, Weather
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.training.scores import Trial, score_drive, score_drives
 from roadproof.training.workers import Seat
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 
 SCENARIOS = builtin_scenarios()
 

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import ControllerSpec, Device, ScenarioFile, ScenarioName, SimulatorSpec, choice, weathers_of
+from roadproof.cli.options import (
+    ControllerSpec,
+    Device,
+    Processes,
+    ScenarioFile,
+    ScenarioName,
+    SimulatorSpec,
+    check_processes,
+    choice,
+    weathers_of,
+)
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
@@ -31,7 +41,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
     simulator: SimulatorSpec = "town",
     device: Device = "cpu",
-    processes: Annotated[int, typer.Option(help="Drives of the evaluation made at once.")] = 1,
+    processes: Processes = 1,
     out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
         "out/demo"
     ),
@@ -47,6 +57,7 @@ def demo(
     from roadproof.simulators.loading import open_simulator
 
     tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
+    check_processes(processes, simulator)
     spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
     spent = replace(spent, rounds=rounds, attack_weathers=weathers_of(attack_weathers, "attack-weathers"))
     space = SearchSpace(figures=figures)
@@ -89,7 +100,8 @@ def demo(
 def _film(world: Simulator, controller: Controller, result: StressTest, out: Path) -> None:
     """The clean and the painted drive side by side; composited frames beside the rendered ones."""
     from roadproof.evaluation import compare_with_rendered, rendered_frames
-    from roadproof.evaluation.result import episodes, load_paint
+    from roadproof.evaluation.episodes import load_episodes
+    from roadproof.evaluation.result import load_paint
     from roadproof.recordings import load_recordings
     from roadproof.report.film import film_trial
 
@@ -97,7 +109,7 @@ def _film(world: Simulator, controller: Controller, result: StressTest, out: Pat
     film_trial(world, evaluation, load_paint(place), place)
     recordings = load_recordings(out / "recordings")
     clean = recordings.recordings[0]
-    (driven,) = episodes(place, [evaluation.shown().clean])
+    (driven,) = load_episodes(place, [evaluation.shown().clean])
     rendered = rendered_frames(world, evaluation.scenario, driven, result.pattern, clean.frame_number)
     compared = compare_with_rendered(result.pattern, recordings, controller, rendered, drive=clean.name)
     compared.save(place / "fidelity.npz")

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import Device, DriverSpec, ScenarioFile, ScenarioName, SimulatorSpec, driver_of, weathers_of
+from roadproof.cli.options import (
+    Device,
+    DriverSpec,
+    Processes,
+    ScenarioFile,
+    ScenarioName,
+    SimulatorSpec,
+    check_processes,
+    driver_of,
+    weathers_of,
+)
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
@@ -37,7 +47,7 @@ def evaluate(
         typer.Option(help="The set attacked, to compare composites with what is rendered.", show_default=False),
     ] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
-    processes: Annotated[int, typer.Option(help="Drives made at once.")] = 1,
+    processes: Processes = 1,
     simulator: SimulatorSpec = "town",
     seed: Annotated[int, typer.Option(help="Of the first run with traffic; the others count on.")] = 0,
     device: Device = "cpu",
@@ -60,6 +70,7 @@ def evaluate(
 
     driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
     skies = weathers_of(weathers, "weathers")
+    check_processes(processes, simulator)
     figures = load_pattern(pattern) if pattern.suffix == ".json" else None
     paint = read_paint(pattern)
     if figures is None and (random or recordings):
@@ -100,9 +111,9 @@ def _compared(
 ) -> Fidelity | None:
     """The surrogate's frames beside the simulator's, where the set was recorded on this clean drive."""
     from roadproof.evaluation import compare_with_rendered, is_drive_of, rendered_frames
-    from roadproof.evaluation.result import episodes
+    from roadproof.evaluation.episodes import load_episodes
 
-    (clean,) = episodes(out, [evaluation.shown().clean])
+    (clean,) = load_episodes(out, [evaluation.shown().clean])
     drive = next((each for each in recorded.recordings if each.push == "clean"), None)
     if drive is None or not is_drive_of(drive, clean):
         return None

@@ -36,6 +36,22 @@ WeatherName: TypeAlias = Annotated[str, typer.Option(help="One of the eight, for
 SimulatorSpec: TypeAlias = Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")]
 Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
+Processes: TypeAlias = Annotated[int, typer.Option(help="Drives of the evaluation made at once.")]
+
+
+def check_processes(processes: int, simulator: str) -> None:
+    """See that several processes have a simulator each.
+
+    Raises:
+        RoadproofError: there are none, or they would share one server.
+    """
+    if processes < 1:
+        raise RoadproofError(f"--processes is {processes}, expected 1 or more")
+    if processes > 1 and simulator.startswith("carla://"):
+        raise RoadproofError(
+            f"--processes is {processes}, but all of them would step the one server of {simulator}; expected 1"
+        )
+
 
 def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:
     """The allowed word that was given.

@@ -58,7 +58,6 @@ def select(
             best=best,
             weather=recorded.weather,
             folder=run / "selection",
-            driver_name=controller,
             on_drive=show,
         )
     save_pattern(selection.pattern, run / "pattern.json")

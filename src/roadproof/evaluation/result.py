@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -314,12 +314,3 @@ def load_paint(folder: Path) -> PatternImage:
         PatternError: the file is missing or damaged.
     """
     return read_paint(folder / "paint.png")
-
-
-def episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
-    """Drives of an evaluation by file name.
-
-    Raises:
-        EpisodeError: one is missing or damaged.
-    """
-    return tuple(Episode.load(folder / "episodes" / name) for name in names)

@@ -2,28 +2,26 @@
 
 SELECTION/selection.json      every candidate driven, with what came of it
 SELECTION/pattern.json, .png  the one that was chosen
-SELECTION/episodes/*.npz      the drives: clean, and one for each candidate
-
-Every drive is kept under a name that ends in a hash of what it depends on, as those of an evaluation.
+SELECTION/episodes/*.npz      the drives: clean, and one for each candidate (`evaluation.episodes`)
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from roadproof.attacks import Candidate
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError
-from roadproof.evaluation.result import Trial, judge, trial_from_json
+from roadproof.evaluation.episodes import CLEAN, Conditions, Episodes
+from roadproof.evaluation.result import Trial, trial_from_json
 from roadproof.files import read_json, write_atomically
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
-from roadproof.rollout import Driver, Episode, rollout
-from roadproof.scenarios import Scenario, identity
+from roadproof.rollout import Episode
+from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
 FORMAT = "roadproof-selection"
@@ -117,7 +115,6 @@ def select_by_driving(
     best: int,
     weather: Weather = Weather.CLEAR_NOON,
     folder: Path,
-    driver_name: str = "",
     clean: Episode | None = None,
     on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
 ) -> Selection:
@@ -133,7 +130,6 @@ def select_by_driving(
         best: how many are driven; every group gets its share, since the surrogate does not know which side gives way.
         weather: of the drives.
         folder: keeps every drive and the choice; what it holds is not done again.
-        driver_name: what tells this controller from others that may have driven in the folder.
         clean: the drive over the bare road, where it was made already.
         on_drive: told after each drive how many are done, and the largest deviation so far.
 
@@ -145,32 +141,27 @@ def select_by_driving(
     chosen = first_of_each_group(candidates, best)
     if not chosen:
         raise RoadproofError(f"{len(candidates)} candidates and {best} of them to drive; expected at least one")
-    drive = _Drives(simulator, controller, scenario, weather, folder, driver_name)
-    files = [drive.file(f"candidate-{rank}", candidate.pattern) for rank, candidate in chosen]
+    paints = {f"candidate-{rank}": raster(candidate.pattern) for rank, candidate in chosen}
+    episodes = Episodes.of(simulator, controller, scenario, paints, folder)
+    bare = Conditions(paint=CLEAN, weather=weather)
+    over = [replace(bare, paint=name) for name in paints]
     if (folder / "selection.json").exists():
         kept = Selection.load(folder)
-        if [each.trial.painted for each in kept.driven] != files:
+        if [each.trial.painted for each in kept.driven] != [episodes.file(drive) for drive in over]:
             raise RoadproofError(
                 f"{folder} holds a choice for another attack, controller or scenario, or among more or fewer "
                 "candidates; remove it to choose again"
             )
         return kept
-    calls, clean_file = int(clean is None), drive.file("clean", None)
-    if clean is not None and not drive.path(clean_file).exists():
-        clean.save(drive.path(clean_file))
-    clean = drive(clean_file, None)
+    calls = int(clean is None)
+    if clean is not None:
+        episodes.put(bare, clean)
+    episodes.make(simulator, bare)
     on_drive(1, 0.0)
     driven: list[Driven] = []
-    for (rank, candidate), file in zip(chosen, files, strict=True):
-        trial = judge(
-            clean,
-            drive(file, candidate.pattern),
-            scenario.canvas,
-            pattern=f"candidate-{rank}",
-            clean_file=clean_file,
-            painted_file=file,
-        )
-        driven.append(Driven(group=candidate.group, rank=rank, trial=trial))
+    for (rank, candidate), drive in zip(chosen, over, strict=True):
+        episodes.make(simulator, drive)
+        driven.append(Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, drive)))
         on_drive(1 + len(driven), max(each.trial.deviation_m for each in driven))
     winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
     selection = Selection(
@@ -192,33 +183,3 @@ def first_of_each_group(candidates: Sequence[Candidate], count: int) -> list[tup
         placed.append((seen[candidate.group], rank, candidate))
     kept = sorted(placed, key=lambda each: each[:2])[:count]
     return sorted(((rank, candidate) for _, rank, candidate in kept), key=lambda each: each[0])
-
-
-@dataclass(frozen=True, slots=True)
-class _Drives:
-    """Drives a scenario over patterns; what is in the folder already is read."""
-
-    simulator: Simulator
-    driver: Controller | Driver[Simulator]
-    scenario: Scenario
-    weather: Weather
-    folder: Path
-    driver_name: str
-
-    def file(self, name: str, pattern: Pattern | None) -> str:
-        """What a drive is called."""
-        painted = b"" if pattern is None else raster(pattern).tobytes()
-        inputs = [identity(self.scenario), self.weather, self.driver_name, hashlib.sha256(painted).hexdigest()]
-        return f"{name}-{hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:12]}.npz"
-
-    def path(self, file: str) -> Path:
-        """Where it is kept."""
-        return self.folder / "episodes" / file
-
-    def __call__(self, file: str, pattern: Pattern | None) -> Episode:
-        path = self.path(file)
-        if path.exists():
-            return Episode.load(path)
-        episode = rollout(self.simulator, self.driver, self.scenario, weather=self.weather, pattern=pattern)
-        episode.save(path)
-        return episode

@@ -15,7 +15,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from roadproof.datatypes import Control, Observation
-from roadproof.evaluation.result import Evaluation, episodes, path_of
+from roadproof.evaluation.episodes import load_episodes
+from roadproof.evaluation.result import Evaluation, path_of
 from roadproof.files import write_atomically
 from roadproof.metrics import lateral_m, passage
 from roadproof.report.words import in_words
@@ -85,7 +86,7 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
         OutputError: the folder cannot be written.
     """
     trial = evaluation.shown()
-    clean, painted = episodes(folder, (trial.clean, trial.painted))
+    clean, painted = load_episodes(folder, (trial.clean, trial.painted))
     bare = _pictures(simulator, evaluation.scenario, clean, None)
     driven = _pictures(simulator, evaluation.scenario, painted, paint)
     beside = lateral_m(path_of(clean), path_of(painted))

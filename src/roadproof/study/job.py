@@ -49,8 +49,9 @@ from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme
 from roadproof.evaluation import DrivenObjective, Evaluation, evaluate
+from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.objective import Measure
-from roadproof.evaluation.result import Trial, episodes, path_of
+from roadproof.evaluation.result import Trial, path_of
 from roadproof.evaluation.selection import first_of_each_group
 from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.patterns import Pattern, save_pattern
@@ -121,7 +122,7 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         search = _by_gradient if job.method.search == "gradopt" else _by_black_box
         found = search(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
-        (clean,) = episodes(scratch / "evaluation", [parts[0].shown().clean])
+        (clean,) = load_episodes(scratch / "evaluation", [parts[0].shown().clean])
         seen = views(world, job.scenario, found.pattern, clean, job.weathers)
     costs = {
         "search_calls": found.calls,
@@ -337,7 +338,7 @@ def _evaluate(
 
 def _paths(evaluation: Evaluation, folder: Path) -> bytes:
     trial = evaluation.shown()
-    clean, painted = episodes(folder, [trial.clean, trial.painted])
+    clean, painted = load_episodes(folder, [trial.clean, trial.painted])
     packed = io.BytesIO()
     np.savez_compressed(packed, clean_xy=path_of(clean), painted_xy=path_of(painted))
     return packed.getvalue()

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import needs
 from carla_serving import serving
 from paint_shy import just_before_the_canvas
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 from roadproof.attacks import Schedule
 from roadproof.calibration import load_report
@@ -26,7 +27,8 @@ from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Trial, compare_with_rendered, rendered_frames
-from roadproof.evaluation.result import episodes, judge, path_of
+from roadproof.evaluation.episodes import load_episodes
+from roadproof.evaluation.result import judge, path_of
 from roadproof.geometry import CameraModel, CropResize
 from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.metrics import lateral_m
@@ -72,7 +74,7 @@ def run(world, folder, pattern=None):
     )
     pattern = result.selection.pattern if pattern is None else pattern
     recordings = load_recordings(folder / "recordings")
-    (clean,) = episodes(folder / "evaluation", [result.evaluation.shown().clean])
+    (clean,) = load_episodes(folder / "evaluation", [result.evaluation.shown().clean])
     recorded = recordings.recordings[0]
     rendered = rendered_frames(world, SCENARIO, clean, pattern, recorded.frame_number)
     fidelity = compare_with_rendered(pattern, recordings, controller, rendered, drive=recorded.name)

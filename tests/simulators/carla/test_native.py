@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+import needs
 from carla_serving import serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 from roadproof.datatypes import Control, VehicleState
 from roadproof.errors import SimulatorError

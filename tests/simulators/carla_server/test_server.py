@@ -10,10 +10,11 @@ import time
 import numpy as np
 import pytest
 
+import needs
 from carla_serving import free_port, serving, straight_map
 
 carla = pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 
 PATIENCE_S = 60.0

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
+import needs
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CameraModel
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.town.agent_nodes import in_view
 
 STEEP = CameraModel(width_px=640, height_px=480, fov_deg=60.0, forward_m=1.0, left_m=0.4, up_m=3.0, pitch_deg=-50.0)

@@ -1,13 +1,12 @@
 """The expert in the town itself: its physics, its traffic, its judge."""
 
-from collections.abc import Iterator
-
 import pytest
 
+import needs
 from roadproof.datatypes import Event
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.town import physics
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training import expert as driver
@@ -15,12 +14,6 @@ from roadproof.training.expert import Expert
 
 SCENARIOS = builtin_scenarios()
 FEW = [find_scenario(name, SCENARIOS) for name in ("straight-16", "left-03", "left-12", "right-07", "right-11")]
-
-
-@pytest.fixture(scope="module")
-def town() -> Iterator[TownSimulator]:
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 def driven(town: TownSimulator, scenario: Scenario, agents: int, seed: int) -> tuple[bool, list[Event], float]:

@@ -3,9 +3,10 @@ import math
 import numpy as np
 import pytest
 
+import needs
 from roadproof.datatypes import Control, EventKind, VehicleState
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.town.judge import Judge, people_hit
 from roadproof.simulators.town.maps import load_map
 from roadproof.simulators.town.meshes import Pose

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import needs
 from roadproof.datatypes import Command, Control, VehicleState, Weather
 from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.geometry import (
@@ -22,7 +23,7 @@ from roadproof.geometry import (
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from town_driving import drive, fingerprint
 
-pytest.importorskip("panda3d", reason="the town needs the extra roadproof[town]")
+needs.town()
 from roadproof.simulators.protocol import Simulator
 from roadproof.simulators.town import engine
 from roadproof.simulators.town.simulator import TownSimulator
@@ -30,12 +31,6 @@ from roadproof.simulators.town.simulator import TownSimulator
 SCENARIOS = builtin_scenarios()
 STRAIGHT = find_scenario("straight-01", SCENARIOS)
 LEFT = find_scenario("left-05", SCENARIOS)
-
-
-@pytest.fixture(scope="module")
-def town():
-    with TownSimulator() as simulator:
-        yield simulator
 
 
 def before_canvas(scenario, distance_m, aside_m=0.0, turned_rad=0.0):

@@ -1,0 +1,31 @@
+"""The checks of types and shapes do check: a test that passes under them says something."""
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from roadproof.coverage import Shape
+from roadproof.datatypes import Control
+from roadproof.geometry import CameraModel
+from roadproof.metrics import deviation_m, mean_95
+from roadproof.patterns import Pattern
+
+
+def test_a_wrong_type_is_refused():
+    with pytest.raises(TypeCheckError, match="steer"):
+        Control("left")
+    with pytest.raises(TypeCheckError, match="values"):
+        mean_95(3)
+    with pytest.raises(TypeCheckError, match="width_px"):
+        CameraModel(width_px="wide", height_px=480, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
+
+
+def test_a_wrong_shape_is_refused():
+    with pytest.raises(TypeCheckError, match="deviation_m"):
+        deviation_m(np.zeros((4, 3)), np.zeros((4, 2)))
+
+
+def test_a_name_in_shapes_means_one_size_throughout_a_call():
+    with pytest.raises(TypeCheckError, match="k=2"):
+        Pattern((Shape.RECTANGLE,) * 2, torch.zeros(2, 5), torch.zeros(3, 3))
