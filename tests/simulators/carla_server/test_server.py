@@ -2,7 +2,9 @@
 
 import contextlib
 import queue
+import select
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -15,7 +17,7 @@ from carla_serving import free_port, serving, straight_map
 
 carla = pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
-pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
+msgpack = pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 
 PATIENCE_S = 60.0
 LISTENING = []
@@ -252,6 +254,29 @@ def test_another_map_is_loaded_and_an_unknown_one_refused(client, world):
     again = client.reload_world(False)
     assert again.id != world.id
     assert again.get_map().name == "Carla/Maps/street"
+
+
+def test_that_the_map_is_another_is_told_with_the_next_tick_and_once(port, world):
+    # Told with the answer, it reaches a client that is about to open its stream anew, which ends with the process.
+    calls, stream = (socket.create_connection(("127.0.0.1", each), timeout=PATIENCE_S) for each in (port, port + 1))
+
+    def call(name, *arguments):
+        calls.sendall(msgpack.packb([0, 1, name, [[False], *arguments]]))
+        assert calls.recv(4096)
+
+    def told():
+        (size,) = struct.unpack("<I", stream.recv(4, socket.MSG_WAITALL))
+        return struct.unpack_from("<Qdf3ii", stream.recv(size, socket.MSG_WAITALL), 48)[::6]
+
+    with calls, stream:
+        stream.sendall(struct.pack("<I", 1))
+        assert told() == (world.id, 0)
+        call("load_new_episode", "", False, 0)
+        assert not select.select([stream], [], [], 0.3)[0]
+        call("tick_cue")
+        assert told() == (world.id + 1, 1)
+        call("tick_cue")
+        assert told() == (world.id + 1, 0)
 
 
 def test_a_call_it_does_not_know_is_refused(world):

@@ -40,10 +40,10 @@ class Calls:
     Args:
         world: what is served.
         port: of the calls; streams are on the next.
-        advance: takes a step, or only shows the world as it is now where another map was loaded.
+        advance: takes a step.
     """
 
-    def __init__(self, world: World, port: int, advance: Callable[..., None]) -> None:
+    def __init__(self, world: World, port: int, advance: Callable[[], None]) -> None:
         self._world, self._port, self._advance = world, port, advance
         self._managers: dict[int, Value] = {}
 
@@ -87,8 +87,6 @@ class Calls:
         self._world.load(name.rsplit("/", 1)[-1] or here)
         if reset_settings:
             self._world.set_settings(list(SETTINGS))
-        # At once: the client waits for the first state of the new episode.
-        self._advance(changed=True)
         return DONE
 
     def call_get_map_info(self) -> Value:

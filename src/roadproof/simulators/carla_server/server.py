@@ -30,6 +30,7 @@ class Server:
 
     def __init__(self, world: World, port: int) -> None:
         self._world, self._port = world, port
+        self._told = world.episode
         self._listeners: dict[int, list[asyncio.StreamWriter]] = {}
         self._calls = Calls(world, port, self.advance)
 
@@ -50,17 +51,24 @@ class Server:
                     ) from error
             ready()
             while True:
+                episode = self._world.episode
                 await asyncio.sleep(FREE_RUN_S)
-                if not self._world.settings[SYNCHRONOUS] and self._listeners.get(WORLD_STREAM):
+                free = not self._world.settings[SYNCHRONOUS] and self._world.episode == episode
+                if free and self._listeners.get(WORLD_STREAM):
                     self.advance()
 
-    def advance(self, *, changed: bool = False) -> None:
-        """Take a step and tell everyone; a world that has just changed is shown as it is."""
-        hits = [] if changed else self._world.step()
+    def advance(self) -> None:
+        """Take a step and tell everyone, the first time on another map also that it is another.
+
+        Never with the answer to the call that loads it: the client opens its stream anew then, and one of version
+        0.9.16 dies if news of another map come through the old one meanwhile. CARLA itself takes longer to load.
+        """
+        hits = self._world.step()
+        changed, self._told = self._told != self._world.episode, self._world.episode
         for sensor in list(self._world.actors.values()):
             if not self._listeners.get(sensor.stream):
                 continue
-            if sensor.name in CAMERAS and not self._world.settings[NO_RENDERING] and not changed:
+            if sensor.name in CAMERAS and not self._world.settings[NO_RENDERING]:
                 self.send(sensor.stream, picture_message(self._world, sensor))
             elif sensor.name == COLLISION_SENSOR:
                 for hit in hits:
