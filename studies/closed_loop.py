@@ -22,11 +22,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import platform
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,6 +45,7 @@ from roadproof.ledger import StageCost
 from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.metrics import mean_95
 from roadproof.patterns import Pattern
+from roadproof.processes import processes_beside
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
@@ -295,7 +295,7 @@ def main() -> None:
     ]
     began = time.perf_counter()
     rows: dict[Cell, list[Row]] = {}
-    with ProcessPoolExecutor(arguments.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with processes_beside(arguments.processes) as pool:
         running = {pool.submit(rows_of, cell): cell for cell in cells}
         for done in as_completed(running):
             cell = running[done]

@@ -5,10 +5,9 @@ evaluation = evaluate(TownSimulator, controller, scenario, pattern, folder=Path(
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import wait
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from roadproof.errors import EpisodeError, PatternError
 from roadproof.evaluation.episodes import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
 from roadproof.evaluation.result import ATTACK, Evaluation
 from roadproof.patterns import Pattern, raster
+from roadproof.processes import processes_beside
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -155,9 +155,7 @@ def _make_together(
 ) -> None:
     """Deal the drives out to processes; what is done shows in the folder."""
     shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
-    # Spawned, since graphics and torch's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(len(shares), mp_context=context) as pool:
+    with processes_beside(len(shares)) as pool:
         running = [pool.submit(_make_share, opening, episodes, share) for share in shares]
         while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
             on_done(sum(episodes.has(drive) for drive in drives))

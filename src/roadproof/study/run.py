@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.files import check_writable
 from roadproof.memory import keep_freed_memory
+from roadproof.processes import processes_beside
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import JobResult, failed, is_done, write_result, write_table
 
@@ -89,7 +88,7 @@ def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int
 
 
 def _in_own_process(job: Job, scratch: Path, work: Work, threads: int) -> tuple[Job, JobResult]:
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_process, (threads,)) as process:
+    with processes_beside(1, _begin_process, threads) as process:
         try:
             return job, process.submit(_attempt, job, scratch, work).result()
         except BrokenProcessPool:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from functools import cached_property
 from typing import TypeVar
@@ -13,6 +12,7 @@ import torch
 
 from roadproof.controllers import Controller, load_controller
 from roadproof.errors import SimulatorError
+from roadproof.processes import processes_beside
 from roadproof.simulators.town.simulator import TownSimulator
 
 Work = TypeVar("Work")
@@ -72,10 +72,7 @@ def spread(
         finally:
             seat.close()
         return
-    # Started afresh: a forked process would share the simulator's threads and torch's.
-    context = multiprocessing.get_context("spawn")
-    count = min(processes, len(works))
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_sit_down, initargs=(seat,)) as pool:
+    with processes_beside(min(processes, len(works)), _sit_down, seat) as pool:
         waiting = {pool.submit(_call, function, work): work for work in works}
         try:
             for future in as_completed(waiting):

@@ -1,0 +1,37 @@
+"""Processes that work beside this one."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+
+
+def processes_beside(count: int, begin: Callable[..., object] | None = None, *arguments: object) -> ProcessPoolExecutor:
+    """A pool of fresh processes that end with this one, however it ends.
+
+    Fresh, since graphics and torch's threads do not survive a fork. One that outlived its parent would go on writing to
+    the folder in which the next run goes on.
+
+    Args:
+        count: how many.
+        begin: called in each before its first work; a function of a module.
+        arguments: of it.
+    """
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(begin, arguments))
+
+
+def _begin(begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if begin is not None:
+        begin(*arguments)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
