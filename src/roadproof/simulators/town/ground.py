@@ -8,6 +8,7 @@ Convention:
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from PIL import Image, ImageChops, ImageDraw, ImageFilter
 
 from roadproof.simulators.town.lanes import Lane
 from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.scenery import Scenery
+from roadproof.simulators.town.scenery import Scenery, Tree
 from roadproof.simulators.town.textures import fractal_noise
 from roadproof.simulators.town.weather import Sky
 
@@ -27,6 +28,7 @@ NOISE_M = 64.0
 UNIT = 190
 WET_FROM = 0.3
 EDGE_M = 0.4
+TUFTS = 22
 
 ASPHALT, SHOULDER, PAVEMENT, LAWN = (108, 107, 107), (114, 113, 111), (176, 172, 164), (90, 108, 60)
 KINDS = (LAWN, PAVEMENT, SHOULDER, ASPHALT)
@@ -85,7 +87,7 @@ class _Canvas:
         return Image.new("L", (self.shape[1], self.shape[0]), 0)
 
     def points(self, world: np.ndarray) -> list[tuple[float, float]]:
-        return [(float(x), float(y)) for x, y in (world[:, :2] - self.low) / self.pixel_m - 0.5]
+        return [(x, y) for x, y in ((world[:, :2] - self.low) / self.pixel_m - 0.5).tolist()]
 
     def outlines(self, lanes: list[Lane], width_m: float) -> Plane:
         """The inner borders of lanes as soft lines, in [0, 1]."""
@@ -292,15 +294,11 @@ def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> 
         if solid.casts_shadow:
             base = solid.corners
             pen.polygon(canvas.points(_hull(np.concatenate([base, base + run * solid.height_m]))), fill=255)
-    rng = np.random.default_rng(seed)
-    for tree in scenery.trees:
+    crowns = _crowns(scenery.trees, run, np.random.default_rng(seed))
+    for tree, (centres, radii) in zip(scenery.trees, crowns, strict=True):
         foot = np.array([tree.x_m, tree.y_m])
         pen.line(canvas.points(np.stack([foot, foot + run * 0.45 * tree.height_m])), fill=255, width=1)
-        for _ in range(22):
-            height = tree.height_m * rng.uniform(0.42, 0.92)
-            angle, spread = rng.uniform(0, 2 * math.pi), 0.34 * tree.height_m * math.sqrt(rng.random())
-            centre = foot + run * height + spread * np.array([math.cos(angle), math.sin(angle)])
-            (x, y), r = canvas.points(centre[None])[0], tree.height_m * rng.uniform(0.04, 0.10) / COARSE_M
+        for (x, y), r in zip(canvas.points(centres), (radii / COARSE_M).tolist(), strict=True):
             pen.ellipse((x - r, y - r, x + r, y + r), fill=225)
     soft = image.filter(ImageFilter.GaussianBlur(sky.shadow_blur_m / COARSE_M))
     sunlit = 255 - np.asarray(soft)
@@ -322,6 +320,18 @@ def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> 
     )
 
 
+def _crowns(
+    trees: Sequence[Tree], run: Vector, rng: np.random.Generator
+) -> Iterator[tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]]:
+    """Where the shadows of each tree's tufts lie, and their radii, in metres."""
+    drawn = rng.random((len(trees), TUFTS, 4))
+    for tree, (up, round_about, out, wide) in zip(trees, drawn.transpose(0, 2, 1), strict=True):
+        height, angle = tree.height_m * (0.42 + 0.50 * up), 2 * math.pi * round_about
+        spread = 0.34 * tree.height_m * np.sqrt(out)
+        aside = spread[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        yield np.array([tree.x_m, tree.y_m]) + run * height[:, None] + aside, tree.height_m * (0.04 + 0.06 * wide)
+
+
 def paved_damp(wetness: float) -> float:
     """What wetness multiplies the colour of paved ground with."""
     return 1 - 0.34 * wetness
@@ -340,17 +350,16 @@ def _damp(ground: Ground, wetness: float) -> Image.Image:
 def _hull(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """Convex hull, by Andrew's monotone chain."""
     ordered = sorted((float(x), float(y)) for x, y in points)
-
-    def half(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        kept: list[tuple[float, float]] = []
-        for p in sequence:
-            while len(kept) > 1 and _turn(kept[-2], kept[-1], p) <= 0:
-                kept.pop()
-            kept.append(p)
-        return kept[:-1]
-
-    return np.array(half(ordered) + half(ordered[::-1]))
+    return np.array(_half_hull(ordered) + _half_hull(ordered[::-1]))
 
 
-def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+def _half_hull(ordered: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    kept: list[tuple[float, float]] = []
+    for x, y in ordered:
+        while len(kept) > 1:
+            (ax, ay), (bx, by) = kept[-2:]
+            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                break
+            kept.pop()
+        kept.append((x, y))
+    return kept[:-1]
