@@ -129,5 +129,6 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job
 
 
 def _on_node(job: Job, work: Work) -> JobResult:
+    keep_freed_memory()
     # What a job keeps to go on from stays on its node; its result travels.
     return _attempt(job, Path(tempfile.gettempdir()) / "roadproof-study" / job.key, work)
