@@ -57,6 +57,7 @@ class Episodes:
         driver: who drives.
         scenario: where.
         paints: what is painted, by name.
+        digests: hash of each of them, and of none for the bare road.
         folder: they are in its folder "episodes".
         common: all that every drive depends on, as text.
     """
@@ -64,6 +65,7 @@ class Episodes:
     driver: AnyDriver
     scenario: Scenario
     paints: Mapping[str, PatternImage]
+    digests: Mapping[str, str]
     folder: Path
     common: str
 
@@ -76,13 +78,19 @@ class Episodes:
         folder: Path,
     ) -> Episodes:
         """Those that a driver makes in a simulator."""
-        common = _identity(simulator, driver, scenario)
-        return Episodes(driver=driver, scenario=scenario, paints=paints, folder=folder, common=common)
+        hashed = {name: paint.tobytes() for name, paint in paints.items()} | {CLEAN: b""}
+        return Episodes(
+            driver=driver,
+            scenario=scenario,
+            paints=paints,
+            digests={name: hashlib.sha256(content).hexdigest() for name, content in hashed.items()},
+            folder=folder,
+            common=_identity(simulator, driver, scenario),
+        )
 
     def file(self, drive: Conditions) -> str:
         """What it is called."""
-        painted = b"" if drive.paint == CLEAN else self.paints[drive.paint].tobytes()
-        told = [self.common, hashlib.sha256(painted).hexdigest()]
+        told = [self.common, self.digests[drive.paint]]
         told += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
         among = f"traffic-{drive.seed}" if drive.cars + drive.pedestrians else "alone"
         ending = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:12]
