@@ -154,7 +154,7 @@ def select_by_driving(
             )
         return kept
     calls = int(clean is None)
-    if clean is not None:
+    if clean is not None and not episodes.has(bare):
         episodes.put(bare, clean)
     episodes.make(simulator, bare)
     on_drive(1, 0.0)
