@@ -48,7 +48,7 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
         (["--attack-weathers", "clear-noon,rainy-noon", "--budget", "paper"], "choose two-paint"),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
-        (["--processes", "0"], "--processes is 0, expected 1 or more"),
+        (["--processes", "0"], "0 processes; expected 1"),
         (["--processes", "2", "--simulator", "carla://localhost:2000"], "would step the one server"),
     ):
         code, printed = demo(*options, "--out", tmp_path)

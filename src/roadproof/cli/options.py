@@ -43,10 +43,8 @@ def check_processes(processes: int, simulator: str) -> None:
     """See that several processes have a simulator each.
 
     Raises:
-        RoadproofError: there are none, or they would share one server.
+        RoadproofError: they would share one server.
     """
-    if processes < 1:
-        raise RoadproofError(f"--processes is {processes}, expected 1 or more")
     if processes > 1 and simulator.startswith("carla://"):
         raise RoadproofError(
             f"--processes is {processes}, but all of them would step the one server of {simulator}; expected 1"
