@@ -67,7 +67,8 @@ def run_study(
 
 
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
-    """A job's result, whatever it raises: one bad job must not stop the night."""
+    """A job's result, whatever it raises: one bad job must not stop the night. The process is the job's own."""
+    keep_freed_memory()
     try:
         scratch.mkdir(parents=True, exist_ok=True)
         return work(job, scratch)
@@ -98,7 +99,6 @@ def _in_own_process(job: Job, scratch: Path, work: Work, threads: int) -> tuple[
 def _begin_process(threads: int) -> None:
     # Before torch is imported; workers that each took all cores would only get in each other's way.
     os.environ["OMP_NUM_THREADS"] = str(threads)
-    keep_freed_memory()
 
 
 def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job, JobResult]]:
@@ -129,6 +129,5 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job
 
 
 def _on_node(job: Job, work: Work) -> JobResult:
-    keep_freed_memory()
     # What a job keeps to go on from stays on its node; its result travels.
     return _attempt(job, Path(tempfile.gettempdir()) / "roadproof-study" / job.key, work)
