@@ -31,7 +31,6 @@ from roadproof.simulators.town.simulator import TownSimulator
 SCENARIOS = builtin_scenarios()
 STRAIGHT = find_scenario("straight-01", SCENARIOS)
 LEFT = find_scenario("left-05", SCENARIOS)
-COMPANY = {"cars": 5, "pedestrians": 5, "seed": 1}
 
 
 def before_canvas(scenario, distance_m, aside_m=0.0, turned_rad=0.0):
@@ -242,14 +241,8 @@ def test_a_transparent_pattern_looks_like_none(town):
     np.testing.assert_array_equal(town.reset(start, pattern=pattern).frame, bare)
 
 
-@pytest.fixture(scope="module")
-def in_every_weather(town):
-    """The beginning of a drive."""
-    return {weather: drive(town, LEFT, 20, weather=weather, **COMPANY) for weather in Weather}
-
-
-def test_every_weather_looks_different_and_none_is_dark_or_burnt_out(in_every_weather):
-    frames = {weather: seen[0].frame.astype(float) for weather, seen in in_every_weather.items()}
+def test_every_weather_looks_different_and_none_is_dark_or_burnt_out(town):
+    frames = {weather: town.reset(STRAIGHT, weather=weather).frame.astype(float) for weather in Weather}
     for weather, frame in frames.items():
         assert 50 < frame.mean() < 200, weather
         for other, its in frames.items():
@@ -277,26 +270,29 @@ from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.simulators.town.simulator import TownSimulator
 scenario = find_scenario("left-05", builtin_scenarios())
 with TownSimulator() as simulator:
-    for weather in sys.argv[4:]:
-        company, frames = json.loads(sys.argv[2]), int(sys.argv[3])
-        print(fingerprint(drive(simulator, scenario, frames, weather=Weather(weather), **company)))
+    for weather in sys.argv[2:]:
+        print(fingerprint(drive(simulator, scenario, 150, weather=Weather(weather), cars=5, pedestrians=5, seed=1)))
 """
 
 
-def in_another_process(frames, weathers):
+def in_another_process(weathers):
     paths = [str(Path(__file__).parents[2]), *[path for path in sys.path if path]]
-    command = [sys.executable, "-c", SCRIPT, json.dumps(paths), json.dumps(COMPANY), str(frames), *weathers]
+    command = [sys.executable, "-c", SCRIPT, json.dumps(paths), *weathers]
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=600).stdout.split()
 
 
+def assert_same_in_two_processes(town, weathers):
+    here = [fingerprint(drive(town, LEFT, 150, weather=weather, cars=5, pedestrians=5, seed=1)) for weather in weathers]
+    assert in_another_process(weathers) == here
+
+
 def test_150_frames_are_the_same_in_two_processes(town):
-    here = fingerprint(drive(town, LEFT, 150, **COMPANY))
-    assert in_another_process(150, [Weather.CLEAR_NOON]) == [here]
+    assert_same_in_two_processes(town, [Weather.CLEAR_NOON])
 
 
 @pytest.mark.slow
-def test_frames_are_the_same_in_two_processes_in_every_weather(in_every_weather):
-    assert in_another_process(20, Weather) == [fingerprint(seen) for seen in in_every_weather.values()]
+def test_150_frames_are_the_same_in_two_processes_in_every_weather(town):
+    assert_same_in_two_processes(town, list(Weather))
 
 
 def test_running_into_a_car_is_one_event(town):
