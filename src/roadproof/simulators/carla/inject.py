@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from roadproof.geometry import CANVAS_SIZE_PX, Homography
 from roadproof.simulators.protocol import PatternImage
@@ -88,20 +88,47 @@ def _mapped(
 
 
 def _averaged(
-    canvas_from_image: Homography, rows: np.ndarray, columns: np.ndarray, pattern: PatternImage
+    canvas_from_image: Homography, rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"], pattern: PatternImage
 ) -> Float[np.ndarray, "p 4"]:
     """Mean of the pattern over each pixel, colours in levels and multiplied with alpha; alpha in [0, 1]."""
+    # A transparent frame stands for all that is outside.
+    levels = np.pad(pattern, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
+    levels[..., 3] /= 255
+    levels[..., :3] *= levels[..., 3:]
+    paint, alike = _looked_up(canvas_from_image, rows, columns, levels)
+    # Most pixels see one colour alone; only the others are worth the samples.
+    mixed = np.flatnonzero(~alike)
     across = (np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS - 0.5
     down = (np.arange(SAMPLES_DOWN) + 0.5) / SAMPLES_DOWN - 0.5
     dx, dy = (axis.ravel() for axis in np.meshgrid(across, down))
-    x, y, ahead = _mapped(canvas_from_image, columns[:, None] + dx, rows[:, None] + dy)
-    inside = (ahead > 0) & (np.abs(x - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2)
-    inside &= np.abs(y - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2
-    column, row = (np.where(inside, np.rint(v), 0).astype(np.intp).clip(0, CANVAS_SIZE_PX - 1) for v in (x, y))
-    levels = pattern.astype(np.float32)
-    alpha = levels[..., 3:] / 255
-    premultiplied = np.concatenate([levels[..., :3] * alpha, alpha], axis=-1)
-    return (premultiplied[row, column] * inside[..., None]).mean(axis=1, dtype=np.float64)
+    x, y, ahead = _mapped(canvas_from_image, columns[mixed, None] + dx, rows[mixed, None] + dy)
+    seen = levels.reshape(-1, 4).take(_framed(y) * levels.shape[1] + _framed(x), axis=0)
+    paint[mixed] = (seen * (ahead > 0)[..., None]).mean(axis=1, dtype=np.float64)
+    return paint
+
+
+def _looked_up(
+    canvas_from_image: Homography,
+    rows: Int[np.ndarray, " p"],
+    columns: Int[np.ndarray, " p"],
+    levels: Float[np.ndarray, "h w 4"],
+) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:
+    """A level somewhere in each pixel, and whether all in it are the same."""
+    across, down = np.array([[-0.5, 0.5, -0.5, 0.5], [-0.5, -0.5, 0.5, 0.5]])[..., None]
+    x, y, ahead = _mapped(canvas_from_image, columns + across, rows + down)
+    (left, right), (top, bottom) = ((_framed(v.min(axis=0)), _framed(v.max(axis=0))) for v in (x, y))
+    steps = np.zeros(levels.shape[:2], np.int32)
+    steps[:-1] |= (levels[1:] != levels[:-1]).any(axis=-1)
+    steps[:, :-1] |= (levels[:, 1:] != levels[:, :-1]).any(axis=-1)
+    sums = np.pad(steps.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    within = sums[bottom + 1, right + 1] - sums[top, right + 1] - sums[bottom + 1, left] + sums[top, left]
+    return levels[top, left].astype(np.float64), (within == 0) & (ahead > 0).all(axis=0)
+
+
+def _framed(canvas_px: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+    """Indices into the canvas with a frame around it, which takes all that is outside."""
+    inside = np.nan_to_num(canvas_px, nan=-1.0).clip(-1, CANVAS_SIZE_PX)
+    return np.rint(inside).astype(np.intp) + 1
 
 
 def _light(picture: UInt8[np.ndarray, "h w 3"], asphalt: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:

@@ -12,9 +12,9 @@ from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
 from roadproof.simulators.carla_server import wire
 from roadproof.simulators.carla_server.actors import Actor, attached
-from roadproof.simulators.carla_server.world import Collision, World
+from roadproof.simulators.carla_server.world import Collision, Town, World
 from roadproof.simulators.town.agents import Agents
-from roadproof.simulators.town.labels import FAR_M, Label
+from roadproof.simulators.town.labels import FAR_M, Label, LabelledPicture
 
 MAX_SIDE_PX = 4096
 MAX_ROLL_DEG = 0.1
@@ -67,16 +67,23 @@ def picture_message(world: World, sensor: Actor) -> bytes:
     width, height, fov = _optics(sensor)
     camera = CameraModel(width_px=width, height_px=height, fov_deg=fov, up_m=0.0, pitch_deg=pitch)
     eye = VehicleState(x, -y, z, -math.radians(yaw), 0.0)
-    cars, people = (_agents(world, kind, sensor.parent) for kind in ("vehicle", "walker"))
     if sensor.name == "sensor.camera.rgb":
-        world.town.renderer.set_agents(cars, people)
+        world.town.renderer.set_agents(*_others(world, sensor))
         rgb = world.town.renderer.view(camera, eye, world.frame)
     else:
-        scene = world.town.labels()
-        scene.set_agents(cars, people)
-        seen = scene.look(camera, eye)
+        seen = _labelled(world, world.town, sensor, camera, eye)
         rgb = depth_levels(seen.depth_m) if sensor.name == "sensor.camera.depth" else label_levels(seen.labels)
     return wire.image(wire.header(wire.IMAGE, world.frame, world.time_s, pose), _bgra(rgb), fov)
+
+
+def _labelled(world: World, town: Town, sensor: Actor, camera: CameraModel, eye: VehicleState) -> LabelledPicture:
+    """Kinds and distances; depth and semantic cameras come in pairs, so the last look is kept for the other one."""
+    look = (world.episode, world.frame, sensor.parent, camera, eye)
+    if town.last_look is None or town.last_look[0] != look:
+        scene = town.labels()
+        scene.set_agents(*_others(world, sensor))
+        town.last_look = look, scene.look(camera, eye)
+    return town.last_look[1]
 
 
 def depth_levels(depth_m: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -119,8 +126,13 @@ def world_message(world: World, clock_s: float, *, changed: bool = False) -> byt
     )
 
 
+def _others(world: World, sensor: Actor) -> tuple[Agents, Agents]:
+    """All cars and people as the town draws them, but for the one who carries the camera."""
+    return _agents(world, "vehicle", sensor.parent), _agents(world, "walker", sensor.parent)
+
+
 def _agents(world: World, kind: str, without: int) -> Agents:
-    """All actors of a kind as the town draws them, but for the one who carries the camera."""
+    """All actors of a kind but one."""
     chosen = [actor for actor in world.actors.values() if actor.kind == kind and actor.id != without]
     states = [actor.state for actor in chosen]
     return Agents(

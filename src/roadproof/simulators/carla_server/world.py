@@ -22,7 +22,7 @@ from roadproof.simulators.carla_server.actors import Actor
 from roadproof.simulators.carla_server.pieces import Piece, road_pieces
 from roadproof.simulators.carla_server.wire import ORIGIN, Pose6, Value
 from roadproof.simulators.town.judge import people_hit
-from roadproof.simulators.town.labels import LabelScene
+from roadproof.simulators.town.labels import LabelledPicture, LabelScene
 from roadproof.simulators.town.maps import BUILTIN_MAPS, builtin_map_file, load_map
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
@@ -42,7 +42,11 @@ ragdolls, two distances of tiles, the spectator as ego."""
 
 @dataclass(slots=True)
 class Town:
-    """One map with all that stands on it."""
+    """One map with all that stands on it.
+
+    Args:
+        last_look: from where and when it was last seen as kinds and distances, and what was seen.
+    """
 
     name: str
     file: Path
@@ -51,6 +55,7 @@ class Town:
     renderer: Renderer
     pieces: dict[str, Piece]
     labelled: LabelScene | None = None
+    last_look: tuple[tuple[object, ...], LabelledPicture] | None = None
 
     def labels(self) -> LabelScene:
         """The map as kinds and distances; made when first asked for."""
