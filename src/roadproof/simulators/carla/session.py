@@ -52,6 +52,7 @@ class Session:
         self._lost = False
         self.painted = False
         self._last_paint: tuple[list[str], UInt8[np.ndarray, "h w 3"]] | None = None
+        self._texture: tuple[carla.TextureColor, UInt8[np.ndarray, "h w 3"]] | None = None
         self._actors: list[carla.Actor] = []
         self._maps: dict[str, RoadMap] = {}
         self.client = carla.Client(host, port, worker_threads=1)
@@ -145,17 +146,30 @@ class Session:
         last = self._last_paint
         if last is not None and last[0] == wanted and np.array_equal(last[1], picture):
             return
-        height, width = picture.shape[:2]
-        texture, put = carla.TextureColor(width, height), carla.Color(0, 0, 0, 255)
-        for row, line in enumerate(picture.tolist()):
-            for column, (put.r, put.g, put.b) in enumerate(line):
-                texture.set(column, row, put)
+        texture = self._textured(picture)
         self.painted, self._last_paint = True, None
         self.patiently(
             "a texture",
             lambda: self.world.apply_color_texture_to_objects(wanted, carla.MaterialParameter.Diffuse, texture),
         )
         self._last_paint = wanted, picture
+
+    def _textured(self, picture: UInt8[np.ndarray, "h w 3"]) -> carla.TextureColor:
+        """A picture as the client takes it: a pixel at a time, so those that are as before are left."""
+        if self._texture is None or self._texture[1].shape != picture.shape:
+            height, width = picture.shape[:2]
+            texture, changed = carla.TextureColor(width, height), np.ones((height, width), bool)
+        else:
+            texture, before = self._texture
+            changed = (picture != before).any(axis=-1)
+        put = carla.Color(0, 0, 0, 255)
+        rows, columns = np.nonzero(changed)
+        for row, column, (put.r, put.g, put.b) in zip(
+            rows.tolist(), columns.tolist(), picture[changed].tolist(), strict=True
+        ):
+            texture.set(column, row, put)
+        self._texture = texture, picture.copy()
+        return texture
 
     def keep(self, actor: carla.Actor) -> None:
         """Destroy an actor at the end of the drive."""
