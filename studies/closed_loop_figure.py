@@ -29,18 +29,22 @@ WAYS = {
 
 
 def draw(axes: Axes, controller: str, rows: list[dict[str, Any]], scenarios: list[str]) -> None:
-    """One controller: a line for each scenario, and a bar for the mean."""
+    """One controller: a line for each scenario, a stroke from seed to seed, and a bar for the mean."""
     for number, scenario in enumerate(scenarios):
-        got = {row["method"]: row["deviation_m"] for row in rows if row["scenario"] == scenario}
-        at = [index for index, way in enumerate(WAYS) if way in got]
-        values = [got[way] for way in WAYS if way in got]
+        here = [row for row in rows if row["scenario"] == scenario]
+        got = {way: [row["deviation_m"] for row in here if row["method"] == way] for way in WAYS}
+        at = [index for index, way in enumerate(WAYS) if got[way]]
+        values = [values for values in got.values() if values]
         colour = COLOURS[number % len(COLOURS)]
         marker = MARKERS[number % len(MARKERS)]
-        axes.plot(at, values, color=colour, marker=marker, markersize=5, linewidth=0.9, alpha=0.85, label=scenario)
+        means = [np.mean(each) for each in values]
+        axes.plot(at, means, color=colour, marker=marker, markersize=5, linewidth=0.9, alpha=0.85, label=scenario)
+        axes.vlines(at, [min(each) for each in values], [max(each) for each in values], color=colour, alpha=0.5)
     for index, way in enumerate(WAYS):
         mean = np.mean([row["deviation_m"] for row in rows if row["method"] == way])
         axes.plot([index - 0.3, index + 0.3], [mean, mean], color="black", linewidth=2.2, zorder=3)
-    axes.set_title(controller, fontsize=11)
+    seeds = len({row["seed"] for row in rows})
+    axes.set_title(controller if seeds == 1 else f"{controller}, {seeds} seeds", fontsize=11)
     axes.set_xticks(range(len(WAYS)), list(WAYS.values()), fontsize=7.5)
     axes.grid(axis="y", color=RULE)
     axes.tick_params(colors=MUTED)
