@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -58,8 +59,9 @@ class Ground:
     open_sky: UInt8[np.ndarray, "h w"]
 
 
+@lru_cache(maxsize=2)
 def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50) -> Ground:
-    """Draw the ground of a map; its extent is a whole number of cells."""
+    """Draw the ground of a map; its extent is a whole number of cells. Kept, so that the next call is free."""
     x0, y0, x1, y1 = roads.bounds_m
     low = (math.floor((x0 - BORDER_M) / cell_m) * cell_m, math.floor((y0 - BORDER_M) / cell_m) * cell_m)
     size = (
