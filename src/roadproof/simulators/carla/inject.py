@@ -102,8 +102,8 @@ def _averaged(
     down = (np.arange(SAMPLES_DOWN) + 0.5) / SAMPLES_DOWN - 0.5
     dx, dy = (axis.ravel() for axis in np.meshgrid(across, down))
     x, y, ahead = _mapped(canvas_from_image, columns[mixed, None] + dx, rows[mixed, None] + dy)
-    seen = levels.reshape(-1, 4).take(_framed(y) * levels.shape[1] + _framed(x), axis=0)
-    paint[mixed] = (seen * (ahead > 0)[..., None]).mean(axis=1, dtype=np.float64)
+    seen = levels[_framed(y), _framed(x)] * (ahead > 0)[..., None]
+    paint[mixed] = seen.mean(axis=1, dtype=np.float64)
     return paint
 
 
