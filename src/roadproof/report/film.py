@@ -34,6 +34,7 @@ STRIP_COLUMNS = 6
 STRIP_SIZE = (400, 300)
 STRIP_HORIZON_M = 14.0
 EVENT_SHOWN_S = 3.0
+STANDS_MPS = 0.1
 INK, PAPER, FAINT, CLEAN, PAINTED = (30, 33, 38), (250, 249, 246), (110, 114, 120), (36, 92, 168), (184, 58, 26)
 
 
@@ -97,8 +98,8 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     Strip(
         time_s=painted.time_s[steps],
         lateral_m=beside[steps],
-        clean=_reduced([bare[k] for k in steps]),
-        painted=_reduced([driven[k] for k in steps]),
+        clean=_reduced([bare[min(k, len(bare) - 1)] for k in steps]),
+        painted=_reduced([driven[min(k, len(driven) - 1)] for k in steps]),
     ).save(folder / STRIP)
     pages = _Pages(clean, painted, beside, bare, driven)
     middle = int(np.abs(beside[: last + 1]).argmax())
@@ -113,8 +114,13 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
 
 
 def _pictures(simulator: Simulator, scenario: Scenario, episode: Episode, paint: PatternImage | None) -> list[bytes]:
-    """The camera's pictures of a drive as JPEG, which is a tenth of the memory."""
+    """The camera's pictures of a drive as JPEG, which is a tenth of the memory.
+
+    A car that stands for good, at a rail until its time is up, say, is shown for a moment only.
+    """
     kept: list[bytes] = []
+    moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
+    enough = int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s) if moving.size else 1
 
     def keep(seen: Observation, _: Control | None) -> None:
         picture = Image.fromarray(seen.shown)
@@ -133,6 +139,7 @@ def _pictures(simulator: Simulator, scenario: Scenario, episode: Episode, paint:
         seed=episode.seed,
         full_pictures=True,
         on_step=keep,
+        until=lambda _: len(kept) >= enough,
     )
     return kept
 

@@ -1,0 +1,38 @@
+"""The film of two drives."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import needs
+from short_drive import SHORT
+
+needs.town()
+av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
+from roadproof.coverage import Shape
+from roadproof.datatypes import Control, Weather
+from roadproof.evaluation import evaluate
+from roadproof.evaluation.episodes import load_episodes
+from roadproof.patterns import Pattern
+from roadproof.report.film import EVENT_SHOWN_S, film_trial
+
+PATTERN = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+
+
+def stops_for_good(_):
+    """Drives over the canvas, and then stands until its time is up."""
+    return lambda seen: Control(steer=0.0, throttle=0.6) if seen.time_s < 2.0 else Control(steer=0.0, brake=1.0)
+
+
+def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town, tmp_path):
+    scenario = dataclasses.replace(SHORT, time_limit_s=10.0)
+    done = evaluate(town, stops_for_good, scenario, PATTERN, folder=tmp_path, weathers=(Weather.CLEAR_NOON,), runs=0)
+    (drive,) = load_episodes(tmp_path, [done.shown().painted])
+    assert film_trial(town, done, np.zeros((400, 400, 4), np.uint8), tmp_path)
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        frames = sum(1 for _ in film.decode(video=0))
+    stood_at = int(np.flatnonzero(drive.speed_mps > 0.1)[-1])
+    assert stood_at + EVENT_SHOWN_S / drive.dt_s <= frames <= stood_at + EVENT_SHOWN_S / drive.dt_s + 3
+    assert frames < len(drive) - 20
