@@ -66,7 +66,8 @@ class Budget:
             in the first. By default the first of `weathers` alone.
 
     Raises:
-        RoadproofError: rounds without candidates to drive, or several weathers with colours that hold in one alone.
+        RoadproofError: rounds without candidates to drive, a number of them below 0, or several weathers with colours
+            that hold in one alone.
     """
 
     deviations_m: tuple[float, ...] = (1.5,)
@@ -84,6 +85,10 @@ class Budget:
     noise_deg: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
+        if min(self.rounds, self.select, self.runs) < 0:
+            raise RoadproofError(
+                f"{self.rounds} rounds, {self.select} candidates driven, {self.runs} runs in traffic; expected ≥ 0"
+            )
         if self.rounds and not self.select:
             raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
         if len(self.recorded_in) > 1 and self.calibration is Method.PUBLISHED:
