@@ -98,8 +98,8 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     Strip(
         time_s=painted.time_s[steps],
         lateral_m=beside[steps],
-        clean=_reduced([bare[min(k, len(bare) - 1)] for k in steps]),
-        painted=_reduced([driven[min(k, len(driven) - 1)] for k in steps]),
+        clean=_reduced([_shown(bare, k) for k in steps]),
+        painted=_reduced([_shown(driven, k) for k in steps]),
     ).save(folder / STRIP)
     pages = _Pages(clean, painted, beside, bare, driven)
     middle = int(np.abs(beside[: last + 1]).argmax())
@@ -144,6 +144,11 @@ def _pictures(simulator: Simulator, scenario: Scenario, episode: Episode, paint:
     return kept
 
 
+def _shown(pictures: Sequence[bytes], step: int) -> bytes:
+    """The picture of a step; after the last one, that."""
+    return pictures[min(step, len(pictures) - 1)]
+
+
 def _opened(picture: bytes) -> Image.Image:
     return Image.open(io.BytesIO(picture)).convert("RGB")
 
@@ -178,7 +183,7 @@ class _Pages:
         pen = ImageDraw.Draw(page)
         for column, (episode, pictures, title, colour) in enumerate(self._sides):
             left, k = column * VIEW[0], min(step, len(pictures) - 1)
-            page.paste(_opened(pictures[k]), (left, CAPTION_PX))
+            page.paste(_opened(_shown(pictures, step)), (left, CAPTION_PX))
             pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=colour)
             pen.text((left + 20, 12), title, colour, self._fonts[0])
             beside = (
