@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CameraModel, CanvasPlacement, apply_homography, homography_from_pose
-from roadproof.simulators.carla.inject import ASPHALT_LEVEL, Scene, painted
+from roadproof.simulators.carla.inject import ASPHALT_LEVEL, Paint, Scene
 
 CAMERA = CameraModel(width_px=160, height_px=120, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 STATE = VehicleState(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -38,7 +38,7 @@ def inside(margin_px):
 
 
 def test_full_paint_is_lit_as_the_road_is():
-    seen = painted(bare(), VIEW, opaque(255, 128, 0))
+    seen = Paint(opaque(255, 128, 0)).on(bare(), VIEW)
     light = ROAD / (255 * ASPHALT_LEVEL)
     expected = np.round(np.array([255, 128, 0]) * light)
     within = inside(60)
@@ -49,20 +49,20 @@ def test_full_paint_is_lit_as_the_road_is():
 
 
 def test_a_road_in_full_light_shows_paint_as_it_is_painted():
-    assert (painted(bare(200), VIEW, opaque(255, 255, 255))[inside(60)] == 255).all()
+    assert (Paint(opaque(255, 255, 255)).on(bare(200), VIEW)[inside(60)] == 255).all()
 
 
 def test_a_transparent_pattern_changes_nothing():
     pattern = opaque(255, 0, 255)
     pattern[..., 3] = 0
-    assert (painted(bare(), VIEW, pattern) == ROAD).all()
+    assert (Paint(pattern).on(bare(), VIEW) == ROAD).all()
 
 
 def test_each_pixel_shows_the_average_of_the_pattern_in_it():
     rng = np.random.default_rng(3)
     pattern = opaque(0, 0, 0)
     pattern[..., :3] = np.kron(rng.integers(0, 2, (20, 20, 1)), np.ones((20, 20, 3))) * 255
-    seen = painted(bare(255 * ASPHALT_LEVEL // 1), VIEW, pattern).astype(float)
+    seen = Paint(pattern).on(bare(255 * ASPHALT_LEVEL // 1), VIEW).astype(float)
     rows, columns = np.nonzero(inside(40))
     fine = (np.arange(64) + 0.5) / 64 - 0.5
     for row, column in list(zip(rows, columns, strict=True))[::97]:
@@ -77,9 +77,9 @@ def test_what_stands_on_the_canvas_hides_it():
     kinds, heights = changed(scene), changed(scene)
     kinds["road"] = scene.road & (np.arange(160) > 80)
     heights["height_m"] = np.where(np.arange(160) > 80, 0.02, 0.8) + scene.height_m
-    free = painted(scene, VIEW, opaque(255, 255, 255))
+    free = Paint(opaque(255, 255, 255)).on(scene, VIEW)
     for hidden in (kinds, heights):
-        seen = painted(Scene(**hidden), VIEW, opaque(255, 255, 255))
+        seen = Paint(opaque(255, 255, 255)).on(Scene(**hidden), VIEW)
         assert (seen[:, :81] == ROAD).all()
         assert (seen[:, 81:] == free[:, 81:]).all()
 
@@ -90,14 +90,14 @@ def test_lane_lines_below_the_paint_do_not_brighten_it():
     line[:, 70:76] = True
     scene["picture"] = np.where(line[..., None], 230, scene["picture"]).astype(np.uint8)
     scene["asphalt"] = ~line
-    seen = painted(Scene(**scene), VIEW, opaque(128, 128, 128))
+    seen = Paint(opaque(128, 128, 128)).on(Scene(**scene), VIEW)
     assert np.ptp(seen[inside(60)].astype(int)) <= 1
 
 
 def test_a_shadow_on_the_road_lies_on_the_paint_too():
     scene = changed(bare())
     scene["picture"][:, :80] = 40
-    seen = painted(Scene(**scene), VIEW, opaque(200, 200, 200)).astype(float)
+    seen = Paint(opaque(200, 200, 200)).on(Scene(**scene), VIEW).astype(float)
     within = inside(60)
     left, right = within & (np.arange(160) < 70), within & (np.arange(160) > 90)
     assert seen[right].mean() / seen[left].mean() == pytest.approx(2.0, rel=0.03)
@@ -106,4 +106,4 @@ def test_a_shadow_on_the_road_lies_on_the_paint_too():
 def test_a_canvas_out_of_sight_changes_nothing():
     behind = homography_from_pose(CAMERA, STATE, CanvasPlacement(x_m=-30.0, y_m=0.0))
     scene = bare()
-    assert (painted(scene, behind, opaque(255, 255, 255)) == scene.picture).all()
+    assert (Paint(opaque(255, 255, 255)).on(scene, behind) == scene.picture).all()

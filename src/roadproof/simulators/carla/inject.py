@@ -46,26 +46,72 @@ class Scene:
     asphalt: Bool[np.ndarray, "h w"]
 
 
-def painted(scene: Scene, image_from_canvas: Homography, pattern: PatternImage) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with the pattern on the road.
+class Paint:
+    """A pattern made ready to be put into one picture after another.
 
-    Convention:
-        Pixel centres at integers; `image_from_canvas` has a positive third coordinate in front of the camera.
+    Args:
+        pattern: of the canvas.
     """
-    free = scene.road & (np.abs(scene.height_m) < PLANE_M)
-    rows, columns = np.nonzero(free & may_show(image_from_canvas, scene.road.shape))
-    if not len(rows):
-        return scene.picture
-    paint = _averaged(np.linalg.inv(image_from_canvas), rows, columns, pattern)
-    # Only the neighbourhood of the paint tells its light.
-    top, left = max(int(rows.min()) - LIGHT_RADIUS_PX, 0), max(int(columns.min()) - LIGHT_RADIUS_PX, 0)
-    near = (slice(top, int(rows.max()) + LIGHT_RADIUS_PX + 1), slice(left, int(columns.max()) + LIGHT_RADIUS_PX + 1))
-    light = _light(scene.picture[near], scene.asphalt[near])[rows - top, columns - left]
-    clean = scene.picture[rows, columns].astype(np.float64)
-    seen = clean * (1.0 - paint[:, 3:]) + paint[:, :3] * light
-    result = scene.picture.copy()
-    result[rows, columns] = np.clip(seen + 0.5, 0, 255).astype(np.uint8)
-    return result
+
+    def __init__(self, pattern: PatternImage) -> None:
+        # A transparent frame stands for all that is outside. Colours in levels, multiplied with alpha; alpha in [0, 1].
+        levels = np.pad(pattern, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
+        levels[..., 3] /= 255
+        levels[..., :3] *= levels[..., 3:]
+        self._levels = levels
+        steps = np.zeros(levels.shape[:2], np.int32)
+        steps[:-1] |= (levels[1:] != levels[:-1]).any(axis=-1)
+        steps[:, :-1] |= (levels[:, 1:] != levels[:, :-1]).any(axis=-1)
+        # Running sums: how many places within a box differ from the next one.
+        self._steps = np.pad(steps.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+
+    def on(self, scene: Scene, image_from_canvas: Homography) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture with the pattern on the road.
+
+        Convention:
+            Pixel centres at integers; `image_from_canvas` has a positive third coordinate in front of the camera.
+        """
+        free = scene.road & (np.abs(scene.height_m) < PLANE_M)
+        rows, columns = np.nonzero(free & may_show(image_from_canvas, scene.road.shape))
+        if not len(rows):
+            return scene.picture
+        paint = self._averaged(np.linalg.inv(image_from_canvas), rows, columns)
+        # Only the neighbourhood of the paint tells its light.
+        reach = LIGHT_RADIUS_PX
+        top, left = max(int(rows.min()) - reach, 0), max(int(columns.min()) - reach, 0)
+        near = np.s_[top : int(rows.max()) + reach + 1, left : int(columns.max()) + reach + 1]
+        light = _light(scene.picture[near], scene.asphalt[near])[rows - top, columns - left]
+        clean = scene.picture[rows, columns].astype(np.float64)
+        seen = clean * (1.0 - paint[:, 3:]) + paint[:, :3] * light
+        result = scene.picture.copy()
+        result[rows, columns] = np.clip(seen + 0.5, 0, 255).astype(np.uint8)
+        return result
+
+    def _averaged(
+        self, canvas_from_image: Homography, rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"]
+    ) -> Float[np.ndarray, "p 4"]:
+        """Mean of the levels over each pixel."""
+        paint, alike = self._looked_up(canvas_from_image, rows, columns)
+        # Most pixels see one colour alone; only the others are worth the samples.
+        mixed = np.flatnonzero(~alike)
+        across = (np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS - 0.5
+        down = (np.arange(SAMPLES_DOWN) + 0.5) / SAMPLES_DOWN - 0.5
+        dx, dy = (axis.ravel() for axis in np.meshgrid(across, down))
+        x, y, ahead = _mapped(canvas_from_image, columns[mixed, None] + dx, rows[mixed, None] + dy)
+        seen = self._levels[_framed(y), _framed(x)] * (ahead > 0)[..., None]
+        paint[mixed] = seen.mean(axis=1, dtype=np.float64)
+        return paint
+
+    def _looked_up(
+        self, canvas_from_image: Homography, rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"]
+    ) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:
+        """A level somewhere in each pixel, and whether all in it are the same."""
+        across, down = np.array([[-0.5, 0.5, -0.5, 0.5], [-0.5, -0.5, 0.5, 0.5]])[..., None]
+        x, y, ahead = _mapped(canvas_from_image, columns + across, rows + down)
+        (left, right), (top, bottom) = ((_framed(v.min(axis=0)), _framed(v.max(axis=0))) for v in (x, y))
+        sums = self._steps
+        within = sums[bottom + 1, right + 1] - sums[top, right + 1] - sums[bottom + 1, left] + sums[top, left]
+        return self._levels[top, left].astype(np.float64), (within == 0) & (ahead > 0).all(axis=0)
 
 
 def may_show(image_from_canvas: Homography, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
@@ -85,44 +131,6 @@ def _mapped(
     x, y, w = (a * columns + b * rows + c for a, b, c in canvas_from_image)
     with np.errstate(divide="ignore", invalid="ignore"):
         return x / w, y / w, w
-
-
-def _averaged(
-    canvas_from_image: Homography, rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"], pattern: PatternImage
-) -> Float[np.ndarray, "p 4"]:
-    """Mean of the pattern over each pixel, colours in levels and multiplied with alpha; alpha in [0, 1]."""
-    # A transparent frame stands for all that is outside.
-    levels = np.pad(pattern, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
-    levels[..., 3] /= 255
-    levels[..., :3] *= levels[..., 3:]
-    paint, alike = _looked_up(canvas_from_image, rows, columns, levels)
-    # Most pixels see one colour alone; only the others are worth the samples.
-    mixed = np.flatnonzero(~alike)
-    across = (np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS - 0.5
-    down = (np.arange(SAMPLES_DOWN) + 0.5) / SAMPLES_DOWN - 0.5
-    dx, dy = (axis.ravel() for axis in np.meshgrid(across, down))
-    x, y, ahead = _mapped(canvas_from_image, columns[mixed, None] + dx, rows[mixed, None] + dy)
-    seen = levels[_framed(y), _framed(x)] * (ahead > 0)[..., None]
-    paint[mixed] = seen.mean(axis=1, dtype=np.float64)
-    return paint
-
-
-def _looked_up(
-    canvas_from_image: Homography,
-    rows: Int[np.ndarray, " p"],
-    columns: Int[np.ndarray, " p"],
-    levels: Float[np.ndarray, "h w 4"],
-) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:
-    """A level somewhere in each pixel, and whether all in it are the same."""
-    across, down = np.array([[-0.5, 0.5, -0.5, 0.5], [-0.5, -0.5, 0.5, 0.5]])[..., None]
-    x, y, ahead = _mapped(canvas_from_image, columns + across, rows + down)
-    (left, right), (top, bottom) = ((_framed(v.min(axis=0)), _framed(v.max(axis=0))) for v in (x, y))
-    steps = np.zeros(levels.shape[:2], np.int32)
-    steps[:-1] |= (levels[1:] != levels[:-1]).any(axis=-1)
-    steps[:, :-1] |= (levels[:, 1:] != levels[:, :-1]).any(axis=-1)
-    sums = np.pad(steps.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
-    within = sums[bottom + 1, right + 1] - sums[top, right + 1] - sums[bottom + 1, left] + sums[top, left]
-    return levels[top, left].astype(np.float64), (within == 0) & (ahead > 0).all(axis=0)
 
 
 def _framed(canvas_px: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:

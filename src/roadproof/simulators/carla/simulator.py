@@ -26,7 +26,7 @@ from roadproof.simulators.arguments import check_crop, check_pattern
 from roadproof.simulators.carla.actors import Crowd, carla_transform, spawn_driven, vehicle_state
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.collisions import Collisions
-from roadproof.simulators.carla.inject import Scene, painted
+from roadproof.simulators.carla.inject import Paint, Scene
 from roadproof.simulators.carla.native import Ground, SeveralPiecesError, find_ground, lay
 from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch
 from roadproof.simulators.carla.session import Session, carla
@@ -60,7 +60,7 @@ class _Drive:
     crowd: Crowd | None
     cameras: dict[str, Camera]
     collisions: Collisions
-    pattern: PatternImage | None
+    paint: Paint | None
     full_pictures: Pictures
     state: VehicleState
     image_from_canvas: Homography = field(default_factory=lambda: np.eye(3))
@@ -185,7 +185,7 @@ class CarlaSimulator:
                 camera.
         """
         drive = self._running()
-        if drive.pattern is None or self._paint is PaintKind.NATIVE:
+        if drive.paint is None:
             raise SimulatorError("depth and kinds are seen in drives with a pattern only; reset with one")
         return seen_by(self._camera, drive.images, drive.scenario.canvas.z_m)
 
@@ -294,14 +294,14 @@ class CarlaSimulator:
         for _ in range(SETTLE_TICKS):
             self._order(session, ego, STOP)
             session.tick()
-        inject = pattern is not None and self._paint is PaintKind.INJECT
-        kinds = ("rgb", "depth", "semantic_segmentation") if inject else ("rgb",)
+        paint = Paint(pattern) if pattern is not None and self._paint is PaintKind.INJECT else None
+        kinds = ("rgb",) if paint is None else ("rgb", "depth", "semantic_segmentation")
         collisions = Collisions(session, ego)
         cameras = {kind: Camera(session, kind, self._camera, ego) for kind in kinds}
         for camera in cameras.values():
             camera.begin()
         self._drive = _Drive(
-            scenario, route, Judge(roads), ego, crowd, cameras, collisions, pattern, full_pictures, scenario.start
+            scenario, route, Judge(roads), ego, crowd, cameras, collisions, paint, full_pictures, scenario.start
         )
         return self._observe(self._drive, self._start(session, self._drive))
 
@@ -378,8 +378,8 @@ class CarlaSimulator:
             image_from_world(self._camera, images["rgb"]) @ drive.scenario.canvas.world_from_canvas
         )
         picture = levels(images["rgb"])
-        if drive.pattern is not None and self._paint is PaintKind.INJECT:
-            picture = painted(self.scene(), drive.image_from_canvas, drive.pattern)
+        if drive.paint is not None:
+            picture = drive.paint.on(self.scene(), drive.image_from_canvas)
         time_s = drive.steps * self._dt_s
         place = drive.route.locate(state.x_m, state.y_m, drive.arclength_m if drive.steps else None)
         drive.arclength_m = place.arclength_m
