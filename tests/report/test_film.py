@@ -16,7 +16,7 @@ from roadproof.datatypes import Control, Weather
 from roadproof.evaluation import evaluate
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.patterns import Pattern
-from roadproof.report.film import EVENT_SHOWN_S, film_trial
+from roadproof.report.film import EVENT_SHOWN_S, film_trial, told
 
 PATTERN = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
 
@@ -27,7 +27,7 @@ def stops_for_good(_):
 
 
 def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town, tmp_path):
-    scenario = dataclasses.replace(SHORT, time_limit_s=10.0)
+    scenario = dataclasses.replace(SHORT, time_limit_s=8.0)
     done = evaluate(town, stops_for_good, scenario, PATTERN, folder=tmp_path, weathers=(Weather.CLEAR_NOON,), runs=0)
     (drive,) = load_episodes(tmp_path, [done.shown().painted])
     assert film_trial(town, done, np.zeros((400, 400, 4), np.uint8), tmp_path)
@@ -36,3 +36,6 @@ def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town
     stood_at = int(np.flatnonzero(drive.speed_mps > 0.1)[-1])
     assert stood_at + EVENT_SHOWN_S / drive.dt_s <= frames <= stood_at + EVENT_SHOWN_S / drive.dt_s + 3
     assert frames < len(drive) - 20
+    assert told(drive, frames - 2, frames) == ("", False)
+    assert told(drive, frames - 1, frames) == ("stands: time limit after 8 s", False)
+    assert told(drive, len(drive) - 1, len(drive)) == ("time limit", False)

@@ -189,19 +189,25 @@ class _Pages:
             beside = (
                 f"{abs(self._beside[k]):.2f} m to the {'left' if self._beside[k] > 0 else 'right'}" if column else ""
             )
-            words = f"{3.6 * episode.speed_mps[k]:.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
+            words = f"{abs(3.6 * episode.speed_mps[k]):.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
             pen.text((left + 20, 50), words, INK, self._fonts[1])
-            self._tell(pen, episode, float(episode.time_s[k]), left + VIEW[0] - 20)
+            words, fresh = told(episode, k, len(pictures))
+            pen.text((left + VIEW[0] - 20, 14), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")
         pen.line((VIEW[0], 0, VIEW[0], page.height), PAPER, 3)
         return page
 
-    def _tell(self, pen: ImageDraw.ImageDraw, episode: Episode, now_s: float, right: int) -> None:
-        """What has just happened; or, for a while, that the drive is over."""
-        fresh = [event for event in episode.events if 0 <= now_s - event.time_s < EVENT_SHOWN_S]
-        words = in_words(fresh[-1].kind) if fresh else ""
-        if now_s >= episode.time_s[-1]:
-            words = words or str(episode.ending)
-        pen.text((right, 14), words, PAINTED if fresh else FAINT, self._fonts[0], anchor="ra")
+
+def told(episode: Episode, step: int, shown: int) -> tuple[str, bool]:
+    """What has just happened at a step, and True; or, with the last of the pictures shown, how the drive ends."""
+    now_s = float(episode.time_s[step])
+    for event in reversed(episode.events):
+        if 0 <= now_s - event.time_s < EVENT_SHOWN_S:
+            return in_words(event.kind), True
+    if step < shown - 1:
+        return "", False
+    if shown == len(episode):
+        return str(episode.ending), False
+    return f"stands: {episode.ending} after {episode.time_s[-1]:.0f} s", False
 
 
 def _encode(av: Any, path: Path, pages: _Pages, rate: Fraction) -> None:  # noqa: ANN401
