@@ -70,6 +70,14 @@ def test_the_same_rows_give_the_same_tables(finished, tmp_path):
     assert again.read_text() == page.read_text()
 
 
+def test_a_list_of_gaps_goes_when_they_are_filled(tmp_path):
+    study = made_up_study(figures=(1,), methods=(METHODS[0], METHODS[3]))
+    for failing in ({(study.scenarios[1].name, 1, "BO")}, set()):
+        frame = write_made_up_study(tmp_path, study, failing=failing)
+        page = write_study(frame.to_dict("records"), tmp_path, tmp_path / "tables")
+        assert page.with_name("missing.tex").exists() == bool(failing)
+
+
 def test_a_weather_never_names_a_file_elsewhere(finished):
     folder, records, _ = finished
     job = next(each for each in read_found(folder, records).values() if each.view("clear-noon") is not None)

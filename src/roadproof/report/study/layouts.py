@@ -18,6 +18,8 @@ from roadproof.report.words import MISSING, in_words
 from roadproof.scenarios import KINDS
 
 SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}
+GAPS = "missing"
+"""The table of what failed or is missing; there is none where nothing is."""
 
 
 def paper_tables(results: Results) -> tuple[Table, ...]:
@@ -232,7 +234,7 @@ def gaps_table(results: Results) -> Table | None:
     if not gaps:
         return None
     return Table(
-        name="missing",
+        name=GAPS,
         title="What failed or is missing",
         note=f"{len(gaps)} of {len(results.jobs)} jobs. The same study run again tries them again.",
         header=(tuple(map(Heading, ("scenario", "K", "method", "seed", "why"))),),

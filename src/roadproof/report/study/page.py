@@ -18,7 +18,7 @@ from roadproof.report.plots import save
 from roadproof.report.study.blocks import DEVIATION, PENALTY
 from roadproof.report.study.charts import Picture, by_figures, progress
 from roadproof.report.study.folder import Found, read_found
-from roadproof.report.study.layouts import paper_tables
+from roadproof.report.study.layouts import GAPS, paper_tables
 from roadproof.report.study.pictures import gallery, in_weathers, trajectories
 from roadproof.report.study.results import BLACK, Method, Record, Results, results_of
 from roadproof.report.study.table import Table, in_latex, in_markdown, markdown_text
@@ -53,6 +53,8 @@ def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Se
     for picture in pictures:
         save(picture.figure, out / "figures" / f"{picture.name}.png")
     tables = [*paper_tables(results), *map(transfer_table, matrices)]
+    # A list of what was missing does not outlive the gaps.
+    (out / f"{GAPS}.tex").unlink(missing_ok=True)
     for table in tables:
         _write(out / f"{table.name}.tex", in_latex(table))
     name = folder.resolve().name
