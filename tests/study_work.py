@@ -30,3 +30,13 @@ def dies_for_two_figures(job: Job, scratch: Path) -> JobResult:
         (scratch / "died").touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return counts(job, scratch)
+
+
+def tells_threads(job: Job, scratch: Path) -> JobResult:
+    # As a real job does, it imports torch in its own process.
+    import torch
+
+    rows = [
+        {**job_columns(job), "weather": str(weather), "points": torch.get_num_threads()} for weather in job.weathers
+    ]
+    return JobResult(tuple(rows), {"pattern.json": b"{}"})

@@ -14,7 +14,7 @@ from roadproof.study.plan import load_study
 from roadproof.study.rows import read_table
 from roadproof.study.run import run_study
 from short_drive import write_plan
-from study_work import counts, dies_for_two_figures, fails_for_bo
+from study_work import counts, dies_for_two_figures, fails_for_bo, tells_threads
 
 
 def test_every_job_gives_its_rows(small_study, tmp_path):
@@ -47,6 +47,12 @@ def test_a_job_that_fails_is_a_row_that_says_why_and_is_tried_again(small_study,
     again = run_study(small_study, tmp_path, counts, workers=2)
     assert len(again) == 8
     assert again["error"].isna().all()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_job_has_one_thread_however_many_are_done_at_once(small_study, tmp_path, monkeypatch, workers):
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert set(run_study(small_study, tmp_path, tells_threads, workers=workers)["points"]) == {1}
 
 
 def test_a_process_that_dies_takes_its_job_and_no_other(small_study, tmp_path):
@@ -107,10 +113,10 @@ def test_a_cluster_finds_and_drives_as_this_machine_does(tmp_path):
     pytest.importorskip("ray", reason="ray is not installed")
     needs.town()
     there = on_two_workers(DRIVEN, run_job, tmp_path)
-    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", run_job, workers=2)
+    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", run_job)
     assert here["error"].isna().all()
     assert (here["deviation_m"] > 0).all()
-    # The same jobs twice, in other processes: the same rows but for the time they took.
+    # The same jobs two at once and one by one: the same rows but for the time they took.
     time = ["search_seconds", "seconds"]
     assert there.drop(columns=time).equals(here.drop(columns=time))
 

@@ -45,7 +45,7 @@ def run_study(
         study: what to compare.
         folder: where results are kept; may hold those of a run before.
         work: does one job; a function of a module, since it runs in other processes.
-        workers: processes on this machine.
+        workers: processes on this machine, each with one thread.
         cluster: address of a Ray cluster, "local" for one on this machine; None stays without Ray.
         on_job: told of every job.
 
@@ -84,21 +84,21 @@ def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int
         raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
     # Threads that each wait for a process of their own: one that dies takes its job with it and no other.
     pool = joblib.Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered", pre_dispatch=workers)
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    yield from pool(joblib.delayed(_in_own_process)(job, folder / "work" / job.key, work, threads) for job in jobs)
+    yield from pool(joblib.delayed(_in_own_process)(job, folder / "work" / job.key, work) for job in jobs)
 
 
-def _in_own_process(job: Job, scratch: Path, work: Work, threads: int) -> tuple[Job, JobResult]:
-    with processes_beside(1, _begin_process, threads) as process:
+def _in_own_process(job: Job, scratch: Path, work: Work) -> tuple[Job, JobResult]:
+    with processes_beside(1, _begin_process) as process:
         try:
             return job, process.submit(_attempt, job, scratch, work).result()
         except BrokenProcessPool:
             return job, failed(job, "its process died, most likely for want of memory; use fewer workers")
 
 
-def _begin_process(threads: int) -> None:
-    # Before torch is imported; workers that each took all cores would only get in each other's way.
-    os.environ["OMP_NUM_THREADS"] = str(threads)
+def _begin_process() -> None:
+    # Before torch is imported. The last digits of a search depend on the number of threads, and rows must not depend on
+    # how many jobs are done at once; Ray gives each job one as well.
+    os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job, JobResult]]:
