@@ -71,7 +71,7 @@ def test_the_same_rows_give_the_same_tables(finished, tmp_path):
 
 
 def test_a_list_of_gaps_goes_when_they_are_filled(tmp_path):
-    study = made_up_study(figures=(1,), methods=(METHODS[0], METHODS[3]))
+    study = made_up_study(scenarios=made_up_study().scenarios[:2], figures=(1,), methods=(METHODS[0], METHODS[3]))
     for failing in ({(study.scenarios[1].name, 1, "BO")}, set()):
         frame = write_made_up_study(tmp_path, study, failing=failing)
         page = write_study(frame.to_dict("records"), tmp_path, tmp_path / "tables")
@@ -85,6 +85,15 @@ def test_a_weather_never_names_a_file_elsewhere(finished):
     other = next(each for each in job.folder.parent.iterdir() if each != job.folder)
     (job.folder / "view-").mkdir()
     assert job.view(f"/../../{other.name}/view-clear-noon") is None
+
+
+def test_a_weather_of_the_rows_never_names_a_table_elsewhere(finished, tmp_path):
+    folder, records, _ = finished
+    moved = [{**row, "weather": str(row["weather"]).replace("rainy-noon", "../../up/rain")} for row in records]
+    write_study(moved, folder, tmp_path / "study" / "tables")
+    assert [path.name for path in tmp_path.iterdir()] == ["study"]
+    assert [path.name for path in (tmp_path / "study").iterdir()] == ["tables"]
+    assert (tmp_path / "study" / "tables" / "up-rain-alone-bo.tex").exists()
 
 
 def test_a_damaged_view_is_named(finished, tmp_path):

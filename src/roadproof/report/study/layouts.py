@@ -70,7 +70,7 @@ def _against(results: Results, ours: str, theirs: str, name: str) -> list[Table]
         tables.append(table("weathers", f"infraction penalty in other weathers than {in_words(home)}", blocks))
         tables += [
             table(
-                f"{weather}-alone",
+                f"{slug(weather)}-alone",
                 f"all scenarios, {in_words(weather)}, {'in traffic' if alone else 'alone on the road'}",
                 [Block(each.title, each, weather, alone) for each in (DEVIATION, PENALTY)],
             )

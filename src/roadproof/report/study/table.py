@@ -68,7 +68,7 @@ class Table:
         left: how many columns from the left hold names.
 
     Raises:
-        StudyError: a row is not as wide as the others.
+        StudyError: a row is not as wide as the others, or the name is not fit for a file.
     """
 
     name: str
@@ -79,6 +79,9 @@ class Table:
     left: int = 1
 
     def __post_init__(self) -> None:
+        # What names a file comes from rows, and those from wherever the folder does.
+        if self.name != slug(self.name):
+            raise StudyError(f"table {self.name!r} cannot name a file, expected small letters, digits and dashes")
         for width in (*(sum(each.span for each in row) for row in self.header), *map(len, self.rows)):
             if width != self.columns:
                 raise StudyError(f"table {self.name}: a row has {width} columns, the last heading {self.columns}")
