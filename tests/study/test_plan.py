@@ -81,8 +81,16 @@ def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
         ('search = "gradopt"\n', "", "method lacks search"),
         ("trajectories = 1", "trajectories = 2", "trajectories is 2"),
         ("trajectories = 1", 'trajectories = "1"', "expected a number"),
-        ('name = "BO"', 'name = "GradOpt"', "same name"),
+        ('name = "BO"', 'name = "GradOpt"', "method has GradOpt twice"),
+        ("figures = [", "figures = [5, ", "figures has 5 twice"),
+        ("seeds = [0, 1]", "seeds = [0, 0]", "seeds has 0 twice"),
+        ("seeds = [0, 1]", "seeds = [0.5]", "seeds has 0.5"),
+        ("seeds = [0, 1]", 'seeds = ["a"]', "seeds has 'a'"),
+        ("seeds = [0, 1]", "seeds = [-1]", "seeds is -1"),
+        ('"rainy-noon"', '"clear-noon"', "weathers has clear-noon twice"),
+        ("calls = 100\n", "calls = 40\n", "random_calls is 40 of 40 calls"),
         ("runs = 4", "runs = 0", "runs is 0"),
+        ("runs = 4", "cars = 0\npedestrians = 0", "leave .traffic. out"),
         ("runs = 4", 'weathers = "some"', "weathers is 'some'"),
         ("trajectories = 1", "trajectories = 9", "trajectories is 9"),
         ("trajectories = 1", 'schedule = "slow"', "schedule is 'slow'"),
@@ -114,12 +122,23 @@ def test_every_built_in_scenario_can_be_chosen(tmp_path):
     assert study.scenarios == builtin_scenarios()
 
 
-@pytest.mark.parametrize("name", ["paper", "small"])
-def test_the_studies_that_come_with_the_project_can_be_read(name):
-    study = load_study(Path(__file__).parents[2] / "studies" / f"{name}.toml")
-    assert {method.search for method in study.methods} >= {"gradopt", "published-bo"}
-    if name == "paper":
-        assert len(study.scenarios) == 40
-        assert study.figures == ("1-b", 1, 2, 3, 4, 5)
-        assert len(study.weathers) == 4
-        assert (study.methods[-1].calls, study.methods[-1].random_calls) == (1000, 400)
+STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=[path.stem for path in STUDIES])
+def test_the_studies_that_come_with_the_project_can_be_read(path):
+    study = load_study(path)
+    assert any(method.search == "gradopt" for method in study.methods)
+    assert len(study.jobs) == len({job.key for job in study.jobs})
+
+
+def test_the_paper_s_study_is_the_paper_s():
+    study = load_study(next(path for path in STUDIES if path.stem == "paper"))
+    assert len(study.scenarios) == 40
+    assert study.figures == ("1-b", 1, 2, 3, 4, 5)
+    assert len(study.weathers) == 4
+    assert (study.methods[-1].search, study.methods[-1].calls, study.methods[-1].random_calls) == (
+        "published-bo",
+        1000,
+        400,
+    )

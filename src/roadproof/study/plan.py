@@ -117,6 +117,8 @@ class MethodPlan:
         for name in ("restarts", "iterations", "calls", "random_calls", "frames"):
             _at_least(getattr(self, name), name, 1)
         _at_least(self.select, "select", 0)
+        if self.search == "published-bo" and self.random_calls >= self.calls:
+            raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         if self.start and (self.search == "gradopt" or not self.select):
             raise StudyError(f"start is {self.start!r}, expected it with a black-box search and select of 1 or more")
         if self.trajectories not in COUNTS:
@@ -142,6 +144,8 @@ class TrafficPlan:
     def __post_init__(self) -> None:
         for name in ("cars", "pedestrians"):
             _at_least(getattr(self, name), name, 0)
+        if not self.cars + self.pedestrians:
+            raise StudyError("cars and pedestrians are 0; leave [traffic] out to drive alone")
         _at_least(self.runs, "runs", 1)
         _one_of(self.weathers, "weathers", ("all", "first"))
 
@@ -176,16 +180,13 @@ class Job:
         content = json.dumps({"job_version": JOB_VERSION, **asdict(self)}, sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
-    def __str__(self) -> str:
-        return f"{self.scenario.name}, K = {self.figures}, {self.method.name}, seed {self.seed}"
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Study:
     """Scenarios × K × methods × seeds, evaluated in some weathers, with and without traffic.
 
     Raises:
-        StudyError: a list is empty, or a value makes no sense.
+        StudyError: a list is empty, something stands in it twice, or a value makes no sense.
     """
 
     controller: str
@@ -204,9 +205,16 @@ class Study:
         for figures in self.figures:
             if figures != BLACK and (not isinstance(figures, int) or isinstance(figures, bool) or figures < 1):
                 raise StudyError(f"figures has {figures!r}, expected numbers from 1, or {BLACK!r} for one black figure")
-        names = [method.name for method in self.methods]
-        if len(set(names)) < len(names):
-            raise StudyError(f"two methods have the same name among {', '.join(names)}; the tables go by it")
+        for seed in self.seeds:
+            _at_least(seed, "seeds", 0)
+        # What is asked for twice would be two jobs that write the same folder.
+        named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": [m.name for m in self.methods]}
+        for field in ("figures", "seeds", "weathers"):
+            named[field] = list(map(str, getattr(self, field)))
+        for field, names in named.items():
+            twice = [name for name in names if names.count(name) > 1]
+            if twice:
+                raise StudyError(f"{field} has {twice[0]} twice, expected each once")
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -262,7 +270,7 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
         scenarios=_chosen(_list(stated, "scenarios"), load_scenarios(own)),
         figures=tuple(_list(stated, "figures")),
         methods=tuple(_build(MethodPlan, method, "method") for method in _list(stated, "methods")),
-        seeds=tuple(int(seed) for seed in _list(stated, "seeds", (0,))),
+        seeds=tuple(_seed(value) for value in _list(stated, "seeds", (0,))),
         weathers=tuple(_weather(name) for name in _list(stated, "weathers", (Weather.CLEAR_NOON,))),
         traffic=None if traffic is None else _build(TrafficPlan, traffic, "traffic"),
         simulator=str(stated.get("simulator", "town")),
@@ -308,6 +316,12 @@ def _list(stated: Mapping[str, Any], key: str, otherwise: tuple[Any, ...] = ()) 
     if not isinstance(value, list | tuple):
         raise StudyError(f"{key} is {value!r}, expected a list")
     return tuple(cast("list[Any]", value))
+
+
+def _seed(value: object) -> int:
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise StudyError(f"seeds has {value!r}, expected whole numbers")
+    return value
 
 
 def _weather(name: object) -> Weather:
