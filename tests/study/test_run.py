@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -52,7 +53,8 @@ def test_a_job_that_fails_is_a_row_that_says_why_and_is_tried_again(small_study,
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_job_has_one_thread_however_many_are_done_at_once(small_study, tmp_path, monkeypatch, workers):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    assert set(run_study(small_study, tmp_path, tells_threads, workers=workers)["points"]) == {1}
+    study = dataclasses.replace(small_study, figures=("1-b",), methods=small_study.methods[:1])
+    assert set(run_study(study, tmp_path, tells_threads, workers=workers)["points"]) == {1}
 
 
 def test_a_process_that_dies_takes_its_job_and_no_other(small_study, tmp_path):
@@ -141,3 +143,11 @@ def on_two_workers(plan, work, folder):
 def test_arguments_that_make_no_sense_are_named(small_study, tmp_path, options, message):
     with pytest.raises(StudyError, match=message):
         run_study(small_study, tmp_path, counts, **options)
+
+
+@pytest.mark.parametrize("options", [{"workers": 2}, {"cluster": "local"}])
+def test_one_server_is_not_asked_for_two_jobs_at_once(small_study, tmp_path, options):
+    study = dataclasses.replace(small_study, simulator="carla://localhost")
+    with pytest.raises(StudyError, match="use one worker and no cluster"):
+        run_study(study, tmp_path, counts, **options)
+    assert run_study(study, tmp_path, counts)["error"].isna().all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -55,6 +56,8 @@ def run_study(
     """
     if workers < 1:
         raise StudyError(f"workers is {workers}, expected 1 or more")
+    if study.simulator != "town" and (workers > 1 or cluster is not None):
+        raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
     check_writable(folder)
     left = [job for job in study.jobs if not is_done(job, folder)]
     done = len(study.jobs) - len(left)
@@ -69,6 +72,7 @@ def run_study(
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
     """A job's result, whatever it raises: one bad job must not stop the night. The process is the job's own."""
     keep_freed_memory()
+    _compute_with_one_thread()
     try:
         scratch.mkdir(parents=True, exist_ok=True)
         return work(job, scratch)
@@ -77,9 +81,17 @@ def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
         return failed(job, f"{kind}{error}")
 
 
+def _compute_with_one_thread() -> None:
+    """From now on: where a search ends depends on it, and rows must not depend on how many jobs are done at once."""
+    # What is loaded already keeps to limits, what is loaded later to the variable.
+    import_module("threadpoolctl").threadpool_limits(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
 def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int) -> Iterator[tuple[Job, JobResult]]:
     try:
         joblib: Any = import_module("joblib")
+        import_module("threadpoolctl")
     except ImportError as error:
         raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
     # Threads that each wait for a process of their own: one that dies takes its job with it and no other.
@@ -88,17 +100,11 @@ def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int
 
 
 def _in_own_process(job: Job, scratch: Path, work: Work) -> tuple[Job, JobResult]:
-    with processes_beside(1, _begin_process) as process:
+    with processes_beside(1) as process:
         try:
             return job, process.submit(_attempt, job, scratch, work).result()
         except BrokenProcessPool:
             return job, failed(job, "its process died, most likely for want of memory; use fewer workers")
-
-
-def _begin_process() -> None:
-    # Before torch is imported. The last digits of a search depend on the number of threads, and rows must not depend on
-    # how many jobs are done at once; Ray gives each job one as well.
-    os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job, JobResult]]:
@@ -129,5 +135,7 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job
 
 
 def _on_node(job: Job, work: Work) -> JobResult:
-    # What a job keeps to go on from stays on its node; its result travels.
-    return _attempt(job, Path(tempfile.gettempdir()) / "roadproof-study" / job.key, work)
+    # What a job keeps to go on from stays on its node, where others may compute too; its result travels.
+    own = Path(tempfile.gettempdir()) / f"roadproof-study-{getpass.getuser()}"
+    own.mkdir(mode=0o700, exist_ok=True)
+    return _attempt(job, own / job.key, work)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CameraModel, CanvasPlacement, apply_homography, homography_from_pose
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL, Paint, Scene
