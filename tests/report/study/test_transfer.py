@@ -65,3 +65,9 @@ def test_the_heat_map_is_a_picture(tmp_path):
 def test_rows_that_make_no_matrix_are_named(rows, message):
     with pytest.raises(StudyError, match=message):
         transfer_of(rows)
+
+
+def test_one_source_of_patterns_is_not_the_worst_of_any():
+    table = transfer_table(transfer_of([each for each in DRIVES if each["found_on"] == "cil"]))
+    assert not any(cell.best for cell in table.rows[0][1:])
+    assert "bold" not in table.note

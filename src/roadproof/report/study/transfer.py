@@ -73,7 +73,8 @@ def transfer_of(records: Iterable[Record], metric: Metric = DEVIATION) -> Transf
 
 
 def transfer_table(transfer: Transfer) -> Table:
-    """The matrix with intervals; each controller's worst pattern source in bold."""
+    """The matrix with intervals; each controller's worst pattern source in bold, where there are several."""
+    several = len(transfer.found_on) > 1
     worst = {
         driver: max(mean.value for (_, by), mean in transfer.means.items() if by == driver)
         for driver in transfer.driven_by
@@ -81,7 +82,7 @@ def transfer_table(transfer: Transfer) -> Table:
 
     def cell(found_on: str, driver: str) -> Cell:
         mean = transfer.means.get((found_on, driver))
-        return MISSING if mean is None else Estimate(mean, best=mean.value == worst[driver])
+        return MISSING if mean is None else Estimate(mean, best=several and mean.value == worst[driver])
 
     counts = {mean.count for mean in transfer.means.values()}
     missing = len(transfer.found_on) * len(transfer.driven_by) - len(transfer.means)
@@ -90,7 +91,8 @@ def transfer_table(transfer: Transfer) -> Table:
         title=f"Transfer: {transfer.metric.title.lower()} of patterns found against one controller, driven by another",
         note=f"{transfer.metric.title} in {transfer.metric.unit}, driven; means over "
         f"{' to '.join(str(each) for each in sorted({min(counts), max(counts)}))} patterns a cell with 95 % bootstrap "
-        "intervals over scenarios. The highest of each driver in bold."
+        "intervals over scenarios."
+        + (" The highest of each driver in bold." if several else "")
         + (f" {missing} pairs were not driven." if missing else ""),
         header=(
             (Heading(""), Heading("driven by", len(transfer.driven_by))),
