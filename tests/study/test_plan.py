@@ -69,6 +69,17 @@ def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
         assert dataclasses.replace(job, **change).key != job.key
 
 
+def test_other_weights_in_the_same_file_are_other_jobs(tmp_path):
+    weights = tmp_path / "own.safetensors"
+    study = dataclasses.replace(load_study(written(tmp_path, TEXT)), controller=f"cil:{weights}")
+    nothing = [job.key for job in study.jobs]
+    weights.write_bytes(b"one")
+    first = [job.key for job in study.jobs]
+    assert first == [job.key for job in study.jobs]
+    weights.write_bytes(b"another")
+    assert not {*nothing, *first} & {job.key for job in study.jobs}
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [

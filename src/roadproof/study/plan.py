@@ -3,7 +3,8 @@
 format = "roadproof-study"
 version = 1
 controller = "cil"
-simulator = "town"                        # or carla://HOST:PORT; with several workers, the town
+simulator = "town"                        # or carla://HOST:PORT, for one worker
+scenario_file = "own.toml"                # beside the study; left out, the built-in scenarios
 scenarios = ["straight-01", "left-*"]     # names or patterns of names
 figures = ["1-b", 1, 3, 5]                # K; 1-b is one black figure
 seeds = [0]
@@ -163,6 +164,8 @@ class Job:
         weathers: of the evaluation; found in the first.
         traffic: of the evaluation, or None.
         simulator: its spec, see `simulators.loading`.
+        weights: digest of the file that the controller's spec names; empty for one that comes with the package, and for
+            a function of yours, whose weights a study does not see.
     """
 
     controller: str
@@ -173,11 +176,15 @@ class Job:
     weathers: tuple[Weather, ...]
     traffic: TrafficPlan | None
     simulator: str = "town"
+    weights: str = ""
 
     @property
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
-        content = json.dumps({"job_version": JOB_VERSION, **asdict(self)}, sort_keys=True, default=str)
+        told = {"job_version": JOB_VERSION, **asdict(self)}
+        if not self.weights:
+            del told["weights"]
+        content = json.dumps(told, sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
@@ -219,6 +226,7 @@ class Study:
     @property
     def jobs(self) -> tuple[Job, ...]:
         """Every combination, scenario by scenario."""
+        weights = _digest(self.controller)
         return tuple(
             Job(
                 controller=self.controller,
@@ -229,6 +237,7 @@ class Study:
                 weathers=self.weathers,
                 traffic=self.traffic,
                 simulator=self.simulator,
+                weights=weights,
             )
             for scenario, figures, method, seed in product(self.scenarios, self.figures, self.methods, self.seeds)
         )
@@ -316,6 +325,12 @@ def _list(stated: Mapping[str, Any], key: str, otherwise: tuple[Any, ...] = ()) 
     if not isinstance(value, list | tuple):
         raise StudyError(f"{key} is {value!r}, expected a list")
     return tuple(cast("list[Any]", value))
+
+
+def _digest(controller: str) -> str:
+    """Of the file that a spec names, as `cil:FILE.safetensors` does; empty where it names none."""
+    path = Path(controller.partition(":")[2] or controller)
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.suffix and path.is_file() else ""
 
 
 def _seed(value: object) -> int:
