@@ -55,21 +55,39 @@ def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_pa
     assert len(list((tmp_path / "out" / "transfer").rglob("episodes/*.npz"))) == 4
 
 
+BLIND = """
+class Blind:
+    input_size = None
+
+    def steer(self, frames, speed_mps, command):
+        return 0 * speed_mps
+
+    def act(self, frame, speed_mps, command):
+        raise RuntimeError("sees nothing")
+"""
+
+
 @pytest.mark.slow
-def test_jobs_that_fail_are_a_line_each(study, plan, tmp_path):
-    plan.write_text(PLAN.replace('"pilotnet"', '"own:nobody"'))
+def test_jobs_that_fail_are_a_line_each(study, plan, tmp_path, monkeypatch):
+    needs.town()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "blind_one.py").write_text(BLIND)
+    plan.write_text(PLAN.replace('"pilotnet"', '"blind_one:Blind"'))
     code, printed = study("run", plan, "--out", tmp_path / "out")
     assert code == 1
     assert "FAILED short, K = 1-b, chance, seed 0: " in printed.out
-    assert "own" in printed.out.split("FAILED")[1]
+    assert "sees nothing" in printed.out.split("FAILED")[1]
 
 
 def test_mistakes_are_one_clear_line(study, plan, tmp_path):
     unknown = tmp_path / "unknown.toml"
     unknown.write_text(PLAN.replace("calls", "cals"))
+    nobody = tmp_path / "nobody.toml"
+    nobody.write_text(PLAN.replace('"pilotnet"', '"own:nobody"'))
     for arguments, message in (
         (["run", tmp_path / "none.toml"], "cannot read"),
         (["run", unknown], "did you mean 'calls'"),
+        (["run", nobody], "cannot import own:nobody"),
         (["run", plan, "--workers", 0], "workers is 0"),
         (["transfer", plan, "--controllers", "cil"], "no results of this study"),
         (["transfer", plan, "--controllers", ","], "no controller"),

@@ -84,6 +84,7 @@ def test_other_weights_in_the_same_file_are_other_jobs(tmp_path):
     ("before", "after", "message"),
     [
         ("version = 1", "version = 2", "expected format"),
+        ('controller = "cil"', 'controller = "cil"\nsimulator = "twon"', "simulator is 'twon'"),
         ("seeds =", "seed =", "did you mean 'seeds'"),
         ("figures = [", "figures = [0, ", "figures has 0"),
         ('"straight-03"', '"straigt-03"', "did you mean 'straight-03'"),

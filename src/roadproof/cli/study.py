@@ -31,6 +31,7 @@ def run(
     from rich.console import Console
 
     from roadproof.cli.progress import HOURS_S, progress
+    from roadproof.controllers import load_controller
     from roadproof.study.job import run_job
     from roadproof.study.plan import load_study
     from roadproof.study.rows import is_done, records
@@ -39,6 +40,9 @@ def run(
 
     chosen = load_study(plan)
     begun = sum(is_done(job, out) for job in chosen.jobs)
+    if begun < len(chosen.jobs):
+        # One that is not there is refused at once, not job by job.
+        load_controller(chosen.controller)
     failed = 0
     with progress("Jobs", len(chosen.jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
 
