@@ -79,6 +79,7 @@ def by_figures(results: Results) -> Picture:
                 **style(results, method.name),
             )
         axes.set_xticks(range(len(results.figures)), results.figures)
+        axes.set_xlim(-0.5, len(results.figures) - 0.5)
         axes.set_ylim(bottom=0.0)
         label(axes, "K, figures of the pattern", f"{block.metric.title.lower()}, {block.metric.unit}")
     legend(figure)
