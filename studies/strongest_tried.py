@@ -42,10 +42,11 @@ def _row(path: Path, folder: Path) -> dict[str, Any] | None:
     """A job's; None where it was no black-box search or is not done."""
     job = json.loads(path.read_text())
     driven = folder / "work" / path.parent.name / "driven.json"
-    if not driven.exists() or not path.with_name("rows.json").exists():
+    course = path.with_name("history.json")
+    if not driven.exists() or not course.exists():
         return None
     drives = json.loads(driven.read_text())["drives"]
-    history = json.loads(path.with_name("history.json").read_text())
+    history = json.loads(course.read_text())
     return {
         "scenario": job["scenario"]["name"],
         "figures": str(job["figures"]),

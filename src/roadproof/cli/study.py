@@ -73,17 +73,18 @@ def transfer(
     """Drive other controllers over the patterns a study found."""
     from rich.console import Console
 
-    from roadproof.cli.progress import HOURS_S, progress
+    from roadproof.cli.progress import stages
     from roadproof.study.plan import load_study
-    from roadproof.study.rows import is_done, records
+    from roadproof.study.rows import records
     from roadproof.study.summary import matrix
     from roadproof.study.transfer import transfer as run_transfer
 
     chosen = load_study(plan)
-    specs = list(dict.fromkeys(spec.strip() for spec in controllers.split(",") if spec.strip()))
-    found = sum(is_done(job, out) for job in chosen.jobs)
-    with progress("Patterns", found * len(specs), "", remember_s=HOURS_S) as show:
-        rows = records(run_transfer(chosen, out, specs, on_pattern=lambda done, _total: show(done, 0.0)))
+    specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
+    with stages() as show:
+        rows = records(
+            run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
+        )
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     for line in matrix(rows):
         say(line)

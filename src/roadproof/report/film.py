@@ -183,7 +183,7 @@ class _Pages:
         pen = ImageDraw.Draw(page)
         for column, (episode, pictures, title, colour) in enumerate(self._sides):
             left, k = column * VIEW[0], min(step, len(pictures) - 1)
-            page.paste(_opened(_shown(pictures, step)), (left, CAPTION_PX))
+            page.paste(_opened(pictures[k]), (left, CAPTION_PX))
             pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=colour)
             pen.text((left + 20, 12), title, colour, self._fonts[0])
             beside = (
