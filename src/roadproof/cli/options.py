@@ -45,7 +45,10 @@ def check_processes(processes: int, simulator: str) -> None:
     Raises:
         RoadproofError: they would share one server.
     """
-    if processes > 1 and simulator.startswith("carla://"):
+    # The road map comes with it; `--help` is spared.
+    from roadproof.simulators.loading import is_server
+
+    if processes > 1 and is_server(simulator):
         raise RoadproofError(
             f"--processes is {processes}, but all of them would step the one server of {simulator}; expected 1"
         )

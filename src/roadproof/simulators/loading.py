@@ -48,6 +48,11 @@ class MappedSimulator(Simulator, Protocol):
         ...
 
 
+def is_server(spec: str) -> bool:
+    """Whether all processes that open this simulator step the same one."""
+    return spec.startswith("carla://")
+
+
 @contextmanager
 def open_simulator(spec: str) -> Generator[MappedSimulator]:
     """Open the simulator of a spec for a with-block; leaving frees everything it holds.
@@ -62,7 +67,7 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
         with TownSimulator() as town:
             yield town
         return
-    if spec.startswith("carla://"):
+    if is_server(spec):
         host, port, paint = _address(spec)
         # CARLA's client is an extra.
         from roadproof.simulators.carla.simulator import CarlaSimulator

@@ -54,6 +54,7 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import Weather
 from roadproof.errors import StudyError
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
+from roadproof.simulators.loading import SPECS, is_server
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 1
@@ -212,8 +213,8 @@ class Study:
         for figures in self.figures:
             if figures != BLACK and (not isinstance(figures, int) or isinstance(figures, bool) or figures < 1):
                 raise StudyError(f"figures has {figures!r}, expected numbers from 1, or {BLACK!r} for one black figure")
-        if self.simulator != "town" and not self.simulator.startswith("carla://"):
-            raise StudyError(f"simulator is {self.simulator!r}, expected town or carla://HOST:PORT")
+        if self.simulator != "town" and not is_server(self.simulator):
+            raise StudyError(f"simulator is {self.simulator!r}, expected {SPECS}")
         for seed in self.seeds:
             _at_least(seed, "seeds", 0)
         # What is asked for twice would be two jobs that write the same folder.

@@ -15,6 +15,7 @@ from roadproof.errors import RoadproofError, StudyError
 from roadproof.files import check_writable
 from roadproof.memory import keep_freed_memory
 from roadproof.processes import processes_beside
+from roadproof.simulators.loading import is_server
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import JobResult, failed, is_done, write_result, write_table
 
@@ -56,7 +57,7 @@ def run_study(
     """
     if workers < 1:
         raise StudyError(f"workers is {workers}, expected 1 or more")
-    if study.simulator != "town" and (workers > 1 or cluster is not None):
+    if is_server(study.simulator) and (workers > 1 or cluster is not None):
         raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
     check_writable(folder)
     left = [job for job in study.jobs if not is_done(job, folder)]
