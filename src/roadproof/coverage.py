@@ -55,7 +55,7 @@ _CORNERS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprints:
-    """The canvas under P picture pixels.
+    """The canvas under P picture pixels; leading dimensions, where there are any, belong to patterns of their own.
 
     Args:
         centre: canvas coordinates of the pixel centres, px, (P, 2).
@@ -65,9 +65,9 @@ class Footprints:
         variance: footprint², the value of `FOOTPRINT_VARIANCE` for the picture's resampling.
     """
 
-    centre: Float[Tensor, "p 2"]
-    jacobian: Float[Tensor, "p 2 2"]
-    features: Float[Tensor, "6 p"]
+    centre: Float[Tensor, "*v p 2"]
+    jacobian: Float[Tensor, "*v p 2 2"]
+    features: Float[Tensor, "*v 6 p"]
     variance: float
 
     @staticmethod
@@ -80,19 +80,26 @@ class Footprints:
         dtype: torch.dtype = torch.float32,
     ) -> Footprints:
         """Footprints from canvas coordinates and Jacobians, computed in float64 and stored as `dtype`."""
-        variance = FOOTPRINT_VARIANCE[resampling]
-        moment = variance * jacobian @ np.swapaxes(jacobian, -1, -2)
-        x, y = centre.T
-        features = np.stack([x, y, np.ones_like(x), moment[:, 0, 0], 2 * moment[:, 0, 1], moment[:, 1, 1]])
-        return Footprints(
-            torch.tensor(centre, device=device, dtype=dtype),
-            torch.tensor(jacobian, device=device, dtype=dtype),
-            torch.tensor(features, device=device, dtype=dtype),
-            variance,
+        exact = Footprints.made(torch.tensor(centre), torch.tensor(jacobian), resampling)
+        centre_, jacobian_, features = (
+            part.to(device=device, dtype=dtype) for part in (exact.centre, exact.jacobian, exact.features)
         )
+        return Footprints(centre_, jacobian_, features, exact.variance)
+
+    @staticmethod
+    def made(
+        centre: Float[Tensor, "*v p 2"], jacobian: Float[Tensor, "*v p 2 2"], resampling: Resampling
+    ) -> Footprints:
+        """Footprints from canvas coordinates and Jacobians, where and as precise as they are."""
+        variance = FOOTPRINT_VARIANCE[resampling]
+        moment = variance * jacobian @ jacobian.mT
+        x, y = centre.unbind(-1)
+        across, skewed, along = moment[..., 0, 0], 2 * moment[..., 0, 1], moment[..., 1, 1]
+        features = torch.stack([x, y, torch.ones_like(x), across, skewed, along], -2)
+        return Footprints(centre, jacobian, features, variance)
 
     def __len__(self) -> int:
-        return len(self.centre)
+        return self.centre.shape[-2]
 
 
 def in_figure_axes(
@@ -171,7 +178,7 @@ def _ellipse_coverage(box: Tensor, footprints: Footprints) -> Tensor:
     radius = torch.sqrt(u * u + v * v + 1e-12)
     nu, nv = u / radius / half_width, v / radius / half_length
     nx, ny = c * nu - s * nv, s * nu + c * nv
-    xx, xy2, yy = footprints.features[3:]
+    xx, xy2, yy = footprints.features[..., 3:, :].unbind(-2)
     sharpness = torch.rsqrt((nx * nx * xx + nx * ny * xy2 + ny * ny * yy).clamp_min(MIN_VARIANCE))
     return tent_share((1 - radius) * sharpness) + tent_share((1 + radius) * sharpness)
 
@@ -197,8 +204,8 @@ def _polygon_coverage(vertices: Float[Tensor, "*b n 2"], footprints: Footprints)
     """
     side = (2 * footprints.variance) ** 0.5
     picture_from_canvas = cast("Tensor", torch.linalg.inv(footprints.jacobian)) / side
-    offset = vertices[..., None, :, :] - footprints.centre[:, None, :]
-    points = torch.einsum("pij,...pnj->...pni", picture_from_canvas, offset)
+    offset = vertices[..., None, :, :] - footprints.centre[..., None, :]
+    points = torch.einsum("...pij,...pnj->...pni", picture_from_canvas, offset)
     following = points.roll(-1, dims=-2)
     x0, y0, x1, y1 = points[..., 0], points[..., 1], following[..., 0], following[..., 1]
     run = x1 - x0

@@ -21,16 +21,16 @@ def view():
 def test_runs_hold_every_pixel_once_and_paint_nothing_on_what_fills_the_last(view):
     count = len(view.clean)
     assert len(view.runs) == -(-count // RUN)
-    assert torch.equal(view.runs.features.flatten(1)[:, :count], view.footprints.features)
-    assert torch.equal(view.runs.gain.T[:count], view.gain)
-    assert not view.runs.gain[:, count:].any()
-    assert not view.runs.bias[:, count:].any()
+    assert torch.equal(view.runs.features[0].flatten(1)[:, :count], view.footprints.features)
+    assert torch.equal(view.runs.gain[0].T[:count], view.gain)
+    assert not view.runs.gain[..., count:].any()
+    assert not view.runs.bias[..., count:].any()
 
 
 def test_a_run_of_no_relation_to_a_figure_is_uncovered_and_one_inside_is_covered(view):
     space = SearchSpace(figures=40, family="free")
     boxes = space.pattern(space.random((), torch.Generator().manual_seed(0))).boxes
-    inside, crossed = view.runs.relation(_edge_rows(boxes[None])[0])
+    (inside,), (crossed,) = view.runs.relation(_edge_rows(boxes[None]))
     masks = coverage(Shape.RECTANGLE, boxes, view.footprints)
     whole = len(view.clean) // RUN
     by_run = masks[:, : whole * RUN].view(len(boxes), whole, RUN)

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.rectangles import PaintedRectangles
-from roadproof.compositing.view import CanvasView
+from roadproof.compositing.view import CanvasView, OwnViews
 from roadproof.coverage import Shape
 from roadproof.patterns import Pattern, coverages, visibilities
 
@@ -96,17 +96,33 @@ class _Pasted(torch.autograd.Function):
         return (None, *ctx.compositor.pick(grad_outputs[0]))
 
 
-def canvas_colours(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b p 3"]:
+def composite_own(pattern: Pattern, frames: Float[Tensor, "b 3 h w"], views: OwnViews) -> Float[Tensor, "b 3 h w"]:
+    """B pictures with a pattern of its own painted into each, differentiable in the patterns.
+
+    Args:
+        pattern: a batch of B patterns.
+        frames: the bare pictures, in [0, 1].
+        views: their view of the canvas.
+    """
+    colours = canvas_colours(pattern, views)
+    # A copy is written where its pixel is, with the same colour; the gradient goes to the pixel alone.
+    colours = torch.where(views.valid[..., None], colours, colours.detach())
+    place = views.pixel[:, None].expand(-1, 3, -1)
+    return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+
+
+def canvas_colours(pattern: Pattern, view: CanvasView | OwnViews) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
     seen = view.response(pattern.colours)
     if any(shape is not Shape.RECTANGLE for shape in pattern.shapes):
         return blend(visibilities(coverages(pattern, view.footprints)), seen, view)
     batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
     boxes, seen = pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3)
-    return cast("Tensor", PaintedRectangles.apply(boxes, seen, view)).view(*batch, *view.clean.shape)
+    painted = cast("Tensor", PaintedRectangles.apply(boxes, seen, view.runs))
+    return painted[:, : view.clean.shape[-2]].view(*batch, -1, 3)
 
 
-def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasView) -> Tensor:
+def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasView | OwnViews) -> Tensor:
     """Eq. composite on the canvas' pixels, (*b, P, 3), clipped to [0, 1], as plain tensor operations."""
     share = visibility.sum(-2)[..., None]
     return (view.clean + view.gain * (visibility.mT @ seen) + view.bias * share).clamp(0.0, 1.0)

@@ -25,7 +25,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.runs import RUN, Runs
-from roadproof.compositing.view import CanvasView
 from roadproof.coverage import MIN_VARIANCE, axis_rows
 
 _PIECE = 1 << 18
@@ -33,16 +32,19 @@ _PIECE = 1 << 18
 
 
 class PaintedRectangles(torch.autograd.Function):
-    """Colours of the canvas' pixels, (B, P, 3), from boxes (B, K, 5) and seen colours (B, K, 3)."""
+    """Colours of the canvas' pixels, (B, p, 3), from boxes (B, K, 5) and seen colours (B, K, 3).
+
+    The p pixels are those of the runs, whose last is filled up.
+    """
 
     @staticmethod
-    def forward(ctx: Any, boxes: Tensor, seen: Tensor, view: CanvasView) -> Tensor:  # noqa: ANN401
+    def forward(ctx: Any, boxes: Tensor, seen: Tensor, whole: Runs) -> Tensor:  # noqa: ANN401
         """Paint, piece by piece."""
         rows = _edge_rows(boxes)
-        painted = torch.empty(len(boxes), *view.clean.shape, device=boxes.device, dtype=boxes.dtype)
-        within = torch.empty(len(boxes), *view.runs.clean.shape, device=boxes.device, dtype=torch.bool)
+        painted = torch.empty(len(boxes), len(whole) * RUN, 3, device=boxes.device, dtype=boxes.dtype)
+        within = torch.empty(len(boxes), 3, len(whole) * RUN, device=boxes.device, dtype=torch.bool)
         ctx.edges = []
-        for pixels, runs in _pieces(boxes, view.runs):
+        for pixels, runs in _pieces(boxes, whole):
             edges = _Edges(rows, runs)
             masks = edges.masks()
             through = _shown_through(masks)
@@ -50,18 +52,17 @@ class PaintedRectangles(torch.autograd.Function):
             raw = torch.addcmul(runs.clean, colour, runs.gain).addcmul_(1 - through[:, :1], runs.bias)
             clamped = raw.clamp(0.0, 1.0)
             torch.eq(raw, clamped, out=within[..., pixels])
-            part = painted[:, pixels]
-            part.copy_(clamped.mT[:, : part.shape[1]])
+            painted[:, pixels] = clamped.mT
             ctx.edges.append(edges)
         ctx.save_for_backward(boxes, seen, within)
-        ctx.runs = view.runs
+        ctx.runs = whole
         return painted
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, Tensor, None]:  # noqa: ANN401
         """Lay the figures over each other again and collect the gradients of boxes and seen colours."""
         boxes, seen, within = ctx.saved_tensors
-        grad_painted = torch.nn.functional.pad(grad_outputs[0].mT, (0, within.shape[2] - grad_outputs[0].shape[1]))
+        grad_painted = grad_outputs[0].mT.contiguous()
         grad_rows = torch.zeros(*boxes.shape[:2], 6, 6, device=boxes.device, dtype=boxes.dtype)
         grad_seen = torch.zeros_like(seen)
         for (pixels, runs), edges in zip(_pieces(boxes, ctx.runs), ctx.edges, strict=True):
@@ -104,11 +105,11 @@ class _Edges:
 
     def __init__(self, rows: Float[Tensor, "b k 6 6"], runs: Runs) -> None:
         self.shape = rows.shape
-        self.inside, crossed = runs.relation(rows.flatten(0, 1))
-        figure, run = crossed.nonzero(as_tuple=True)
-        self.place = figure * len(runs) + run
-        self.counts = cast("list[int]", (crossed.sum(-1) * RUN).tolist())
-        self.features = runs.features.index_select(1, run).flatten(1)
+        self.inside, crossed = runs.relation(rows)
+        pattern, figure, run = crossed.nonzero(as_tuple=True)
+        self.place = (pattern * rows.shape[1] + figure) * len(runs) + run
+        self.counts = cast("list[int]", (crossed.sum(-1) * RUN).flatten().tolist())
+        self.features = runs.picked(pattern, run)
         parts = zip(rows.flatten(0, 1), _split(self.features, self.counts), strict=True)
         values = torch.cat([row @ part for row, part in parts], 1)
         self.sharpness = values[4:].clamp_min_(MIN_VARIANCE).rsqrt_()

@@ -1,14 +1,19 @@
-"""The canvas' pixels in short runs with a bounding box each, so that figures skip the runs they do not touch."""
+"""The canvas' pixels in short runs with a bounding box each, so that figures skip the runs they do not touch.
+
+Convention:
+    The leading dimension v is 1 where all patterns are painted on the same pixels, as in recorded frames, or B where
+    each pattern of a batch has pixels of its own, as in pictures from B poses.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from roadproof.coverage import MIN_VARIANCE, Footprints
+from roadproof.coverage import MIN_VARIANCE
 
 RUN = 8
 """Pixels in a run: more would lie further from the edge that crosses the run, fewer would make more runs to test."""
@@ -29,45 +34,61 @@ class Runs:
         bias: see `CanvasView`.
     """
 
-    features: Float[Tensor, "6 n run"]
-    centre: Float[Tensor, "3 n"]
-    reach: Float[Tensor, "2 n"]
-    clean: Float[Tensor, "3 p"]
-    gain: Float[Tensor, "3 p"]
-    bias: Float[Tensor, "3 p"]
+    features: Float[Tensor, "v 6 n run"]
+    centre: Float[Tensor, "v 3 n"]
+    reach: Float[Tensor, "v 2 n"]
+    clean: Float[Tensor, "v 3 p"]
+    gain: Float[Tensor, "v 3 p"]
+    bias: Float[Tensor, "v 3 p"]
 
     @staticmethod
     def of(
-        footprints: Footprints, clean: Float[Tensor, "p 3"], gain: Float[Tensor, "p 3"], bias: Float[Tensor, "p 3"]
+        features: Float[Tensor, "v 6 p"],
+        clean: Float[Tensor, "v p 3"],
+        gain: Float[Tensor, "v p 3"],
+        bias: Float[Tensor, "v p 3"],
     ) -> Runs:
         """Runs of pixels in their order."""
-        missing = -len(footprints) % RUN
-        last = footprints.features[:, -1:].expand(-1, missing)
-        features = torch.cat([footprints.features, last], 1).view(6, -1, RUN)
-        middle = features[:2]
-        half = features[[3, 5]].clamp_min(MIN_VARIANCE).sqrt() + _SLACK_PX
+        missing = -features.shape[2] % RUN
+        last = features[..., -1:].expand(-1, -1, missing)
+        whole = torch.cat([features, last], 2).view(len(features), 6, -1, RUN)
+        middle = whole[:, :2]
+        half = whole[:, [3, 5]].clamp_min(MIN_VARIANCE).sqrt() + _SLACK_PX
         low, high = (middle - half).amin(-1), (middle + half).amax(-1)
-        centre = torch.cat([(low + high) / 2, torch.ones_like(low[:1])])
-        planes = [torch.nn.functional.pad(part.T, (0, missing)) for part in (clean, gain, bias)]
-        return Runs(features, centre, (high - low) / 2, *planes)
+        centre = torch.cat([(low + high) / 2, torch.ones_like(low[:, :1])], 1)
+        planes = [torch.nn.functional.pad(part.mT, (0, missing)) for part in (clean, gain, bias)]
+        return Runs(whole, centre, (high - low) / 2, *planes)
 
     def __len__(self) -> int:
-        return self.features.shape[1]
+        return self.features.shape[2]
 
     def part(self, runs: slice) -> Runs:
-        """Some of the runs."""
+        """Some of the runs of every view."""
         pixels = slice(runs.start * RUN, runs.stop * RUN)
-        planes = (self.clean[:, pixels], self.gain[:, pixels], self.bias[:, pixels])
-        return Runs(self.features[:, runs], self.centre[:, runs], self.reach[:, runs], *planes)
+        planes = (self.clean[..., pixels], self.gain[..., pixels], self.bias[..., pixels])
+        return Runs(self.features[:, :, runs], self.centre[..., runs], self.reach[..., runs], *planes)
 
-    def relation(self, rows: Float[Tensor, "b 6 6"]) -> tuple[Bool[Tensor, "b n"], Bool[Tensor, "b n"]]:
+    def relation(self, rows: Float[Tensor, "b k 6 6"]) -> tuple[Bool[Tensor, "b k n"], Bool[Tensor, "b k n"]]:
         """Which runs lie wholly inside each figure, and which may be crossed by its edges.
 
         Args:
             rows: that give the distances to the four edges, first those across and along the figure to one side.
         """
-        distance = rows[:, :4, :3] @ self.centre
-        depth = torch.minimum(distance[:, :2], distance[:, 2:])
-        reach = rows[:, :2, :2].abs() @ self.reach
-        inside = (depth - reach).amin(1) > 0
-        return inside, ((depth + reach).amin(1) > 0).logical_and_(~inside)
+        distance = self._lined(rows[..., :4, :3], self.centre)
+        depth = torch.minimum(distance[..., :2, :], distance[..., 2:, :])
+        reach = self._lined(rows[..., :2, :2].abs(), self.reach)
+        inside = (depth - reach).amin(-2) > 0
+        return inside, ((depth + reach).amin(-2) > 0).logical_and_(~inside)
+
+    def picked(self, pattern: Int[Tensor, " e"], run: Int[Tensor, " e"]) -> Float[Tensor, "6 c"]:
+        """Features of the pixels of some runs, each of one pattern's view, run after run."""
+        if len(self.features) == 1:
+            return self.features[0].index_select(1, run).flatten(1)
+        return self.features[pattern, :, run].permute(1, 0, 2).flatten(1)
+
+    @staticmethod
+    def _lined(rows: Float[Tensor, "b k i j"], points: Float[Tensor, "v j n"]) -> Float[Tensor, "b k i n"]:
+        """Rows applied to the points of their own view, or of the one there is."""
+        flat = rows.flatten(1, 2)
+        lined = flat.flatten(0, 1) @ points[0] if len(points) == 1 else flat @ points
+        return lined.view(*rows.shape[:3], -1)

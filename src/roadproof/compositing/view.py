@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,6 +47,46 @@ class CanvasView:
         return self.frames.permute(0, 3, 1, 2)
 
 
+class OwnViews(NamedTuple):
+    """Pictures of B poses and the P pixels of each through which the canvas shows: one picture for each pattern.
+
+    Rows with fewer pixels are filled up with copies of their last one, which `valid` leaves out.
+
+    Args:
+        pixel: where in its flattened picture each pixel is, (B, P).
+        valid: which of them are no copies.
+        footprints: of those pixels on the canvas, (B, 1, P, ...).
+        clean: their clean colours.
+        gain: see `CanvasView`.
+        bias: see `CanvasView`.
+        response: painted → seen, before gain and bias.
+        runs: the same pixels in runs, as rectangles are painted.
+    """
+
+    pixel: Int[Tensor, "b p"]
+    valid: Bool[Tensor, "b p"]
+    footprints: Footprints
+    clean: Float[Tensor, "b p 3"]
+    gain: Float[Tensor, "b p 3"]
+    bias: Float[Tensor, "b p 3"]
+    response: Response
+    runs: Runs
+
+    @staticmethod
+    def of(
+        pixel: Int[Tensor, "b p"],
+        valid: Bool[Tensor, "b p"],
+        footprints: Footprints,
+        clean: Float[Tensor, "b p 3"],
+        gain: Float[Tensor, "b p 3"],
+        bias: Float[Tensor, "b p 3"],
+        response: Response,
+    ) -> OwnViews:
+        """The views with their runs."""
+        runs = Runs.of(footprints.features[:, 0], clean, gain, bias)
+        return OwnViews(pixel, valid, footprints, clean, gain, bias, response, runs)
+
+
 def view_canvas(
     frames: UInt8[np.ndarray, "f h w 3"],
     image_from_canvas: Float[np.ndarray, "f 3 3"],
@@ -86,7 +127,7 @@ def view_canvas(
         gain, offset, share = maps.gain.flatten(0, 2)[own], maps.offset.flatten(0, 2)[own], maps.visible.flatten()[own]
     gain, offset, share = (part.to(device=device, dtype=dtype) for part in (gain, offset, share[:, None]))
     gain, bias = share * gain, share * (offset - clean)
-    runs = Runs.of(footprints, clean, gain, bias)
+    runs = Runs.of(footprints.features[None], clean[None], gain[None], bias[None])
     return CanvasView(levels, place, footprints, clean, gain, bias, colour.response, runs)
 
 
