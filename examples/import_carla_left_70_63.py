@@ -3,7 +3,8 @@
     python examples/import_carla_left_70_63.py DATA OUT
 
 DATA is a folder with t1, t2, t3 (clean, pushed right, pushed left) and colour. The homographies and the colours of the
-paint come from the authors' own calibration runs; what is imported is what their attack saw.
+paint come from the authors' own calibration runs; what is imported is what their attack saw. Poses were not recorded:
+they, and the size of the canvas in metres, follow from the homographies.
 """
 
 import argparse
@@ -16,17 +17,24 @@ from PIL import Image
 
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.photometry import ColourFit, fit_colour, samples_from_pictures
+from roadproof.poses import placed
 from roadproof.recordings import Push, Recording, RecordingSet, save_recordings
 
 DRIVES = {"t1": Push.CLEAN, "t2": Push.RIGHT, "t3": Push.LEFT}
+DT_S = 0.1
+
+
+def read_log(folder: Path) -> dict[int, dict[str, str]]:
+    """What was logged, by frame number."""
+    with (folder / "log.csv").open() as file:
+        return {int(row["frame"]): row for row in csv.DictReader(file)}
 
 
 def read_drive(folder: Path, push: Push) -> Recording:
     """One drive: the frames whose homography agrees with the known camera."""
     stored = np.load(folder / "homographies.npz", allow_pickle=False)
     numbers = stored["frame"][stored["consistent"].astype(bool)]
-    with (folder / "log.csv").open() as file:
-        log = {int(row["frame"]): row for row in csv.DictReader(file)}
+    log = read_log(folder)
     return Recording(
         name=str(push),
         push=push,
@@ -37,6 +45,13 @@ def read_drive(folder: Path, push: Push) -> Recording:
         command=np.array([int(log[n]["command"]) for n in numbers]),
         steer=np.array([float(log[n]["steer_clean"]) for n in numbers]),
     )
+
+
+def read_controls(folder: Path, drive: Recording) -> np.ndarray:
+    """Steer, throttle and brake applied from each frame on, (F, 3)."""
+    log = read_log(folder)
+    columns = ("steer_applied", "throttle_applied", "brake_applied")
+    return np.array([[float(log[int(n)][column]) for column in columns] for n in drive.frame_number])
 
 
 def read_colours(folder: Path) -> ColourFit:
@@ -60,15 +75,20 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     args = parser.parse_args()
     colours = read_colours(args.data / "colour")
-    recordings = RecordingSet(
+    drives = {name: read_drive(args.data / name, push) for name, push in DRIVES.items()}
+    unplaced = RecordingSet(
         camera=CIL_CAMERA,
         view=CIL_INPUT,
         colour=colours.transform,
-        recordings=tuple(read_drive(args.data / name, push) for name, push in DRIVES.items()),
+        recordings=tuple(drives.values()),
         origin="CARLA 0.8.2, Town01, start 70, goal 63; github.com/jinghanY/physicalAttackImageComposition",
     )
+    controls = {drive.name: read_controls(args.data / name, drive) for name, drive in drives.items()}
+    recordings = placed(unplaced, dt_s=DT_S, controls=controls)
     save_recordings(recordings, args.out)
     print(f"colour: {colours.report.model}, {colours.report.left_out:.1f} levels off on hues left out of the fit")
+    if recordings.canvas:
+        print(f"canvas: {recordings.canvas.width_m:.2f} m across the road, {recordings.canvas.length_m:.2f} m along it")
     print(f"{args.out}: " + ", ".join(f"{r.name} {len(r.frames)} frames" for r in recordings.recordings))
 
 

@@ -1,9 +1,11 @@
 """Recorded drives on disk: folders that explain themselves, checked when they are read.
 
-    SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, drives
+    SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, the
+                               canvas' place (null where it is not known), drives
     SET/DRIVE/drive.npz        per frame: frame number, homography, speed, command, steer
     SET/DRIVE/frames/N.png     the controller's input, unpainted; or all of them in SET/DRIVE/frames.npy
     SET/DRIVE/shading.npz      optional: gain, offset and visibility of every pixel (see `photometry.PixelMaps`)
+    SET/DRIVE/track.npz        optional: poses and controls of the whole drive (see `tracks.Track`)
 
 Nothing is pickled, and no path in a file leaves the folder.
 """
@@ -12,8 +14,9 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
@@ -25,8 +28,9 @@ from PIL import Image
 
 from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
 from roadproof.files import read_json, write_folder_atomically
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, check_image_from_canvas
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
 from roadproof.photometry import ColourTransform, PixelMaps, Response
+from roadproof.tracks import Track
 
 FORMAT = "roadproof-recordings"
 FORMAT_VERSION = 1
@@ -36,8 +40,14 @@ _UNITS = {
     "speed_mps": "m/s",
     "command": "2 follow, 3 left, 4 right, 5 straight",
     "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
+    "canvas": "its middle and extents in m, yaw in rad: direction of travel, in a right-handed world with z up",
+    "track": "steps numbered as frames, dt_s apart; x_m, y_m, yaw_rad (left positive) of the vehicle's origin in that "
+    "world, speed in m/s; steer, throttle and brake as given at each step and held until the next",
 }
 _PER_FRAME = ("frame_number", "image_from_canvas", "speed_mps", "command", "steer")
+_TRACK = tuple(field.name for field in fields(Track))
+_MOST_TRACK_BYTES = 2**26
+"""A day at 10 steps a second: a track.npz that unpacks to more was not written by roadproof."""
 
 
 class Push(StrEnum):
@@ -63,9 +73,11 @@ class Recording:
         command: CARLA's codes (`datatypes.Command`).
         steer: what the recorded controller answered to each frame; for information.
         maps: per-pixel gain and offset of the paint, where they were calibrated; to the response of the set's colour.
+        track: poses and controls of the whole drive, where they are known; its steps are numbered as the frames are.
 
     Raises:
-        RecordingError: lengths differ, a value is not finite, or a homography is not a view of the canvas.
+        RecordingError: a frame has no pose in the track, lengths differ, a value is not finite, or a homography is not
+            a view of the canvas.
     """
 
     name: str
@@ -77,6 +89,7 @@ class Recording:
     command: Int[np.ndarray, "..."]
     steer: Float[np.ndarray, "..."]
     maps: PixelMaps | None = None
+    track: Track | None = None
 
     def __post_init__(self) -> None:
         count = len(self.frames)
@@ -98,9 +111,14 @@ class Recording:
                 check_image_from_canvas(homography)
             except GeometryError as error:
                 raise RecordingError(f"drive {self.name}, frame {number}: {error}") from None
+        if self.track is not None:
+            try:
+                self.track.rows(self.frame_number)
+            except RecordingError as error:
+                raise RecordingError(f"drive {self.name}: {error}") from None
 
     def thinned(self, every: int) -> Recording:
-        """Every n-th frame, counted back from the last one, which shows the canvas largest."""
+        """Every n-th frame, counted back from the last one, which shows the canvas largest; the track stays whole."""
         frames = slice((len(self.frames) - 1) % every, None, every)
         maps = self.maps and PixelMaps(
             self.maps.gain[frames], self.maps.offset[frames], self.maps.visible[frames], self.maps.response
@@ -119,6 +137,7 @@ class RecordingSet:
         colour: painted → seen, common to all drives.
         recordings: the drives.
         origin: where they come from, in words.
+        canvas: where it lies in the world of the tracks, where that is known.
 
     Raises:
         RecordingError: no drive, two of one name, or frames of another size than the controller's input.
@@ -129,6 +148,7 @@ class RecordingSet:
     colour: ColourTransform
     recordings: tuple[Recording, ...]
     origin: str = ""
+    canvas: CanvasPlacement | None = None
 
     def __post_init__(self) -> None:
         if not self.recordings:
@@ -144,6 +164,11 @@ class RecordingSet:
                     f"expected {self.view.width_px}×{self.view.height_px} as the set's crop and resize make them"
                 )
 
+    @property
+    def is_placed(self) -> bool:
+        """Whether the set can be driven in: its canvas and the poses of all drives are known."""
+        return self.canvas is not None and all(recording.track is not None for recording in self.recordings)
+
 
 def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
     """The drives of several sets as one, such as the same drives in several weathers.
@@ -152,7 +177,8 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
         sets: by name; drives of all but the first are named after theirs.
 
     Raises:
-        RecordingError: there is none, or one differs in camera, crop or colour transform; per-pixel maps may differ.
+        RecordingError: there is none, or one differs in camera, crop, colour transform or the place of the canvas;
+            per-pixel maps may differ.
     """
     first, *others = sets.values() or (None,)
     if first is None:
@@ -161,6 +187,11 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
     for name, each in list(sets.items())[1:]:
         if (each.camera, each.view, each.colour.to_dict()) != (first.camera, first.view, first.colour.to_dict()):
             raise RecordingError(f"the recordings {name} have another camera, crop or colour transform than the first")
+        if each.canvas != first.canvas:
+            raise RecordingError(
+                f"the recordings {name} place the canvas at {each.canvas}, but the first at {first.canvas}; "
+                "expected one place for all"
+            )
         drives += [replace(drive, name=f"{name}-{drive.name}") for drive in each.recordings]
     origin = "; ".join(each.origin for each in (first, *others))
     return replace(first, recordings=tuple(drives), origin=origin)
@@ -198,6 +229,7 @@ def _manifest(recordings: RecordingSet) -> dict[str, Any]:
         "camera": asdict(recordings.camera),
         "crop_resize": asdict(recordings.view),
         "colour": recordings.colour.to_dict(),
+        "canvas": recordings.canvas and asdict(recordings.canvas),
         "drives": [
             {"name": recording.name, "push": str(recording.push), "frames": len(recording.frames)}
             for recording in recordings.recordings
@@ -207,8 +239,10 @@ def _manifest(recordings: RecordingSet) -> dict[str, Any]:
 
 def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
     folder.mkdir()
-    fields: dict[str, Any] = {field: getattr(recording, field) for field in _PER_FRAME}
-    np.savez_compressed(folder / "drive.npz", **fields)
+    per_frame: dict[str, Any] = {field: getattr(recording, field) for field in _PER_FRAME}
+    np.savez_compressed(folder / "drive.npz", **per_frame)
+    if recording.track is not None:
+        np.savez_compressed(folder / "track.npz", **asdict(recording.track))
     if recording.maps is not None:
         maps = recording.maps
         np.savez_compressed(
@@ -241,11 +275,26 @@ def load_recordings(folder: Path) -> RecordingSet:
             colour=colour,
             recordings=tuple(_read_drive(folder, drive, colour.response) for drive in manifest["drives"]),
             origin=str(manifest.get("origin", "")),
+            canvas=_read_canvas(folder / "recordings.json", manifest.get("canvas")),
         )
     except (KeyError, TypeError) as error:
         raise RecordingError(f"{folder / 'recordings.json'} is incomplete or has an unknown field: {error}") from None
     except (ColourError, GeometryError) as error:
         raise RecordingError(f"{folder / 'recordings.json'}: {error}") from None
+
+
+def _read_canvas(path: Path, stored: object) -> CanvasPlacement | None:
+    if stored is None:
+        return None
+    names = [field.name for field in fields(CanvasPlacement)]
+    values = cast("dict[str, Any]", stored) if isinstance(stored, dict) else {}
+    # Python's JSON reads NaN, Infinity and integers that no float holds.
+    numbers = {
+        name: float(value) for name, value in values.items() if isinstance(value, int | float) and abs(value) < 1e9
+    }
+    if set(values) != set(names) or len(numbers) != len(names):
+        raise RecordingError(f"{path}: canvas is {stored!r:.200}, expected finite numbers for {', '.join(names)}")
+    return CanvasPlacement(**numbers)
 
 
 def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Recording:
@@ -259,18 +308,37 @@ def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Record
         push = Push(drive["push"])
     except ValueError:
         raise RecordingError(f"drive {name} has push {drive['push']!r}, expected one of {', '.join(Push)}") from None
-    fields = _read_arrays(folder / "drive.npz", _PER_FRAME)
+    stored = _read_arrays(folder / "drive.npz", _PER_FRAME)
     return Recording(
         name=name,
         push=push,
-        frames=_read_frames(folder, fields["frame_number"]),
-        frame_number=fields["frame_number"],
-        image_from_canvas=fields["image_from_canvas"].astype(np.float64),
-        speed_mps=fields["speed_mps"].astype(np.float64),
-        command=fields["command"],
-        steer=fields["steer"].astype(np.float64),
+        frames=_read_frames(folder, stored["frame_number"]),
+        frame_number=stored["frame_number"],
+        image_from_canvas=stored["image_from_canvas"].astype(np.float64),
+        speed_mps=stored["speed_mps"].astype(np.float64),
+        command=stored["command"],
+        steer=stored["steer"].astype(np.float64),
         maps=_read_maps(folder / "shading.npz", response),
+        track=_read_track(folder / "track.npz", stored["frame_number"]),
     )
+
+
+def _read_track(path: Path, frame_number: np.ndarray) -> Track | None:
+    if not path.exists():
+        return None
+    stored = _read_arrays(path, _TRACK, most_bytes=_MOST_TRACK_BYTES)
+    dt_s, step = stored.pop("dt_s"), stored.pop("step")
+    if dt_s.shape != () or step.dtype.kind not in "iu":
+        raise RecordingError(
+            f"{path} has dt_s of shape {dt_s.shape} and steps of type {step.dtype}, expected one number and integers"
+        )
+    try:
+        values = {name: array.astype(np.float64) for name, array in stored.items()}
+        track = Track(dt_s=float(dt_s), step=step.astype(np.int64), **values)
+        track.rows(frame_number)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    return track
 
 
 def _read_maps(path: Path, response: Response) -> PixelMaps | None:
@@ -283,17 +351,28 @@ def _read_maps(path: Path, response: Response) -> PixelMaps | None:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _read_arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _read_arrays(path: Path, names: tuple[str, ...], *, most_bytes: int | None = None) -> dict[str, np.ndarray]:
+    """Arrays of numbers by name; an archive that would unpack to more than `most_bytes` is not unpacked."""
     try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+        if most_bytes is not None and unpacked > most_bytes:
+            raise RecordingError(f"{path} unpacks to {unpacked} bytes, expected at most {most_bytes}; write it again")
         # Opened here, since numpy leaves the file of a damaged archive open.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in names}
+            arrays: dict[str, np.ndarray] = {name: stored[name] for name in names}
     except FileNotFoundError:
         raise RecordingError(f"{path} is missing") from None
     except KeyError as error:
         raise RecordingError(f"{path}: {error.args[0]}") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+    except RecordingError:
+        raise
+    except (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
         raise RecordingError(f"{path} is damaged ({error}); record or copy it again") from None
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biuf":
+            raise RecordingError(f"{path}: {name} is of type {array.dtype}, expected numbers")
+    return arrays
 
 
 def _read_frames(folder: Path, numbers: np.ndarray) -> UInt8[np.ndarray, "f h w 3"]:

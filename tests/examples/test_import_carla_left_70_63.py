@@ -5,6 +5,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from roadproof.cli import main
@@ -29,6 +30,20 @@ def test_the_consistent_frames_of_three_drives_are_imported(imported):
     assert clean.speed_mps.min() > 5
     assert set(clean.command) == {2}
     assert clean.frames.std() > 20
+
+
+def test_the_imported_drives_are_placed_and_hold_what_was_applied(imported):
+    recordings = load_recordings(imported)
+    assert recordings.canvas.width_m == pytest.approx(7.56, rel=0.02)
+    assert recordings.canvas.length_m == pytest.approx(9.53, rel=0.02)
+    clean, right, left = (drive.track for drive in recordings.recordings)
+    assert {track.dt_s for track in (clean, right, left)} == {0.1}
+    assert [len(track) for track in (clean, right, left)] == [23, 17, 20]
+    at = 46
+    assert right.steer[right.rows(np.array([at]))[0]] == pytest.approx(0.05298, abs=1e-5), "the push, not the answer"
+    assert clean.steer[clean.rows(np.array([at]))[0]] == pytest.approx(-0.05631, abs=1e-5)
+    assert left.throttle.min() > 0.4
+    assert not clean.brake.any()
 
 
 def test_real_recordings_and_a_real_network_are_attacked(imported, pilotnet_data, tmp_path, monkeypatch):

@@ -54,7 +54,8 @@ def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys
     needs.town()
     tiny = dataclasses.replace(
         roadproof.loop.QUICK,
-        frames=5,
+        deviations_m=(1.5,),
+        frames=20,
         schedule=Schedule(iterations=8, drops=()),
         restarts=2,
         select=2,

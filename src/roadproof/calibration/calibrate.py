@@ -146,6 +146,7 @@ def calibrate(
             _recording(drive, g, shading) for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
         ),
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
+        canvas=settings.scenario.canvas,
     )
     return Calibrated(recordings, report)
 
@@ -212,4 +213,5 @@ def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None) -> Rec
         command=drive.episode.command[steps],
         steer=drive.steer[kept],
         maps=maps,
+        track=drive.track,
     )

@@ -26,6 +26,7 @@ from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.recordings import Push
 from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario
+from roadproof.tracks import Track
 
 FORMAT = "roadproof-record"
 FORMAT_VERSION = 1
@@ -67,6 +68,26 @@ class Drive:
     def states(self) -> tuple[VehicleState, ...]:
         """Where the car was at each kept frame."""
         return tuple(self.episode.state(step) for step in self.frame_number.tolist())
+
+    @property
+    def track(self) -> Track:
+        """Poses and controls of all its steps; what was given last is held at the last one."""
+        episode = self.episode
+
+        def held(values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+            return np.append(values, values[-1:] if values.size else 0.0)
+
+        return Track(
+            dt_s=episode.dt_s,
+            step=np.arange(len(episode)),
+            x_m=episode.x_m,
+            y_m=episode.y_m,
+            yaw_rad=episode.yaw_rad,
+            speed_mps=episode.speed_mps,
+            steer=held(episode.steer),
+            throttle=held(episode.throttle),
+            brake=held(episode.brake),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -32,6 +32,7 @@ _GAIN_PRIOR = 0.3
 _GAIN_PRIOR_WEIGHT = 0.05
 _FINE_M = 0.25
 _NOISE_BEFORE_END_S, _NOISE_S = 1.5, 2.1
+_TEST_S = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,6 +170,17 @@ def swerving(policy: Policy, path: CleanPath, wanted: Offsets, answered: Callabl
         return Control(steer, control.throttle, control.brake).clipped()
 
     return act
+
+
+def steering_test(side: float, dt_s: float) -> list[float]:
+    """Steer for a second: full to a side, full to the other, straight; it shows how far and how fast the wheels turn.
+
+    Args:
+        side: 1 begins to the right, −1 to the left.
+        dt_s: seconds a step.
+    """
+    held = max(round(_TEST_S / dt_s), 1)
+    return [*([side] * held), *([-side] * held), *([0.0] * (held // 2))]
 
 
 def noisy(

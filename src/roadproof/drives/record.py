@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -14,7 +15,7 @@ from roadproof.compositing.view import canvas_pixels
 from roadproof.controllers import Controller
 from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
 from roadproof.drives.drives import Drive, Drives, Settings, read_drive, write_drive, write_settings
-from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, swerving
+from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
 from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, homography_from_pose
@@ -192,8 +193,9 @@ def _perturbed(
     for tried in range(TRIES):
         share = SMALLER**tried
         film = _Film(settings.scenario, settings.window)
-        episode, answered = _astray(simulator, driver, settings, plan, clean, share, film)
-        harm = next((str(event.kind) for event in episode.events if event.kind in _ENDS_IT), "")
+        episode, answered, behind_s = _astray(simulator, driver, settings, plan, clean, share, film)
+        events = (event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= behind_s)
+        harm = next((str(event.kind) for event in events), "")
         if not harm:
             chosen = _chosen(film, settings, plan.name)
             right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in chosen[2]])
@@ -213,29 +215,46 @@ def _astray(
     clean: Drive,
     share: float,
     film: _Film,
-) -> tuple[Episode, Float[np.ndarray, " n"]]:
-    """One perturbed drive to behind the canvas, and what the driver answered on the way."""
+) -> tuple[Episode, Float[np.ndarray, " n"], float]:
+    """One perturbed drive to behind the canvas, what the driver answered on the way, and when it was behind.
+
+    A swerve ends with a steering test there, from which a vehicle can be identified (`recorded.vehicle`); it stops
+    where it comes to harm.
+    """
     path, answers = CleanPath.of(clean.episode), list[float]()
     first, last = (path.locate(clean.states[k], None)[0] for k in (0, -1))
     rng = np.random.default_rng((settings.seed, plan.stream, list(Push).index(plan.push)))
     at_m: float | None = None
+    behind_s, test = math.inf, list[float]()
+    how = settings.trajectories.perturbation
 
     def begin(world: SimulatorT) -> Policy:
-        policy, how = policy_of(driver, world), settings.trajectories.perturbation
+        policy = policy_of(driver, world)
         if isinstance(how, SteeringNoise):
             noise = steering_noise(plan.push, how, clean.episode, int(clean.frame_number[-1]), rng)
             return noisy(policy, clean.episode, share * noise, answers.append)
         length_m = float(path.arclength_m[-1])
         wanted = offsets(plan.push, share * plan.deviation_m, first, last, length_m, rng)
-        return swerving(policy, path, wanted, answers.append)
+        swerve = swerving(policy, path, wanted, answers.append)
 
-    def behind(seen: Observation) -> bool:
-        nonlocal at_m
-        at_m, _ = path.locate(seen.state, at_m)
-        return at_m > last + AFTER_M
+        def act(seen: Observation) -> Control:
+            control = swerve(seen)
+            return replace(control, steer=test.pop(0)) if seen.time_s >= behind_s else control
 
-    episode = rollout(simulator, begin, settings.scenario, weather=settings.weather, on_step=film, until=behind)
-    return episode, np.array(answers)
+        return act
+
+    def over(seen: Observation) -> bool:
+        nonlocal at_m, behind_s
+        if behind_s < math.inf:
+            return not test or any(event.kind in _ENDS_IT for event in seen.events)
+        at_m, d = path.locate(seen.state, at_m)
+        if at_m > last + AFTER_M:
+            behind_s = seen.time_s
+            test.extend([] if isinstance(how, SteeringNoise) else steering_test(-np.sign(d) or 1.0, settings.dt_s))
+        return behind_s < math.inf and not test
+
+    episode = rollout(simulator, begin, settings.scenario, weather=settings.weather, on_step=film, until=over)
+    return episode, np.array(answers), behind_s
 
 
 Chosen: TypeAlias = tuple[Int[np.ndarray, " f"], UInt8[np.ndarray, "f h w 3"], Int[np.ndarray, " f"]]

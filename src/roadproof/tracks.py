@@ -1,0 +1,104 @@
+"""Where a car was at every step of a drive, and what it was told to do there: what a vehicle is identified from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from roadproof.datatypes import VehicleState
+from roadproof.errors import RecordingError
+
+FASTEST_MPS = 70.0
+"""No car of a recording moves faster between two steps: a pose that jumps further is wrong."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Track:
+    """The n steps of a drive whose poses are known.
+
+    Args:
+        dt_s: seconds from one step to the next.
+        step: numbers of the steps, rising; where one is left out, nothing is known of it.
+        x_m: world x of the vehicle's origin at each step.
+        y_m: world y.
+        yaw_rad: heading, left positive.
+        speed_mps: forward speed, from −1 (rolling back) to `FASTEST_MPS`.
+        steer: given at each step and held until the next, in [−1, 1], right positive.
+        throttle: the same, in [0, 1].
+        brake: the same, in [0, 1].
+
+    Raises:
+        RecordingError: lengths differ, a value is not finite or outside its range, steps do not rise, or a pose jumps.
+    """
+
+    dt_s: float
+    step: Int[np.ndarray, "..."]
+    x_m: Float[np.ndarray, "..."]
+    y_m: Float[np.ndarray, "..."]
+    yaw_rad: Float[np.ndarray, "..."]
+    speed_mps: Float[np.ndarray, "..."]
+    steer: Float[np.ndarray, "..."]
+    throttle: Float[np.ndarray, "..."]
+    brake: Float[np.ndarray, "..."]
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.dt_s <= 1.0:
+            raise RecordingError(f"dt_s of the track is {self.dt_s}, expected seconds above 0 and at most 1")
+        count = self.step.size
+        if count == 0:
+            raise RecordingError("the track has no step, expected at least one")
+        for field in fields(self)[1:]:
+            values: np.ndarray = getattr(self, field.name)
+            if values.shape != (count,):
+                raise RecordingError(f"{field.name} of the track has shape {values.shape}, expected ({count},)")
+            if not np.isfinite(values).all():
+                raise RecordingError(f"{field.name} of the track has NaN or infinite values")
+        for name, low, high in (("steer", -1, 1), ("throttle", 0, 1), ("brake", 0, 1), ("speed_mps", -1, FASTEST_MPS)):
+            values = getattr(self, name)
+            if values.min() < low or values.max() > high:
+                raise RecordingError(
+                    f"{name} of the track goes from {values.min():g} to {values.max():g}, expected [{low}, {high}]"
+                )
+        passed = np.diff(self.step)
+        if count > 1 and passed.min() < 1:
+            raise RecordingError("steps of the track do not rise; order its rows by step, each once")
+        moved = np.hypot(np.diff(self.x_m), np.diff(self.y_m))
+        jumps = np.flatnonzero(moved > FASTEST_MPS * self.dt_s * passed)
+        if jumps.size:
+            at = int(jumps[0])
+            raise RecordingError(
+                f"the pose jumps by {moved[at]:.1f} m from step {self.step[at]} to {self.step[at + 1]}; "
+                "check positions and step numbers"
+            )
+
+    def __len__(self) -> int:
+        """How many steps are known."""
+        return self.step.size
+
+    def rows(self, numbers: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
+        """Index of each of some steps.
+
+        Raises:
+            RecordingError: one of them is not known.
+        """
+        found = np.searchsorted(self.step, numbers).clip(0, len(self) - 1)
+        missing = np.flatnonzero(self.step[found] != numbers)
+        if missing.size:
+            raise RecordingError(f"the track has no pose for frame {numbers[missing[0]]}; drop the frame or add it")
+        return found
+
+    def state(self, row: int) -> VehicleState:
+        """Pose and speed at one row, on the ground."""
+        return VehicleState(
+            float(self.x_m[row]), float(self.y_m[row]), 0.0, float(self.yaw_rad[row]), float(self.speed_mps[row])
+        )
+
+    def stretches(self) -> Iterator[slice]:
+        """Rows of steps that follow each other without a gap."""
+        ends = np.flatnonzero(np.diff(self.step) != 1) + 1
+        bounds = [0, *ends.tolist(), len(self)]
+        yield from (slice(first, last) for first, last in pairwise(bounds))
