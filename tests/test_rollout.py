@@ -10,10 +10,10 @@ import torch
 import needs
 from roadproof.controllers import Controller
 from roadproof.coverage import Shape
-from roadproof.datatypes import Control, Event, EventKind, Weather
+from roadproof.datatypes import Control, Ending, Event, EventKind, Weather
 from roadproof.errors import ControllerError, EpisodeError, OutputError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
-from roadproof.rollout import Ending, Episode, replay, rollout
+from roadproof.rollout import Episode, replay, rollout
 from roadproof.scenarios import builtin_scenarios, find_scenario
 
 needs.town()

@@ -109,6 +109,15 @@ class Event:
     detail: str = ""
 
 
+class Ending(StrEnum):
+    """Why a drive ended."""
+
+    GOAL_REACHED = "goal reached"
+    TIME_LIMIT = "time limit"
+    STOPPED = "stopped"
+    LEFT_RECORDED = "left the recorded stretch"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
     """What a simulator shows after a reset or a step.
@@ -119,8 +128,9 @@ class Observation:
         command: what the route asks next.
         time_s: seconds since the reset.
         events: what happened since the last observation.
-        done: the goal is reached, or the time limit has passed.
+        done: the drive is over: the goal is reached, the time limit has passed, or what `ending` says.
         picture: the full camera picture, where it was asked for.
+        ending: why the drive is over, where it is neither the goal nor the time limit.
     """
 
     frame: UInt8[np.ndarray, "h w 3"]
@@ -130,6 +140,7 @@ class Observation:
     events: tuple[Event, ...] = ()
     done: bool = False
     picture: UInt8[np.ndarray, "hc wc 3"] | None = None
+    ending: Ending | None = None
 
     @property
     def shown(self) -> UInt8[np.ndarray, "hs ws 3"]:

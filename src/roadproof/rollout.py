@@ -12,7 +12,6 @@ import json
 import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from enum import StrEnum
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -21,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from roadproof.controllers import Controller
-from roadproof.datatypes import Control, Event, EventKind, Observation, VehicleState, Weather
+from roadproof.datatypes import Control, Ending, Event, EventKind, Observation, VehicleState, Weather
 from roadproof.errors import ControllerError, EpisodeError, SimulatorError
 from roadproof.files import write_atomically
 from roadproof.patterns import Pattern, raster
@@ -49,14 +48,6 @@ Driver: TypeAlias = Callable[[SimulatorT], Policy]
 
 OnStep: TypeAlias = Callable[[Observation, Control | None], object]
 """Told of each observation and the control that answers it, before it is carried out; the last has none."""
-
-
-class Ending(StrEnum):
-    """Why a drive ended."""
-
-    GOAL_REACHED = "goal reached"
-    TIME_LIMIT = "time limit"
-    STOPPED = "stopped"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -244,7 +235,7 @@ def rollout(
     if on_step is not None:
         on_step(seen, None)
     late = seen.time_s >= scenario.time_limit_s - 0.5 * simulator.dt_s
-    ending = Ending.STOPPED if stopped else Ending.TIME_LIMIT if late else Ending.GOAL_REACHED
+    ending = Ending.STOPPED if stopped else seen.ending or (Ending.TIME_LIMIT if late else Ending.GOAL_REACHED)
     *observed, command = np.array(rows, np.float64).T
     given = [np.array([getattr(control, name) for control in controls], np.float64) for name in _GIVEN]
     return Episode(

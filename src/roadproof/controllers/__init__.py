@@ -14,6 +14,7 @@ from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA as PILOTNET_ON_CARL
 from roadproof.controllers.pilotnet import PilotNet as PilotNet
 from roadproof.controllers.pilotnet import pilotnet_controller as pilotnet_controller
 from roadproof.controllers.protocol import Controller as Controller
+from roadproof.controllers.protocol import PedalController as PedalController
 from roadproof.controllers.shipped import ModelCard as ModelCard
 from roadproof.controllers.shipped import model_card as model_card
 from roadproof.controllers.shipped import shipped_names as shipped_names

@@ -80,15 +80,26 @@ class ConditionalNetwork(nn.Module):
         """
         return self._controls(self.image_feature(frames), speed_mps, command)[:, 0].to(frames.dtype)
 
+    def controls(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, "b 3"]:
+        """The published agent's steer, throttle and brake; see `controllers.PedalController`.
+
+        It does not brake below 0.1, gives gas or brakes but not both, and gives no gas above 10 m/s.
+
+        Raises:
+            ControllerError: frames of the wrong size.
+        """
+        steer, gas, brake = self._controls(self.image_feature(frames), speed_mps, command).to(frames.dtype).unbind(1)
+        brake = torch.where((brake < 0.1) | (gas > brake), 0.0, brake)
+        gas = torch.where((speed_mps > 10.0) & (brake == 0.0), 0.0, gas)
+        return torch.stack([steer.clamp(-1.0, 1.0), gas.clamp(0.0, 1.0), brake.clamp(0.0, 1.0)], 1)
+
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
-        """The published agent's control: no braking below 0.1, gas or brake but not both, no gas above 10 m/s."""
-        frames, speed, code = one_frame_batch(self, frame, speed_mps, command)
+        """What `controls` says of one frame."""
         with torch.no_grad():
-            steer, gas, brake = map(float, self._controls(self.image_feature(frames), speed, code)[0])
-        brake = 0.0 if brake < 0.1 or gas > brake else brake
-        if speed_mps > 10.0 and brake == 0.0:
-            gas = 0.0
-        return Control(steer=steer, throttle=gas, brake=brake).clipped()
+            steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
+        return Control(steer=steer, throttle=gas, brake=brake)
 
     def _controls(
         self, image: Float[Tensor, "b image"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]

@@ -45,3 +45,24 @@ class Controller(Protocol):
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """What the car shall do now; every value of the control is inside its range."""
         ...
+
+
+@runtime_checkable
+class PedalController(Controller, Protocol):
+    """A controller that also says throttle and brake for many frames at once.
+
+    Recorded worlds drive many cars side by side. A controller that only steers is given the clean drive's speed there;
+    one of these its own, also where paint changes it.
+    """
+
+    def controls(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, "b 3"]:
+        """Steer, throttle and brake of each frame by itself, inside their ranges, differentiable in the frames.
+
+        Args:
+            frames: RGB in [0, 1].
+            speed_mps: speed of the car at each frame.
+            command: what the route asks at each frame.
+        """
+        ...

@@ -42,6 +42,11 @@ class CruiseControl:
         effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
         return Control(steer=steer, throttle=max(effort, 0.0), brake=max(-effort, 0.0)).clipped()
 
+    def controls(self, steer: Float[Tensor, " b"], speed_mps: Float[Tensor, " b"]) -> Float[Tensor, "b 3"]:
+        """The same for many cars: steer, throttle and brake inside their ranges, differentiable."""
+        effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
+        return torch.stack([steer.clamp(-1.0, 1.0), effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0)], 1)
+
 
 class SteeringController(nn.Module):
     """A `Controller` around a network that answers with one steering value a frame.
@@ -94,6 +99,16 @@ class SteeringController(nn.Module):
                 "expected one steering value a frame"
             )
         return answer.reshape(-1).to(frames.dtype)
+
+    def controls(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, "b 3"]:
+        """Steer by the network, throttle and brake by `cruise`; see `controllers.PedalController`.
+
+        Raises:
+            ControllerError: as `steer` does.
+        """
+        return self.cruise.controls(self.steer(frames, speed_mps, command), speed_mps)
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """Steer by the network, hold the speed by `cruise`."""

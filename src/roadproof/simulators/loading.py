@@ -75,6 +75,8 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
         with CarlaSimulator(host, port, paint=paint) as server:
             yield server
         return
+    if spec.startswith("recorded:"):
+        raise SimulatorError(f"simulator {spec!r} is a recorded world, which evaluate, select and drive alone drive in")
     raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")
 
 

@@ -29,6 +29,14 @@ class PaintKind(StrEnum):
     INJECT = "inject"
     """Put into the pictures of the car's camera."""
 
+    COMPOSITED = "composited"
+    """Composited into pictures made from recorded frames: nothing was driven for real."""
+
+    @property
+    def predicted(self) -> bool:
+        """Whether drives over such paint are predictions, not drives."""
+        return self is PaintKind.COMPOSITED
+
 
 Pictures: TypeAlias = bool | frozenset[int]
 """Which observations of a drive have the full camera picture: all, none, or those after so many steps."""
@@ -109,4 +117,14 @@ class Simulator(Protocol):
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px."""
+        ...
+
+
+@runtime_checkable
+class Identified(Protocol):
+    """A simulator that differs from others of its kind in more than camera, input and time step."""
+
+    @property
+    def identity(self) -> str:
+        """A text that is the same where its world is the same, and else another."""
         ...

@@ -1,0 +1,136 @@
+"""The clean drive as a line that other drives are compared with, and the bare road's law of steering along it.
+
+    symbol    meaning                                                                  unit
+    s         arclength along the clean path                                           m
+    d         offset from it, positive to the right                                    m
+    e         heading error, positive to the left                                      rad
+
+Near the clean drive a controller answers to the bare road with about
+
+    u = u_clean(s) + p d + q e + r d |d|
+
+fitted to its answers to the recorded frames. The law stands for the picture where there is none, past the last recorded
+frame, and its slopes stand for what the picture would say of a small change of pose when gradients are taken.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from roadproof.errors import RecordingError
+from roadproof.geometry import CanvasPlacement
+from roadproof.metrics import passage
+from roadproof.recorded.pictures import Poses
+from roadproof.recorded.vehicle import curvatures
+from roadproof.tracks import Track
+
+_FAR_M = 4.0
+
+
+class Place(NamedTuple):
+    """Where R cars are beside the clean path.
+
+    Args:
+        nearest: index of the nearest known point of it.
+        s_m: arclength.
+        right_m: offset; differentiable in the pose, as turned_rad.
+        turned_rad: heading error, left positive.
+    """
+
+    nearest: Int[Tensor, " r"]
+    s_m: Float[Tensor, " r"]
+    right_m: Float[Tensor, " r"]
+    turned_rad: Float[Tensor, " r"]
+
+
+class Course:
+    """The clean drive while the canvas is in view.
+
+    Args:
+        track: of the clean drive.
+        canvas: where it lies.
+        shown: step of the first recorded frame: there is nothing to see before it.
+        device: where it is compared.
+
+    Raises:
+        RecordingError: the drive is too short, or does not move.
+    """
+
+    def __init__(
+        self, track: Track, canvas: CanvasPlacement, shown: int, *, device: torch.device | str = "cpu"
+    ) -> None:
+        rows = max(track.stretches(), key=lambda part: part.stop - part.start)
+        if rows.stop - rows.start < 3:
+            raise RecordingError("the clean drive has fewer than three steps that follow each other; record more of it")
+        x, y = track.x_m[rows] - canvas.x_m, track.y_m[rows] - canvas.y_m
+        moved = np.hypot(np.diff(x), np.diff(y))
+        if moved.sum() < 1.0:
+            raise RecordingError("the clean drive moves less than a metre past the canvas; check its track")
+        seen = passage(np.stack([track.x_m[rows], track.y_m[rows]], 1), canvas)
+        kappa = curvatures(track, rows)
+        self.seen, self.dt_s = seen, track.dt_s
+        self.first = max(seen.start, shown - int(track.step[rows][0]))
+        self.count = seen.stop - self.first
+        self.canvas, self.rows = canvas, rows
+
+        def on_device(values: Float[np.ndarray, " n"]) -> Float[Tensor, " n"]:
+            return torch.tensor(values, dtype=torch.float64, device=device)
+
+        self.arclength_m = on_device(np.concatenate([[0.0], moved.cumsum()]))
+        self.poses = Poses(on_device(x), on_device(y), on_device(np.unwrap(track.yaw_rad[rows])))
+        self.speed_mps = on_device(track.speed_mps[rows])
+        self.steer, self.throttle, self.brake = (
+            on_device(getattr(track, name)[rows]) for name in ("steer", "throttle", "brake")
+        )
+        self.curvature = on_device(np.concatenate([kappa[:1], kappa]))
+        self._law = on_device(np.zeros(3))
+
+    def locate(self, poses: Poses) -> Place:
+        """The nearest point of the clean path, and how a car lies to it."""
+        here, path = poses.detached(), self.poses
+        index = ((here.x_m[:, None] - path.x_m).square() + (here.y_m[:, None] - path.y_m).square()).argmin(1)
+        x, y, yaw = path.x_m[index], path.y_m[index], path.yaw_rad[index]
+        c, s = torch.cos(yaw), torch.sin(yaw)
+        dx, dy = poses.x_m - x, poses.y_m - y
+        turned = poses.yaw_rad - yaw
+        turned = turned - 2 * math.pi * torch.round(turned.detach() / (2 * math.pi))
+        return Place(index, self.arclength_m[index] + (c * dx + s * dy).detach(), s * dx - c * dy, turned)
+
+    def between(self, values: Float[Tensor, " n"], place: Place) -> Float[Tensor, " r"]:
+        """What has one value a point of the path, at places between them."""
+        last = len(values) - 2
+        behind = (place.s_m < self.arclength_m[place.nearest]).long()
+        low = (place.nearest - behind).clamp(0, last)
+        start, end = self.arclength_m[low], self.arclength_m[low + 1]
+        share = ((place.s_m - start) / (end - start).clamp_min(1e-6)).clamp(0.0, 1.0)
+        return torch.lerp(values[low], values[low + 1], share)
+
+    def fit_law(self, poses: Poses, answers: Float[Tensor, " n"]) -> None:
+        """Fit the bare road's law to a controller's answers to recorded frames."""
+        place = self.locate(poses)
+        d, e = place.right_m, place.turned_rad
+        terms = torch.stack([d, e, d * d.abs()], 1)
+        weight = torch.eye(3, dtype=d.dtype, device=d.device) * 1e-3 * len(d)
+        left = answers.to(d) - self.between(self.steer, place)
+        self._law = cast("Tensor", torch.linalg.solve(terms.mT @ terms + weight, terms.mT @ left))
+
+    def law(self, place: Place) -> Float[Tensor, " r"]:
+        """Steering on the bare road at some places."""
+        d = place.right_m.clamp(-_FAR_M, _FAR_M)
+        p, q, r = self._slopes()
+        return self.between(self.steer, place) + p * d + q * place.turned_rad + r * d * d.abs()
+
+    def _slopes(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._law[0], self._law[1], self._law[2]
+
+    def feedback(self, place: Place) -> Float[Tensor, " r"]:
+        """Zero, with the slopes of the law: the gradient that the picture would add through the pose."""
+        p, q, _ = self._slopes()
+        d, e = place.right_m, place.turned_rad
+        return p * (d - d.detach()) + q * (e - e.detach())

@@ -1,0 +1,339 @@
+"""The recorded world behind the protocol of simulators: whatever drives in the town drives in calibrated recordings.
+
+    with RecordedSimulator(load_recordings(Path("out/runs/left-03/recordings"))) as world:
+        episode = rollout(world, controller, world.scenario, pattern=pattern)
+
+What comes of it is predicted: nothing is driven for real. There is no map either, so nothing is known of infractions.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from roadproof.compositing.raster import composite_raster
+from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
+from roadproof.errors import SimulatorError
+from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, Homography, homography_from_pose
+from roadproof.recorded.pictures import Gap, Poses
+from roadproof.recorded.vehicle import Motion, Vehicle
+from roadproof.recorded.world import RecordedWorld
+from roadproof.recordings import RecordingSet
+from roadproof.scenarios import Kind, Scenario
+from roadproof.simulators.arguments import check_pattern
+from roadproof.simulators.protocol import PaintKind, PatternImage, Pictures
+
+FURTHEST_ASIDE_M = 3.0
+"""A picture moved further to the side than this shows too much that was never recorded, so the drive ends."""
+
+FURTHEST_TURNED_RAD = 0.6
+"""The same for its turn: at more than a third of the field of view, too much of the picture is made up."""
+
+SAME_PLACE_M = 0.01
+"""A scenario's canvas is that of the recordings within this."""
+
+SLOWEST = 4.0
+"""The time limit of the set's own scenario, in durations of the recorded clean drive."""
+
+TURNS_RAD = 0.35
+"""A clean drive that turns by more than this goes to the left or to the right; else straight on."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedGap:
+    """How far the car is from the pose of the recorded frame that its picture is made from.
+
+    Args:
+        ahead_m: along its heading, positive where the car is further on.
+        left_m: across it, positive where the car is further left.
+        turned_rad: of heading, left positive.
+    """
+
+    ahead_m: float
+    left_m: float
+    turned_rad: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether a picture made over this gap can be trusted."""
+        return abs(self.left_m) <= FURTHEST_ASIDE_M and abs(self.turned_rad) <= FURTHEST_TURNED_RAD
+
+
+@dataclass(kw_only=True, slots=True)
+class _Drive:
+    """A drive on its way."""
+
+    scenario: Scenario
+    pattern: PatternImage | None
+    full_pictures: Pictures
+    car: Motion
+    steps: int = 0
+
+
+class RecordedSimulator:
+    """Drives in calibrated recordings, as a `Simulator`.
+
+    Every drive begins where the recorded stretch of the clean drive begins, at its speed there, wherever a scenario
+    says that it starts; it ends at the canvas' end. Where the car leaves the band in which pictures can be trusted, it
+    ends as well, and the ending says so.
+
+    There are no full pictures. Where they are asked for, the frame is enlarged to the place that it has in the camera
+    picture; around it, where nothing was recorded, the picture is black.
+
+    Args:
+        recordings: calibrated, with a canvas and the tracks of the drives; the clean drive among them.
+        vehicle: how the car answers; identified from the drives by default.
+        weather: what the light of the recordings is called. They have one light, so drives in another are refused.
+        device: where pictures are made.
+
+    Raises:
+        RecordingError: there is no clean drive, poses are not known, or the vehicle cannot be identified.
+        SimulatorError: the vehicle's time step is not the recordings'.
+    """
+
+    def __init__(
+        self,
+        recordings: RecordingSet,
+        *,
+        vehicle: Vehicle | None = None,
+        weather: Weather = Weather.CLEAR_NOON,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self._world = RecordedWorld(recordings, vehicle=vehicle, device=device)
+        if self._world.vehicle.dt_s != self._world.course.dt_s:
+            raise SimulatorError(
+                f"the vehicle has steps of {self._world.vehicle.dt_s} s, the recordings have {self._world.course.dt_s} "
+                "s; expected one and the same"
+            )
+        self._weather = Weather(weather)
+        self._open = False
+        self._drive: _Drive | None = None
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera on the car."""
+        return self._world.recordings.camera
+
+    @property
+    def input(self) -> CropResize:
+        """How the controller's frame was cut from the camera picture."""
+        return self._world.recordings.view
+
+    @property
+    def dt_s(self) -> float:
+        """Seconds per step, those of the recorded tracks."""
+        return self._world.course.dt_s
+
+    @property
+    def paint(self) -> PaintKind:
+        """How patterns are put on the road: composited into the pictures."""
+        return PaintKind.COMPOSITED
+
+    @cached_property
+    def identity(self) -> str:
+        """A hash of frames, poses, colours and vehicle: other recordings are another world."""
+        recordings = self._world.recordings
+        found = hashlib.sha256(repr((asdict(self._world.vehicle), recordings.colour.to_dict())).encode())
+        for drive in recordings.recordings:
+            track = drive.track
+            arrays: list[Any] = [drive.frames, drive.frame_number, drive.image_from_canvas]
+            arrays += [] if track is None else [track.x_m, track.y_m, track.yaw_rad, track.speed_mps]
+            arrays += [] if drive.maps is None else [drive.maps.gain, drive.maps.offset, drive.maps.visible]
+            for values in arrays:
+                found.update(np.ascontiguousarray(values).tobytes())
+        return found.hexdigest()
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The recorded stretch as a scenario: from its first frame to the canvas' end; no simulator has its map."""
+        course, recordings = self._world.course, self._world.recordings
+        first, last = course.first, course.first + course.count - 1
+        goal_x_m, goal_y_m = self.way[-1].tolist()
+        turned = float(course.poses.yaw_rad[last] - course.poses.yaw_rad[first])
+        kind: Kind = "straight" if abs(turned) <= TURNS_RAD else "left" if turned > 0 else "right"
+        name = recordings.origin.split(",")[0].strip()
+        return Scenario(
+            name=name or "recorded",
+            kind=kind,
+            map_name="recorded",
+            start=self._state(self._world.begin()),
+            goal_m=(goal_x_m, goal_y_m),
+            canvas=course.canvas,
+            time_limit_s=SLOWEST * course.count * course.dt_s,
+        )
+
+    @property
+    def way(self) -> Float[np.ndarray, "n 2"]:
+        """World x, y of the recorded clean drive along the stretch."""
+        course, canvas = self._world.course, self._world.bank.canvas
+        stretch = slice(course.first, course.first + course.count)
+        path = torch.stack([course.poses.x_m[stretch] + canvas.x_m, course.poses.y_m[stretch] + canvas.y_m], 1)
+        return path.cpu().numpy()
+
+    @property
+    def state(self) -> VehicleState:
+        """Where the car is now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._state(self._running().car)
+
+    @property
+    def gap(self) -> RecordedGap:
+        """How far the car is from the recorded pose that its picture is made from.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return _told(self._world.bank.nearest(_poses(self._running().car)))
+
+    def __enter__(self) -> RecordedSimulator:
+        self._open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open, self._drive = False, None
+
+    def reset(
+        self,
+        scenario: Scenario,
+        *,
+        weather: Weather = Weather.CLEAR_NOON,
+        pattern: PatternImage | None = None,
+        cars: int = 0,
+        pedestrians: int = 0,
+        seed: int = 0,  # noqa: ARG002  # nothing here is drawn by chance
+        full_pictures: Pictures = False,
+    ) -> Observation:
+        """Begin a drive at the beginning of the recorded stretch.
+
+        Args:
+            scenario: its canvas must be the recordings'; its time limit counts from the beginning of the stretch, and
+                its start, goal and map are not looked at.
+            weather: that of the recordings.
+            pattern: painted on the canvas; None leaves the road bare.
+            cars: 0, since the recordings have none.
+            pedestrians: 0 as well.
+            seed: of nothing; drives are the same whatever it is.
+            full_pictures: which observations have an enlarged frame.
+
+        Raises:
+            SimulatorError: it is not open, or an argument does not fit.
+        """
+        if not self._open:
+            raise SimulatorError("the recorded world is closed; use it in a with-block")
+        if Weather(weather) is not self._weather:
+            raise SimulatorError(
+                f"the recordings have one light, called {self._weather}, so there is no drive at {weather}; record one"
+            )
+        if cars or pedestrians:
+            raise SimulatorError(
+                f"{cars} cars and {pedestrians} pedestrians are asked for, but recordings hold no others on the road; "
+                "expected 0 of both"
+            )
+        _check_canvas(scenario.canvas, self._world.bank.canvas)
+        check_pattern(pattern)
+        self._drive = _Drive(scenario=scenario, pattern=pattern, full_pictures=full_pictures, car=self._world.begin())
+        return self._observe(self._drive)
+
+    def step(self, control: Control) -> Observation:
+        """Drive on for `dt_s`; values of the control outside their range are clipped.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        drive = self._running()
+        given = control.clipped()
+        pedals = (self._one(value) for value in (given.steer, given.throttle, given.brake))
+        drive.car = self._world.vehicle.step(drive.car, *pedals)
+        drive.steps += 1
+        return self._observe(drive)
+
+    def image_from_canvas(self) -> Homography:
+        """The exact homography of the current state: canvas px to camera px.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return homography_from_pose(self.camera, self.state, self._world.bank.canvas)
+
+    def _running(self) -> _Drive:
+        if self._drive is None:
+            raise SimulatorError("there is no drive; call reset first")
+        return self._drive
+
+    def _one(self, value: float) -> Tensor:
+        return torch.tensor([value], dtype=torch.float64, device=self._world.device)
+
+    def _state(self, car: Motion) -> VehicleState:
+        canvas = self._world.bank.canvas
+        x, y, yaw, speed = (float(value) for value in (car.x_m, car.y_m, car.yaw_rad, car.speed_mps))
+        return VehicleState(x + canvas.x_m, y + canvas.y_m, canvas.z_m, yaw, speed)
+
+    def _observe(self, drive: _Drive) -> Observation:
+        course, poses, time_s = self._world.course, _poses(drive.car), drive.steps * self.dt_s
+        nearest = self._world.bank.nearest(poses)
+        inside = _told(nearest).inside
+        arrived = bool(course.locate(poses).s_m >= course.arclength_m[course.first + course.count - 1])
+        frame = self._frame(poses, nearest, drive.pattern)
+        wanted = drive.full_pictures
+        shown = wanted if isinstance(wanted, bool) else drive.steps in wanted
+        return Observation(
+            frame=frame,
+            state=self._state(drive.car),
+            command=Command(int(self._world.bank.command[nearest.frame])),
+            time_s=time_s,
+            done=arrived or not inside or time_s >= drive.scenario.time_limit_s - 1e-9,
+            picture=self._enlarged(frame) if shown else None,
+            ending=None if inside else Ending.LEFT_RECORDED,
+        )
+
+    def _frame(self, poses: Poses, nearest: Gap, pattern: PatternImage | None) -> UInt8[np.ndarray, "h w 3"]:
+        with torch.no_grad():
+            views = self._world.bank.show(poses, nearest)
+            frames = views.frames
+            if pattern is not None and views.canvas is not None:
+                frames = composite_raster(pattern, frames, views.canvas)
+        return (frames[0] * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+    def _enlarged(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "hc wc 3"]:
+        """A black camera picture with the frame where it was cut from."""
+        view, camera = self.input, self.camera
+        picture = Image.new("RGB", (camera.width_px, camera.height_px))
+        size = (view.right_px - view.left_px, view.bottom_px - view.top_px)
+        picture.paste(Image.fromarray(frame).resize(size, Image.Resampling.NEAREST), (view.left_px, view.top_px))
+        return np.asarray(picture)
+
+
+def _poses(car: Motion) -> Poses:
+    return Poses(car.x_m, car.y_m, car.yaw_rad)
+
+
+def _told(gap: Gap) -> RecordedGap:
+    return RecordedGap(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
+
+
+def _check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
+    turned = math.remainder(asked.yaw_rad - recorded.yaw_rad, 2 * math.pi)
+    same = replace(asked, yaw_rad=recorded.yaw_rad + turned)
+    # Radians count as metres do: so far is what lies a metre from the middle moved by a turn.
+    off = {name: abs(getattr(same, name) - getattr(recorded, name)) for name in CanvasPlacement.__slots__}
+    worst = max(off, key=lambda name: off[name])
+    if off[worst] > SAME_PLACE_M:
+        raise SimulatorError(
+            f"the scenario's canvas has {worst} {getattr(asked, worst):g}, that of the recordings "
+            f"{getattr(recorded, worst):g}; drive the scenario that was recorded"
+        )

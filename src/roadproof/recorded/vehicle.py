@@ -1,0 +1,306 @@
+"""How the car answers to steering and pedals: identified from recorded drives, or a bicycle that the user describes.
+
+    symbol    meaning                                                                   unit
+    κ         curvature of the car's way, positive to the left                          1/m
+    u         steer, positive to the right, as the wheels follow it at a limited rate   −
+    v         forward speed                                                             m/s
+    β         direction of travel against heading, at the vehicle's origin              rad
+    t, p      throttle, brake                                                           −
+
+From one step to the next, dt seconds later,
+
+    κ⁺ = a κ + b u + c u⁻ + k          u⁻ is the steer of the step before
+    v⁺ = v + dt (e t + f p + g + h v + j κ u v²)
+    ψ⁺ = ψ + κ⁺ v̄ dt,   v̄ = (v + v⁺)/2
+    P⁺ = P + v̄ dt (cos, sin)((ψ + ψ⁺)/2 + β),   β = l κ⁺ + m
+
+Every law is linear in its coefficients, so that recorded poses and controls give them by least squares. j is what
+turned front wheels brake.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.errors import RecordingError
+from roadproof.tracks import Track
+
+_MOVING_MPS = 2.0
+_LEAST_STEPS = 12
+_PRIOR_WEIGHT = 1e-3
+_LEAST_R2 = 0.5
+_RATES: list[float] = np.geomspace(0.5, 30.0, 31).tolist()
+_CLEARLY_LESS = 0.7
+_ROUNDS = 20
+
+
+class Motion(NamedTuple):
+    """Cars on the ground, R of them; what passes from one step to the next, all in float64.
+
+    Args:
+        x_m: world x, as y_m.
+        yaw_rad: heading, left positive.
+        speed_mps: forward.
+        curvature: κ of the step just done.
+        steer: given at the step before.
+    """
+
+    x_m: Float[Tensor, " r"]
+    y_m: Float[Tensor, " r"]
+    yaw_rad: Float[Tensor, " r"]
+    speed_mps: Float[Tensor, " r"]
+    curvature: Float[Tensor, " r"]
+    steer: Float[Tensor, " r"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Vehicle:
+    """The response of one car at one time step; see the notation above.
+
+    Args:
+        dt_s: seconds a step.
+        curving: a, b, c, k.
+        pulling: e, f, g, h, j.
+        slipping: l, m.
+        steer_rate_per_s: how fast the wheels turn at most, steer units a second.
+        r2: share of the curvature's variance that steering foretells in the drives it was identified from; 1 where the
+            vehicle was given.
+    """
+
+    dt_s: float
+    curving: tuple[float, float, float, float]
+    pulling: tuple[float, float, float, float, float]
+    slipping: tuple[float, float]
+    steer_rate_per_s: float = math.inf
+    r2: float = 1.0
+
+    @staticmethod
+    def bicycle(
+        *, wheelbase_m: float, steer_range_rad: float, lag_s: float = 0.1, origin_m: float | None = None, dt_s: float
+    ) -> Vehicle:
+        """A kinematic bicycle whose wheels follow the steer with a lag.
+
+        Args:
+            wheelbase_m: from axle to axle.
+            steer_range_rad: angle of the front wheels at full steer.
+            lag_s: time constant of the steering.
+            origin_m: of the vehicle's origin before the rear axle; the middle by default.
+            dt_s: seconds a step.
+
+        Raises:
+            RecordingError: a value is not positive.
+        """
+        if not (wheelbase_m > 0 and 0 < steer_range_rad < math.pi / 2 and lag_s >= 0 and dt_s > 0):
+            raise RecordingError(
+                f"bicycle with wheelbase {wheelbase_m} m, steering range {steer_range_rad} rad, lag {lag_s} s, step "
+                f"{dt_s} s; expected lengths and times above 0 and a range below π/2"
+            )
+        kept = math.exp(-dt_s / lag_s) if lag_s else 0.0
+        gain = -steer_range_rad / wheelbase_m
+        behind = wheelbase_m / 2 if origin_m is None else origin_m
+        return Vehicle(dt_s=dt_s, curving=(kept, (1 - kept) * gain, 0.0, 0.0), pulling=_PULLING, slipping=(behind, 0.0))
+
+    @staticmethod
+    def identified(tracks: Sequence[Track], *, prior: Vehicle | None = None) -> Vehicle:
+        """The response that explains recorded drives.
+
+        What the drives do not show, such as a brake never used, stays with the prior.
+
+        Args:
+            tracks: of drives with one time step; perturbed ones show more than clean ones.
+            prior: believed as far as the drives say nothing; an ordinary car by default.
+
+        Raises:
+            RecordingError: time steps differ, too few steps follow each other, or the steering does not explain the
+                way the car took.
+        """
+        steps = {track.dt_s for track in tracks}
+        if len(steps) != 1:
+            raise RecordingError(f"the drives have time steps {sorted(steps)} s, expected one and the same")
+        dt_s = steps.pop()
+        prior = prior or Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=dt_s)
+        stretches = [(track, part) for track in tracks for part in track.stretches()]
+        rate = _steer_rate(stretches)
+        parts = [_Rows.of(track, part, rate) for track, part in stretches]
+        curving, curved = _stacked([(part.curving, part.curved) for part in parts])
+        if len(curved) < _LEAST_STEPS:
+            raise RecordingError(
+                f"only {len(curved)} steps of the drives follow each other in motion, {_LEAST_STEPS} are needed to "
+                "identify the vehicle; record more, or give its wheelbase and steering range"
+            )
+        a = _fitted(curving, curved, prior.curving, weight=(0.02, 0.02, 0.02, 1.0))
+        r2 = _explained(stretches, rate, a)
+        if r2 < _LEAST_R2:
+            raise RecordingError(
+                f"steering explains {max(r2, 0):.0%} of the way the cars took, expected {_LEAST_R2:.0%} or more; check "
+                "that poses and steer belong to the same steps, or give the vehicle's wheelbase and steering range"
+            )
+        pulling, pulled = _stacked([(part.pulling, part.pulled) for part in parts])
+        slipping, slipped = _stacked([(part.slipping, part.slipped) for part in parts])
+        e, f, g, h, j = _fitted(pulling, pulled, prior.pulling).tolist()
+        if h > 0:
+            # A car that pulls more the faster it goes runs away: what the drives seem to say is their noise.
+            e, f, g, h, j = _fitted(pulling * (1, 1, 1, 0, 1), pulled, prior.pulling).tolist()
+        slope, level = _fitted(slipping, slipped, prior.slipping, weight=(0.01, 1.0)).tolist()
+        b, c, d, k = a.tolist()
+        return Vehicle(
+            dt_s=dt_s,
+            curving=(b, c, d, k),
+            pulling=(e, f, g, h, j),
+            slipping=(slope, level),
+            steer_rate_per_s=rate,
+            r2=r2,
+        )
+
+    def step(
+        self,
+        car: Motion,
+        steer: Float[Tensor, " r"],
+        throttle: Float[Tensor, " r"],
+        brake: Float[Tensor, " r"],
+    ) -> Motion:
+        """One time step of R cars, differentiable in state and controls."""
+        a, b, c, k = self.curving
+        e, f, g, h, j = self.pulling
+        slope, level = self.slipping
+        if math.isfinite(self.steer_rate_per_s):
+            reach = self.steer_rate_per_s * self.dt_s
+            steer = car.steer + (steer - car.steer).clamp(-reach, reach)
+        v = car.speed_mps
+        curvature = a * car.curvature + b * steer + c * car.steer + k
+        pull = e * throttle + f * brake + g + h * v + j * curvature * steer * v * v
+        speed = (v + self.dt_s * pull).clamp_min(0.0)
+        way = (v + speed) * (self.dt_s / 2)
+        yaw = car.yaw_rad + curvature * way
+        heading = (car.yaw_rad + yaw) / 2 + slope * curvature + level
+        x, y = car.x_m + way * torch.cos(heading), car.y_m + way * torch.sin(heading)
+        return Motion(x, y, yaw, speed, curvature, steer)
+
+
+_PULLING = (4.0, -8.0, -0.15, 0.0, 0.0)
+
+
+def curvatures(track: Track, rows: slice) -> Float[np.ndarray, " m"]:
+    """κ of each step of a stretch, one fewer than its rows; 0 where the car hardly moves."""
+    yaw, v = np.unwrap(track.yaw_rad[rows]), track.speed_mps[rows]
+    way = 0.5 * (v[1:] + v[:-1]) * track.dt_s
+    return np.where(way > 0.02, np.diff(yaw) / np.maximum(way, 0.02), 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """The equations that a stretch of a drive gives for each law."""
+
+    curving: Float[np.ndarray, "n 4"]
+    curved: Float[np.ndarray, " n"]
+    pulling: Float[np.ndarray, "m 5"]
+    pulled: Float[np.ndarray, " m"]
+    slipping: Float[np.ndarray, "o 2"]
+    slipped: Float[np.ndarray, " o"]
+
+    @staticmethod
+    def of(track: Track, rows: slice, steer_rate_per_s: float) -> _Rows:
+        v, u = track.speed_mps[rows], _followed(track.steer[rows], steer_rate_per_s * track.dt_s)
+        throttle, brake = track.throttle[rows], track.brake[rows]
+        kappa = curvatures(track, rows)
+        count = max(len(kappa) - 1, 0)
+        before, now, one = slice(0, count), slice(1, count + 1), np.ones(count)
+        moving = v[before] > _MOVING_MPS
+        curving = np.stack([kappa[before], u[now], u[before], one], 1)
+        pull = np.diff(v)[now] / track.dt_s
+        speed = v[now]
+        pulling = np.stack(
+            [throttle[now], brake[now] * (speed > 0.2), one, speed, kappa[before] * u[now] * speed**2], 1
+        )
+        dx, dy = np.diff(track.x_m[rows])[now], np.diff(track.y_m[rows])[now]
+        yaw = np.unwrap(track.yaw_rad[rows])
+        middle = 0.5 * (yaw[1:] + yaw[:-1])[now]
+        slip = np.remainder(np.arctan2(dy, dx) - middle + np.pi, 2 * np.pi) - np.pi
+        slipping = np.stack([kappa[now], one], 1)
+        return _Rows(curving[moving], kappa[now][moving], pulling, pull, slipping[moving], slip[moving])
+
+
+def _followed(steer: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
+    """What the wheels make of the steer when they turn by at most so much a step."""
+    if not math.isfinite(reach):
+        return steer
+    followed, at = np.empty_like(steer), float(steer[0])
+    for step, wanted in enumerate(steer.tolist()):
+        at += min(max(wanted - at, -reach), reach)
+        followed[step] = at
+    return followed
+
+
+def _steer_rate(stretches: Sequence[tuple[Track, slice]]) -> float:
+    """How fast the wheels turn, steer units a second; infinite where no drive steers faster than they follow.
+
+    The law of curvature is fitted with one rate after another; a limit is believed where it leaves much less.
+    """
+    jumps = max((np.abs(np.diff(t.steer[rows])).max(initial=0.0) / t.dt_s for t, rows in stretches), default=0.0)
+
+    def left(rate: float) -> float:
+        parts = [_Rows.of(track, rows, rate) for track, rows in stretches]
+        curving, curved = _stacked([(part.curving, part.curved) for part in parts])
+        if len(curved) < _LEAST_STEPS:
+            return math.inf
+        return float(np.abs(curved - curving @ _fitted(curving, curved, (0.0,) * 4)).sum())
+
+    rates = [rate for rate in _RATES if rate < jumps]
+    if not rates:
+        return math.inf
+    best = min(rates, key=left)
+    fine = min((best * share for share in np.linspace(0.93, 1.07, 29).tolist()), key=left)
+    return fine if left(fine) < _CLEARLY_LESS * left(math.inf) else math.inf
+
+
+def _explained(stretches: Sequence[tuple[Track, slice]], rate: float, law: Float[np.ndarray, "4"]) -> float:
+    """Share of the curvature's variance that the law foretells from steering alone, not looking at the way taken."""
+    told: list[float] = []
+    seen: list[float] = []
+    a, b, c, k = law.tolist()
+    for track, rows in stretches:
+        kappa = curvatures(track, rows)
+        steer = _followed(track.steer[rows], rate * track.dt_s).tolist()
+        at = float(kappa[0]) if kappa.size else 0.0
+        for step in range(1, len(kappa)):
+            at = a * at + b * steer[step] + c * steer[step - 1] + k
+            if track.speed_mps[rows][step - 1] > _MOVING_MPS:
+                told.append(at)
+                seen.append(float(kappa[step]))
+    there = np.array(seen)
+    left = float(np.square(np.array(told) - there).sum())
+    return 1.0 - left / max(float(np.square(there - there.mean()).sum()), 1e-12)
+
+
+def _stacked(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    return np.concatenate([left for left, _ in parts]), np.concatenate([right for _, right in parts])
+
+
+def _fitted(
+    left: Float[np.ndarray, "n k"],
+    right: Float[np.ndarray, " n"],
+    prior: Sequence[float],
+    weight: Sequence[float] | None = None,
+) -> Float[np.ndarray, " k"]:
+    """Robust least squares (Cauchy weights) that hardly leave the prior where the equations are silent.
+
+    Robust, since at the limit of their grip tyres follow no linear law, and a few such steps should not bend it.
+    """
+    believed = np.asarray(prior)
+    weights = _PRIOR_WEIGHT * (np.ones(len(believed)) if weight is None else np.asarray(weight))
+    trust, found = np.ones(len(right)), believed
+    for _ in range(_ROUNDS):
+        rows = np.concatenate([left * trust[:, None], np.diag(weights)])
+        found = np.linalg.lstsq(rows, np.concatenate([right * trust, weights * believed]), rcond=None)[0]
+        off = np.abs(right - left @ found)
+        usual = 3.0 * float(np.median(off)) + 1e-9
+        trust = 1.0 / np.sqrt(1.0 + np.square(off / usual))
+    return found

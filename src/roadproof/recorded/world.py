@@ -1,0 +1,226 @@
+"""The recorded world: driving, with or without paint, in what calibrated recordings hold.
+
+pose → picture → controller → vehicle → pose, for any number of cars at once, differentiable in the patterns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.compositing.composite import composite_own
+from roadproof.controllers import Controller, PedalController
+from roadproof.errors import ControllerError, RecordingError
+from roadproof.metrics import deviation_m
+from roadproof.patterns import Pattern
+from roadproof.recorded.course import Course, Place
+from roadproof.recorded.pictures import FrameBank, Gap, Poses
+from roadproof.recorded.vehicle import Motion, Vehicle
+from roadproof.recordings import Push, RecordingSet
+
+PAST_M = 1.0
+"""So far beyond the last recorded frame a picture can still be made."""
+
+AT_ONCE = 32
+"""Drives rolled side by side where there may be thousands: more make no CPU faster."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Start:
+    """How a drive differs from the clean one where it begins.
+
+    Args:
+        right_m: offset to the right.
+        turned_rad: heading, left positive.
+        faster_mps: speed.
+    """
+
+    right_m: float = 0.0
+    turned_rad: float = 0.0
+    faster_mps: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rolled:
+    """R drives in the recorded world, T instants each.
+
+    Args:
+        x_m: world x, as y_m.
+        yaw_rad: heading, left positive.
+        speed_mps: forward.
+        right_m: offset from the recorded clean path, differentiable in the patterns.
+        steer: given at each instant.
+        ahead_m: of the recorded frame that the picture was made from; as left_m and turned_rad.
+    """
+
+    x_m: Float[Tensor, "r t"]
+    y_m: Float[Tensor, "r t"]
+    yaw_rad: Float[Tensor, "r t"]
+    speed_mps: Float[Tensor, "r t"]
+    right_m: Float[Tensor, "r t"]
+    steer: Float[Tensor, "r t"]
+    ahead_m: Float[Tensor, "r t"]
+    left_m: Float[Tensor, "r t"]
+    turned_rad: Float[Tensor, "r t"]
+
+    def path(self, index: int) -> Float[np.ndarray, "t 2"]:
+        """World x, y of one drive."""
+        return torch.stack([self.x_m[index], self.y_m[index]], 1).detach().cpu().numpy()
+
+
+class RecordedWorld:
+    """A set of recordings to drive in.
+
+    Args:
+        recordings: calibrated, with a canvas and the tracks of the drives; the clean drive among them.
+        vehicle: how the car answers; identified from the drives by default.
+        device: where pictures are made and shown.
+
+    Raises:
+        RecordingError: there is no clean drive, poses are not known, or the vehicle cannot be identified.
+    """
+
+    def __init__(
+        self, recordings: RecordingSet, *, vehicle: Vehicle | None = None, device: torch.device | str = "cpu"
+    ) -> None:
+        clean = next((drive for drive in recordings.recordings if drive.push is Push.CLEAN), None)
+        if clean is None:
+            raise RecordingError("the set has no clean drive, which a recorded world begins with; record one")
+        self.recordings = recordings
+        self.bank = FrameBank(recordings, device=device)
+        assert clean.track is not None
+        tracks = [drive.track for drive in recordings.recordings if drive.track is not None]
+        self.vehicle = vehicle or Vehicle.identified(tracks)
+        self.course = Course(clean.track, self.bank.canvas, int(clean.frame_number[0]), device=device)
+        self.command = self.bank.command[: len(clean.frames)]
+        self.device = self.bank.device
+
+    def fit(self, controller: Controller) -> None:
+        """Ask a controller about all recorded frames, for the bare road's law of its steering."""
+        frames = (self.bank.levels, self.bank.speed_mps, self.bank.command)
+        with torch.no_grad():
+            answers = torch.cat(
+                [
+                    controller.steer(levels / 255, speed, command).float()
+                    for levels, speed, command in zip(*map(_in_parts, frames), strict=True)
+                ]
+            )
+        if not bool(answers.isfinite().all()):
+            raise ControllerError("the controller answers NaN or infinity to clean frames; check its weights")
+        self.course.fit_law(self.bank.poses, answers)
+
+    def roll(
+        self,
+        controller: Controller,
+        pattern: Pattern | None = None,
+        *,
+        starts: tuple[Start, ...] = (Start(),),
+        every: int = 1,
+    ) -> Rolled:
+        """Drive past the canvas, closed loop.
+
+        Args:
+            controller: on the world's device; `fit` was called with it.
+            pattern: a batch of R / len(starts) patterns; each is driven over from every start, one after another.
+                None leaves the road bare.
+            starts: of the drives.
+            every: steps from one picture to the next; controls are held between.
+        """
+        count = len(starts) * (1 if pattern is None else len(pattern.boxes))
+        if pattern is not None:
+            pattern = Pattern(
+                pattern.shapes,
+                pattern.boxes.repeat_interleave(len(starts), 0),
+                pattern.colours.repeat_interleave(len(starts), 0),
+            )
+        car = self.begin(starts, count // len(starts))
+        course = self.course
+        rows: list[tuple[Tensor, ...]] = []
+        controls = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
+        gap = self.bank.nearest(Poses(car.x_m, car.y_m, car.yaw_rad))
+        for step in range(course.count):
+            poses = Poses(car.x_m, car.y_m, car.yaw_rad)
+            place = course.locate(poses)
+            if step % every == 0:
+                gap = self.bank.nearest(poses.detached())
+                answer = self._answer(controller, pattern, poses, car, gap)
+                past = gap.ahead_m > PAST_M
+                steer = torch.where(past, course.law(place), answer[:, 0] + course.feedback(place)).clamp(-1.0, 1.0)
+                pedals = answer[:, 1:] if answer.shape[1] == 3 else self._recorded_pedals(place, car)
+                controls = torch.cat([steer[:, None], pedals], 1)
+            here = (car.x_m, car.y_m, car.yaw_rad, car.speed_mps, place.right_m)
+            rows.append((*here, controls[:, 0], gap.ahead_m, gap.left_m, gap.turned_rad))
+            car = self.vehicle.step(car, *controls.unbind(1))
+        columns = [torch.stack(each, 1) for each in zip(*rows, strict=True)]
+        columns[0], columns[1] = columns[0] + course.canvas.x_m, columns[1] + course.canvas.y_m
+        return Rolled(*columns)
+
+    def whole_path(self, rolled: Rolled, index: int) -> Float[np.ndarray, "n 2"]:
+        """World x, y of one drive at all instants at which the canvas is in view.
+
+        Before the first recorded frame the clean drive's own positions stand.
+        """
+        course = self.course
+        before = slice(course.seen.start, course.first)
+        x, y = (values[before].cpu().numpy() for values in (course.poses.x_m, course.poses.y_m))
+        clean = np.stack([x + course.canvas.x_m, y + course.canvas.y_m], 1)
+        return np.concatenate([clean, rolled.path(index)])
+
+    def deviations_m(self, controller: Controller, patterns: Pattern) -> list[float]:
+        """The paper's deviation that each pattern of a batch is predicted to cause: every picture, the clean start."""
+        with torch.no_grad():
+            bare = self.whole_path(self.roll(controller), 0)
+            found: list[float] = []
+            for first in range(0, len(patterns.boxes), AT_ONCE):
+                part = slice(first, first + AT_ONCE)
+                rolled = self.roll(controller, Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part]))
+                found += [deviation_m(bare, self.whole_path(rolled, k)) for k in range(len(rolled.x_m))]
+        return found
+
+    def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:
+        """Cars at the first recorded frame of the clean drive, one for each start, all of them so many times."""
+        course, first = self.course, self.course.first
+
+        def told(name: str) -> Tensor:
+            return torch.tensor([getattr(start, name) for start in starts], device=self.device).double().repeat(repeats)
+
+        right, turned, faster = told("right_m"), told("turned_rad"), told("faster_mps")
+        yaw = course.poses.yaw_rad[first]
+        o = torch.zeros_like(right)
+        return Motion(
+            course.poses.x_m[first] + torch.sin(yaw) * right,
+            course.poses.y_m[first] - torch.cos(yaw) * right,
+            yaw + turned,
+            (course.speed_mps[first] + faster).clamp_min(0.0),
+            o + course.curvature[first],
+            o + course.steer[max(first - 1, 0)],
+        )
+
+    def _answer(
+        self, controller: Controller, pattern: Pattern | None, poses: Poses, car: Motion, gap: Gap
+    ) -> Float[Tensor, "r c"]:
+        with torch.no_grad():
+            views = self.bank.show(poses.detached(), gap)
+        frames = views.frames
+        if pattern is not None and views.canvas is not None:
+            frames = composite_own(pattern, frames, views.canvas)
+        speed, command = car.speed_mps.float(), self.bank.command[gap.frame]
+        if isinstance(controller, PedalController):
+            return controller.controls(frames, speed, command).double()
+        return controller.steer(frames, speed, command).double()[:, None]
+
+    def _recorded_pedals(self, place: Place, car: Motion) -> Float[Tensor, "r 2"]:
+        """What holds the clean drive's speed at each place."""
+        wanted = self.course.between(self.course.speed_mps, place)
+        e, f, g, h, _ = self.vehicle.pulling
+        pull = (wanted - car.speed_mps) / 0.5 - g - h * car.speed_mps
+        return torch.stack([(pull / e).clamp(0.0, 1.0), (pull / f).clamp(0.0, 1.0)], 1)
+
+
+def _in_parts(values: Tensor) -> tuple[Tensor, ...]:
+    return cast("tuple[Tensor, ...]", values.split(128))

@@ -1,0 +1,97 @@
+"""A road whose picture from any pose is known: smooth colours on the ground, a smooth sky, a straight clean drive."""
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from roadproof.datatypes import Control, VehicleState
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.tracks import Track
+from scenes import PLAIN
+
+CANVAS = CanvasPlacement(x_m=120.0, y_m=-40.0, yaw_rad=0.0)
+VIEW = dataclasses.replace(CIL_INPUT, resampling="area")
+DT_S = 0.1
+SPEED_MPS = 6.0
+
+
+def pose(ahead_m, left_m=0.0, yaw_rad=0.0):
+    """A car so far before (−) or behind the canvas' middle."""
+    return VehicleState(CANVAS.x_m + ahead_m, CANVAS.y_m + left_m, 0.0, yaw_rad, SPEED_MPS)
+
+
+def picture(state):
+    """What the camera sees, at the controller's input: colours by where on the ground, or by direction in the sky."""
+    image = VIEW.input_from_camera @ CIL_CAMERA.image_from_world(state)
+    columns, rows = np.meshgrid(np.arange(VIEW.width_px), np.arange(VIEW.height_px))
+    pixels = np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1)
+    ground = np.linalg.inv(image[:, [0, 1, 3]]) @ pixels
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = ground[0] / ground[2] - CANVAS.x_m, ground[1] / ground[2] - CANVAS.y_m
+    away = np.hypot(x + CANVAS.x_m - state.x_m, y + CANVAS.y_m - state.y_m)
+    fade = np.exp(-away / 30)
+    ramp = 8.0 * np.clip(y, -4.0, 4.0)
+    waves = np.stack([12 * np.sin(x / 2), 10 * np.cos(y), 0 * x])
+    ahead = np.linalg.inv(image[:, :3]) @ pixels
+    turn = np.arctan2(ahead[1], ahead[0])
+    sky = np.stack([120 + 30 * np.sin(3 * turn), 140 + 20 * np.cos(2 * turn), 180 + 10 * np.sin(turn)])
+    shown = np.where(ground[2] > 0, 110 + fade * (ramp + waves), sky)
+    return np.clip(np.round(shown), 0, 255).astype(np.uint8).T.reshape(VIEW.height_px, VIEW.width_px, 3)
+
+
+def recorded(push=Push.CLEAN, left_m=0.0, *, every=1, name=None):
+    """A straight drive past the canvas, so far to the left."""
+    ahead = np.arange(-32.0, 8.0, SPEED_MPS * DT_S)
+    steps = np.arange(len(ahead))
+    shown = steps[(ahead > -29.0) & (ahead < -1.5)][::every]
+    count = len(ahead)
+    states = [pose(ahead[step], left_m) for step in shown]
+    return Recording(
+        name=name or str(push),
+        push=push,
+        frames=np.stack([picture(state) for state in states]),
+        frame_number=shown,
+        image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, state, CANVAS) for state in states]),
+        speed_mps=np.full(len(shown), SPEED_MPS),
+        command=np.full(len(shown), 2),
+        steer=np.zeros(len(shown)),
+        track=Track(
+            dt_s=DT_S,
+            step=steps,
+            x_m=CANVAS.x_m + ahead,
+            y_m=np.full(count, CANVAS.y_m + left_m),
+            yaw_rad=np.zeros(count),
+            speed_mps=np.full(count, SPEED_MPS),
+            steer=np.zeros(count),
+            throttle=np.full(count, 0.1),
+            brake=np.zeros(count),
+        ),
+    )
+
+
+def recorded_road(*, every=1):
+    """A clean drive and one a metre and a half to each side."""
+    drives = (
+        recorded(every=every),
+        recorded(Push.RIGHT, -1.5, every=every),
+        recorded(Push.LEFT, 1.5, every=every),
+    )
+    return RecordingSet(camera=CIL_CAMERA, view=VIEW, colour=PLAIN, recordings=drives, canvas=CANVAS)
+
+
+MIDDLE = float(picture(pose(-15.0))[50:, :, 2].mean()) / 255
+
+
+class RampFollower(torch.nn.Module):
+    """Keeps to the middle of the ramp of brightness across the road; brighter paint steers it to the right."""
+
+    input_size = (88, 200)
+
+    def steer(self, frames, speed_mps, command):
+        return 4.0 * (frames[:, 2, 50:].mean((1, 2)) - MIDDLE)
+
+    def act(self, frame, speed_mps, command):
+        frames = torch.tensor(frame).permute(2, 0, 1)[None] / 255
+        return Control(steer=float(self.steer(frames, None, None)), throttle=0.1).clipped()

@@ -1,0 +1,118 @@
+"""What is made of drives in recordings: evaluations, selections, films and reports that are called predicted."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from paint_shy import PaintShy
+from recorded_drives import drivable_set
+from roadproof.attacks import Candidate
+from roadproof.coverage import Shape
+from roadproof.datatypes import VehicleState, Weather
+from roadproof.evaluation import Evaluation, Selection, evaluate, select_by_driving
+from roadproof.evaluation.result import passage_deviation_m, path_of
+from roadproof.metrics import passage
+from roadproof.patterns import Pattern, raster
+from roadproof.recorded.simulator import RecordedSimulator
+from roadproof.report.film import film_trial
+from roadproof.report.page import write_report
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.simulators.protocol import PaintKind
+from runs import driven
+
+BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return drivable_set()
+
+
+@pytest.fixture(scope="module")
+def predicted(recordings, tmp_path_factory):
+    """A run that holds nothing but an evaluation in recordings, filmed and reported."""
+    run = tmp_path_factory.mktemp("predicted")
+    with RecordedSimulator(recordings) as world:
+        done = evaluate(
+            world, PaintShy(), world.scenario, BAR, folder=run / "evaluation", weathers=(Weather.CLEAR_NOON,), runs=0
+        )
+        film_trial(world, done, raster(BAR), run / "evaluation")
+    write_report(run)
+    return run, done
+
+
+def test_an_evaluation_in_recordings_is_called_predicted_and_knows_nothing_of_infractions(predicted):
+    run, done = predicted
+    (trial,), (row,) = done.trials, done.rows()
+    assert trial.lateral_m < -0.05, "away from the paint, to the right"
+    assert trial.deviation_m > 0.01
+    assert (trial.points, trial.clean_points, trial.leaderboard, trial.first_event_s) == (None,) * 4
+    assert (row.count, row.points, row.clean_points, row.leaderboard, row.failed) == (1, None, None, None, None)
+    assert (done.predicted, done.simulator_calls, done.drives) == (True, 0, 2)
+    content = json.loads((run / "evaluation" / "evaluation.json").read_text())
+    assert content["kind"] == "predicted"
+    assert content["trials"][0]["points"] is None
+    assert Evaluation.load(run / "evaluation") == done
+
+
+def test_predicted_deviation_is_over_the_stretch_that_driven_ones_are_over():
+    """Drives that begin nearer to the canvas count as if they had come straight from where it comes into view."""
+    scenario = find_scenario("left-03", builtin_scenarios())
+    whole = [driven(scenario, aside_m) for aside_m in (0.0, 1.5)]
+    first = passage(path_of(whole[0]), scenario.canvas, horizon_m=15.0).start
+
+    def later(episode, paint):
+        seen = {name: getattr(episode, name)[first:] for name in (*VehicleState.__slots__, "time_s", "command")}
+        given = {name: getattr(episode, name)[first:] for name in ("steer", "throttle", "brake")}
+        return dataclasses.replace(episode, paint=paint, **seen, **given)
+
+    expected = passage_deviation_m(*whole, scenario.canvas)
+    cut = [later(episode, PaintKind.RENDERED) for episode in whole]
+    assert passage_deviation_m(*cut, scenario.canvas) > 1.2 * expected
+    cut = [later(episode, PaintKind.COMPOSITED) for episode in whole]
+    assert passage_deviation_m(*cut, scenario.canvas) == pytest.approx(expected, rel=0.04)
+
+
+def test_the_report_says_that_nothing_was_driven(predicted):
+    run, done = predicted
+    result = json.loads((run / "result.json").read_text())
+    assert result["verdict"]["key"] == "foreseen"
+    assert "closed_loop" not in result
+    assert result["foreseen"]["trials"][0]["deviation_m"] == done.trials[0].deviation_m
+    page = (run / "report.html").read_text()
+    for words in (
+        "Predicted, not driven",
+        "Nothing was driven for real",
+        "mean deviation, predicted",
+        "Predicted<br>deviation m",
+        "Not known: recordings have no map.",
+        "Nothing here was driven for real.",
+        "over the paint, predicted",
+        "--simulator recorded:RECORDINGS",
+    ):
+        assert words in page, words
+    for words in ("penalty points a drive", "No infraction.", "happened in simulation", "driven over the paint"):
+        assert words not in page, words
+
+
+def test_film_and_strip_show_the_frames_enlarged(predicted):
+    run, _ = predicted
+    with np.load(run / "evaluation" / "strip.npz") as strip:
+        shown = strip["painted"]
+    assert shown.shape == (6, 300, 400, 3)
+    assert int(shown[:, :50].max()) < 12, "black where nothing was recorded"
+    magenta = (shown[..., 0].astype(int) - shown[..., 1] > 120).sum((1, 2))
+    assert (magenta > 50).sum() >= 4
+
+
+def test_a_selection_in_recordings_is_called_predicted(recordings, tmp_path):
+    faint = dataclasses.replace(BAR, colours=torch.full((1, 3), 0.4))
+    candidates = [Candidate(faint, "clean+right", 0.3), Candidate(BAR, "clean+right", 0.2)]
+    with RecordedSimulator(recordings) as world:
+        chosen = select_by_driving(world, PaintShy(), world.scenario, candidates, best=2, folder=tmp_path)
+    assert (chosen.chosen, chosen.predicted, chosen.simulator_calls) == (1, True, 0)
+    assert json.loads((tmp_path / "selection.json").read_text())["kind"] == "predicted"
+    assert Selection.load(tmp_path).predicted

@@ -1,0 +1,119 @@
+"""The vehicle: a known one is found again from its drives; a bicycle turns as geometry says."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from roadproof.errors import RecordingError
+from roadproof.recorded.vehicle import Motion, Vehicle
+from roadproof.tracks import Track
+
+KNOWN = Vehicle(
+    dt_s=0.05,
+    curving=(0.3, -0.06, -0.1, 0.0005),
+    pulling=(4.0, -7.0, -0.2, -0.02, 0.1),
+    slipping=(1.2, 0.001),
+    steer_rate_per_s=4.0,
+)
+
+
+def driven(vehicle, steer, throttle, brake):
+    """The track of a car that is told so."""
+    one = torch.ones(1, dtype=torch.float64)
+    car = Motion(0 * one, 0 * one, 0.3 * one, 6.0 * one, 0 * one, float(steer[0]) * one)
+    rows = []
+    for controls in zip(steer, throttle, brake, strict=True):
+        rows.append([float(value) for value in (car.x_m, car.y_m, car.yaw_rad, car.speed_mps)])
+        car = vehicle.step(car, *(float(value) * one for value in controls))
+    x, y, yaw, speed = np.array(rows).T
+    step = np.arange(len(rows))
+    return Track(
+        dt_s=vehicle.dt_s,
+        step=step,
+        x_m=x,
+        y_m=y,
+        yaw_rad=yaw,
+        speed_mps=speed,
+        steer=steer,
+        throttle=throttle,
+        brake=brake,
+    )
+
+
+def lively(seed, count=200, *, jumps=True):
+    rng = np.random.default_rng(seed)
+    steer = 0.3 * np.sin(np.arange(count) / rng.uniform(5, 9))
+    if jumps:
+        steer[-40:-30], steer[-30:-20] = 0.9, -0.9
+    throttle = 0.4 + 0.2 * np.sin(np.arange(count) / 11)
+    brake = np.where(np.arange(count) % 50 > 45, 0.3, 0.0)
+    return steer, throttle, brake
+
+
+def test_a_known_vehicle_is_found_again_from_its_drives():
+    found = Vehicle.identified([driven(KNOWN, *lively(seed)) for seed in range(3)])
+    assert found.curving == pytest.approx(KNOWN.curving, abs=2e-3)
+    assert found.pulling == pytest.approx(KNOWN.pulling, abs=5e-2)
+    assert found.slipping == pytest.approx(KNOWN.slipping, abs=1e-3)
+    assert found.steer_rate_per_s == pytest.approx(4.0, rel=0.02)
+    assert found.r2 > 0.999
+
+
+def test_no_limit_is_believed_where_no_drive_shows_one():
+    smooth = [driven(KNOWN, *lively(seed, jumps=False)) for seed in range(2)]
+    assert Vehicle.identified(smooth).steer_rate_per_s == math.inf
+
+
+def test_what_the_drives_do_not_show_stays_with_the_prior():
+    steer, throttle, brake = lively(0)
+    found = Vehicle.identified([driven(KNOWN, steer, throttle, 0 * brake)])
+    assert found.pulling[1] == pytest.approx(-8.0, abs=0.01)
+
+
+def test_the_identified_vehicle_repeats_a_drive_it_has_not_seen():
+    found = Vehicle.identified([driven(KNOWN, *lively(seed)) for seed in range(3)])
+    controls = lively(7)
+    there, again = driven(KNOWN, *controls), driven(found, *controls)
+    assert np.hypot(there.x_m - again.x_m, there.y_m - again.y_m).max() < 0.15
+
+
+def test_a_bicycle_turns_on_the_circle_of_its_wheels():
+    vehicle = Vehicle.bicycle(wheelbase_m=2.5, steer_range_rad=0.5, lag_s=0.0, dt_s=0.01)
+    count = 400
+    track = driven(vehicle, np.full(count, 0.4), np.full(count, 0.0), np.zeros(count))
+    turned = np.diff(np.unwrap(track.yaw_rad))[5:] / (np.hypot(np.diff(track.x_m), np.diff(track.y_m))[5:])
+    assert turned == pytest.approx(np.full(len(turned), -0.4 * 0.5 / 2.5), rel=2e-3)
+
+
+def test_motion_is_differentiable_in_what_the_car_is_told():
+    def end(steer):
+        zero = torch.zeros(1, dtype=torch.float64)
+        car = Motion(zero, zero, zero, zero + 6.0, zero, zero)
+        for k in range(4):
+            car = KNOWN.step(car, steer[k : k + 1], zero + 0.3, zero)
+        return torch.cat([car.x_m, car.y_m, car.yaw_rad, car.speed_mps])
+
+    steer = torch.tensor([0.05, -0.1, 0.02, 0.1], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(end, (steer,))
+
+
+def test_drives_that_do_not_fit_are_one_clear_line():
+    one, two = (
+        driven(KNOWN, *lively(0)),
+        driven(Vehicle.bicycle(wheelbase_m=3.0, steer_range_rad=0.5, dt_s=0.1), *lively(1)),
+    )
+    with pytest.raises(RecordingError, match=r"time steps \[0.05, 0.1\] s, expected one"):
+        Vehicle.identified([one, two])
+    short = driven(KNOWN, *(part[:8] for part in lively(0)))
+    with pytest.raises(RecordingError, match="steps of the drives follow each other in motion, 12 are needed"):
+        Vehicle.identified([short])
+    steer, throttle, brake = lively(0, jumps=False)
+    unrelated = driven(KNOWN, steer, throttle, brake)
+    mixed = np.random.default_rng(0).permutation(steer)
+    fields = {name: getattr(unrelated, name) for name in ("dt_s", "step", "x_m", "y_m", "yaw_rad", "speed_mps")}
+    with pytest.raises(RecordingError, match="of the way the cars took, expected 50%"):
+        Vehicle.identified([Track(**fields, steer=mixed, throttle=throttle, brake=brake)])
+    with pytest.raises(RecordingError, match="expected lengths and times above 0"):
+        Vehicle.bicycle(wheelbase_m=0.0, steer_range_rad=0.5, dt_s=0.1)

@@ -1,0 +1,117 @@
+"""Driving in recordings: the clean drive holds, batches are their parts, gradients are those of the loop."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from painted_ground import CANVAS, RampFollower, recorded, recorded_road
+from roadproof.coverage import Shape
+from roadproof.errors import RecordingError
+from roadproof.patterns import Pattern
+from roadproof.recorded.vehicle import Vehicle
+from roadproof.recorded.world import RecordedWorld, Start
+from roadproof.recordings import Push
+
+VEHICLE = dataclasses.replace(
+    Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
+)
+
+
+@pytest.fixture(scope="module")
+def world():
+    made = RecordedWorld(recorded_road(), vehicle=VEHICLE)
+    made.fit(RampFollower())
+    return made
+
+
+def painted(*rows):
+    """A batch of patterns of one rectangle each: x px, width px, brightness."""
+    boxes = torch.tensor([[[x, 200.0, width, 380.0, 0.0]] for x, width, _ in rows])
+    colours = torch.tensor([[[level] * 3] for _, _, level in rows])
+    return Pattern((Shape.RECTANGLE,), boxes, colours)
+
+
+def test_the_bare_road_is_driven_as_it_was_recorded(world):
+    rolled = world.roll(RampFollower())
+    assert rolled.right_m.abs().max() < 0.05
+    path = world.whole_path(rolled, 0)
+    assert np.abs(path[:, 1] - CANVAS.y_m).max() < 0.05
+    assert np.diff(path[:, 0]).min() > 0.4
+
+
+def test_a_car_that_starts_aside_is_brought_back(world):
+    rolled = world.roll(RampFollower(), starts=(Start(right_m=0.5), Start(right_m=-0.5), Start(turned_rad=0.03)))
+    assert rolled.right_m[:2, 0].tolist() == pytest.approx([0.5, -0.5])
+    assert (rolled.right_m[:2, -1].abs() < 0.35).all()
+    # Turned to the left it goes to the left first.
+    assert rolled.right_m[2, 5] < -0.02
+
+
+def test_bright_paint_pulls_to_the_right_and_dark_paint_to_the_left(world):
+    bright, dark = world.roll(RampFollower(), painted((200, 300, 1.0), (200, 300, 0.0))).right_m
+    assert bright.max() > 0.3
+    assert dark.min() < -0.1
+    deviations = world.deviations_m(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)))
+    assert deviations[0] > 5 * deviations[1]
+
+
+def test_a_batch_is_its_parts_and_the_same_twice(world):
+    rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (Start(), Start(right_m=0.3))
+    with torch.no_grad():
+        together = world.roll(RampFollower(), painted(*rows), starts=starts)
+        again = world.roll(RampFollower(), painted(*rows), starts=starts)
+        apart = [world.roll(RampFollower(), painted(row), starts=(start,)) for row in rows for start in starts]
+    assert torch.equal(together.right_m, again.right_m)
+    assert torch.allclose(together.right_m, torch.cat([each.right_m for each in apart]), atol=2e-3)
+
+
+def test_gradients_of_a_drive_on_one_picture_are_central_differences(world):
+    """Same start and frame: the loop is open, so that the gradient through the paint is all there is."""
+    once = world.course.count
+
+    def aside(x, level):
+        boxes = torch.stack([x, x.new_tensor(200.0), x.new_tensor(90.0), x.new_tensor(300.0), x.new_tensor(10.0)])
+        pattern = Pattern((Shape.RECTANGLE,), boxes[None, None], level.expand(1, 1, 3))
+        return world.roll(RampFollower(), pattern, every=once).right_m.mean()
+
+    x, level = torch.tensor(170.0, requires_grad=True), torch.tensor(0.8, requires_grad=True)
+    slopes = torch.autograd.grad(aside(x, level), (x, level))
+    with torch.no_grad():
+        by_x = (aside(x + 2.0, level) - aside(x - 2.0, level)) / 4.0
+        by_level = (aside(x, level + 0.02) - aside(x, level - 0.02)) / 0.04
+    assert float(slopes[0]) == pytest.approx(float(by_x), rel=0.05, abs=1e-6)
+    assert float(slopes[1]) == pytest.approx(float(by_level), rel=0.02)
+
+
+def test_gradients_through_the_loop_point_where_the_car_goes(world):
+    level = torch.tensor(0.5, requires_grad=True)
+
+    def aside(value):
+        pattern = painted((200, 60, 1.0))
+        return world.roll(RampFollower(), Pattern(pattern.shapes, pattern.boxes, value.expand(1, 1, 3))).right_m.mean()
+
+    (slope,) = torch.autograd.grad(aside(level), level)
+    with torch.no_grad():
+        measured = (aside(level + 0.05) - aside(level - 0.05)) / 0.1
+    assert float(slope) == pytest.approx(float(measured), rel=0.5)
+
+
+def test_the_gap_says_how_far_the_pictures_are_from_recorded_ones(world):
+    rolled = world.roll(RampFollower(), starts=(Start(right_m=0.6),))
+    assert float(rolled.left_m[0, 0]) == pytest.approx(-0.6, abs=1e-6)
+
+
+def test_sets_too_thin_to_drive_in_are_one_clear_line():
+    aside = recorded(Push.RIGHT, -1.0, every=8)
+    road = recorded_road(every=8)
+    with pytest.raises(RecordingError, match="no clean drive"):
+        RecordedWorld(dataclasses.replace(road, recordings=(aside,)), vehicle=VEHICLE)
+    clean = recorded(every=8)
+    few = dataclasses.replace(
+        clean.track,
+        **{field.name: getattr(clean.track, field.name)[:2] for field in dataclasses.fields(clean.track)[1:]},
+    )
+    with pytest.raises(RecordingError, match="no pose for frame"):
+        dataclasses.replace(clean, track=few)
