@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -13,16 +13,12 @@ from torch import Tensor
 
 from roadproof.attacks.checks import check_search
 from roadproof.attacks.gradopt import Schedule, Search, gradopt
-from roadproof.attacks.published import PublishedSurrogate
+from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.result import AttackResult, Candidate, Cost
-from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
-
-Gradient = Literal["exact", "published"]
-GRADIENTS: tuple[Gradient, ...] = get_args(Gradient)
 
 
 def attack(
@@ -30,29 +26,31 @@ def attack(
     controller: Controller,
     space: SearchSpace,
     *,
+    objective: Objective | None = None,
     groups: Sequence[Group] = (RIGHT_GROUP, LEFT_GROUP),
     schedule: Schedule | None = None,
     restarts: int = 4,
     seed: int = 0,
     device: torch.device | str = "cpu",
-    gradient: Gradient = "exact",
     random_patterns: int = 0,
     starts: Sequence[Candidate] = (),
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
-    """Find the pattern that shifts a controller's steering most on recorded drives.
+    """Find the pattern that moves a controller most on recorded drives.
 
     Args:
         recordings: the drives, with their view of the canvas and its colours.
         controller: on `device`.
         space: the patterns allowed.
+        objective: what is made large: `SteeringShift()` by default, as published, or `PathDeviation()`, which drives
+            in the recordings and needs their tracks; or one of your own.
         groups: drives attacked together; the paper's two sides by default, of which the stronger is kept.
-        schedule: `Schedule.in_heats()` by default; `Schedule()` is the paper's.
+        schedule: `Schedule.in_heats()` by default, for a path deviation `Schedule.closed_loop()`; `Schedule()` is the
+            paper's.
         restarts: of every group.
         seed: of the random starts.
         device: where to search.
-        gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
         random_patterns: random patterns a group that the self-check compares with; 0 for none.
         starts: of an earlier search, to search on from: each for its own group, instead of as many random ones.
         checkpoint: file that keeps the search after every step; an interrupted one goes on from it.
@@ -62,12 +60,12 @@ def attack(
         ControllerError: the controller takes other frames, or answers NaN.
         RecordingError: a group names drives that the set lacks.
     """
-    schedule = schedule or Schedule.in_heats()
-    kind = PublishedSurrogate if gradient == "published" else Surrogate
-    surrogate = kind(recordings, controller, groups, device=device)
+    objective = objective or SteeringShift()
+    schedule = schedule or (Schedule.in_heats() if isinstance(objective, SteeringShift) else Schedule.closed_loop())
+    measure = objective.measure(recordings, controller, groups, device=device)
     start = time.perf_counter()
     search = gradopt(
-        surrogate,
+        measure,
         space,
         schedule=schedule,
         restarts=restarts,
@@ -76,13 +74,15 @@ def attack(
         checkpoint=checkpoint,
         on_step=on_step,
     )
-    cost = Cost(controller_frames=surrogate.frames_evaluated, seconds=time.perf_counter() - start)
-    checks = check_search(surrogate, space, search, random_patterns=random_patterns, seed=seed)
-    candidates = _candidates(search, space, groups)
+    candidates = _candidates(measure, search, space, groups)
+    cost = Cost(controller_frames=measure.frames_evaluated, seconds=time.perf_counter() - start)
+    checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
     return AttackResult(
         pattern=candidates[0].pattern,
         group=candidates[0].group,
+        objective=objective.name,
         surrogate_shift=candidates[0].surrogate_shift,
+        predicted_m=candidates[0].predicted_m,
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
         candidates=candidates,
         history=search.history.double().numpy(),
@@ -120,15 +120,18 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
-def _candidates(search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
-    """Every start's best, the strongest first."""
+def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
+    """Every start's best, the strongest first: by what is predicted where that is known, else by its own value."""
+    shifts, predicted = measure.readings(space, search.best_unit)
     restarts = search.best.shape[1]
-    order = cast("list[int]", search.best.flatten().argsort(descending=True).tolist())
+    rank = search.best.cpu() if predicted is None else predicted
+    order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
     return tuple(
         Candidate(
-            space.pattern(search.best_unit[index // restarts, index % restarts].cpu()),
-            str(groups[index // restarts]),
-            float(search.best[index // restarts, index % restarts]),
+            space.pattern(search.best_unit[group, restart].cpu()),
+            str(groups[group]),
+            float(search.best[group, restart] if predicted is None else shifts[group, restart]),
+            None if predicted is None else float(predicted[group, restart]),
         )
-        for index in order
+        for group, restart in (divmod(index, restarts) for index in order)
     )

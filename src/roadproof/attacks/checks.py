@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.gradopt import Search, random_search
-from roadproof.attacks.surrogate import Surrogate
+from roadproof.attacks.objective import Measure
 from roadproof.search_space import SearchSpace
 
 
@@ -31,43 +31,43 @@ class Check:
 
 
 def check_search(
-    surrogate: Surrogate, space: SearchSpace, search: Search, *, random_patterns: int, seed: int
+    measure: Measure, space: SearchSpace, search: Search, *, random_patterns: int, seed: int
 ) -> tuple[Check, ...]:
     """Look for the usual reasons why a gradient search disappoints.
 
     Args:
-        surrogate: what was searched on.
+        measure: what was searched on.
         space: where.
         search: what came of it.
         random_patterns: patterns of the random search it is compared with, a group; 0 leaves that check out.
         seed: of those.
     """
     checks = [
-        _check_determinism(surrogate, space, search),
-        _check_gradients(surrogate, space, search),
+        _check_determinism(measure, space, search),
+        _check_gradients(measure, space, search),
         _check_bounds(space, search),
     ]
     if random_patterns:
-        checks.append(_check_against_random(surrogate, space, search, random_patterns, seed))
+        checks.append(_check_against_random(measure, space, search, random_patterns, seed))
     return tuple(checks)
 
 
-def _check_determinism(surrogate: Surrogate, space: SearchSpace, search: Search) -> Check:
-    again = surrogate.values(space, search.best_unit)
+def _check_determinism(measure: Measure, space: SearchSpace, search: Search) -> Check:
+    again = measure.values(space, search.best_unit)
     drift = float((again - search.best).abs().max())
     passed = drift <= 1e-3 * max(float(search.best.abs().max()), 1e-3)
     return Check(
         "deterministic controller",
         passed,
-        f"the best patterns, shown again, differ by {drift:.2g} in divergence",
+        f"the best patterns, shown again, differ by {drift:.2g} in value",
         "" if passed else "the controller answers differently to the same frames: put it in eval mode, fix its seeds",
     )
 
 
-def _check_gradients(surrogate: Surrogate, space: SearchSpace, search: Search) -> Check:
-    _, gradient = surrogate.values_and_gradients(space, search.best_unit)
-    _, at_start = surrogate.values_and_gradients(
-        space, space.random((len(surrogate.groups), 2), torch.Generator().manual_seed(0)).to(surrogate.device)
+def _check_gradients(measure: Measure, space: SearchSpace, search: Search) -> Check:
+    _, gradient = measure.values_and_gradients(space, search.best_unit)
+    _, at_start = measure.values_and_gradients(
+        space, space.random((len(measure.groups), 2), torch.Generator().manual_seed(0)).to(measure.device)
     )
     dead = sum(float(_zero_share(part)) for part in (gradient, at_start)) / 2
     passed = dead < 0.5
@@ -99,13 +99,13 @@ def _check_bounds(space: SearchSpace, search: Search) -> Check:
     )
 
 
-def _check_against_random(surrogate: Surrogate, space: SearchSpace, search: Search, patterns: int, seed: int) -> Check:
-    _, by_chance = random_search(surrogate, space, patterns=patterns, seed=seed + 1)
+def _check_against_random(measure: Measure, space: SearchSpace, search: Search, patterns: int, seed: int) -> Check:
+    _, by_chance = random_search(measure, space, patterns=patterns, seed=seed + 1)
     found, chance = float(search.best.max()), float(by_chance.max())
     passed = found > chance
     return Check(
         "better than random search",
         passed,
-        f"gradients found {found:.3f} steer a frame, the best of {patterns} random patterns a group {chance:.3f}",
+        f"gradients found {found:.3f}, the best of {patterns} random patterns a group has {chance:.3f}",
         "" if passed else "use more restarts or a smaller learning rate; the controller's gradients may mislead",
     )

@@ -1,4 +1,4 @@
-"""GradOpt: the pattern that shifts steering most, by gradient through compositor and controller.
+"""GradOpt: the pattern with the largest value, by gradient through compositor and controller.
 
 All restarts of all groups are one batch and take one step together; each keeps its own best point, and each drop of
 the learning rate starts again from there with a fresh optimiser, as in the paper.
@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
-from roadproof.attacks.surrogate import Surrogate
+from roadproof.attacks.objective import Measure
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace
 
@@ -93,6 +93,17 @@ class Schedule:
             heats=(Heat(starts=24, iterations=30, every=4), Heat(starts=8, iterations=30, every=2)),
         )
 
+    @staticmethod
+    def closed_loop(iterations: int = 40) -> Schedule:
+        """For a search where the car goes: heats on the steering shift, then small steps, since a loop amplifies."""
+        return Schedule(
+            iterations=iterations,
+            learning_rate=0.05,
+            drops=(iterations // 2, iterations * 4 // 5),
+            factor=0.3,
+            heats=(Heat(starts=16, iterations=15, every=8), Heat(starts=6, iterations=15, every=4)),
+        )
+
     @property
     def steps(self) -> int:
         """Iterations with those of the heats."""
@@ -121,7 +132,7 @@ class Search:
 
 
 def gradopt(
-    surrogate: Surrogate,
+    measure: Measure,
     space: SearchSpace,
     *,
     schedule: Schedule,
@@ -134,7 +145,7 @@ def gradopt(
     """Minimise −δ over a search space.
 
     Args:
-        surrogate: what is driven up, for all groups.
+        measure: what is driven up, for all groups.
         space: where to look.
         schedule: steps and rates.
         restarts: of every group.
@@ -154,16 +165,16 @@ def gradopt(
         raise RoadproofError(f"restarts is {restarts}, expected 1 or more")
     rungs = _rungs(schedule, restarts)
     given = [cast("list[object]", points.tolist()) for points in starts]
-    identity = repr((space, schedule, restarts, seed, given, surrogate.fingerprint()))
-    state = load_checkpoint(checkpoint, identity, surrogate.device) if checkpoint else None
+    identity = repr((space, schedule, restarts, seed, given, measure.fingerprint()))
+    state = load_checkpoint(checkpoint, identity, measure.device) if checkpoint else None
     if state is None:
-        rung, state = 0, _state_at(_starts(surrogate, space, rungs[0].starts, seed, starts))
+        rung, state = 0, _state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
         rung = int(state.pop("rung"))
-        surrogate.frames_evaluated += int(state.pop("frames"))
+        measure.frames_evaluated += int(state.pop("frames"))
     for number in range(rung, len(rungs)):
         steps, last = rungs[number].steps, number == len(rungs) - 1
-        shown = surrogate if last else surrogate.thinned(rungs[number].every)
+        shown = measure if last else measure.thinned(rungs[number].every)
         done = sum(before.steps.iterations for before in rungs[:number])
         if number > rung:
             state = _state_at(_strongest(state, rungs[number].starts))
@@ -171,11 +182,11 @@ def gradopt(
             state = _step(shown, space, steps, state)
             on_step(done + len(state["history"]), float(state["best"].max()))
             if checkpoint:
-                frames = surrogate.frames_evaluated + (0 if last else shown.frames_evaluated)
+                frames = measure.frames_evaluated + (0 if last else shown.frames_evaluated)
                 whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames)}
                 save_checkpoint(checkpoint, identity, whole)
         if not last:
-            surrogate.frames_evaluated += shown.frames_evaluated
+            measure.frames_evaluated += shown.frames_evaluated
     stopped = "all iterations done"
     if len(state["history"]) < schedule.iterations:
         stopped = f"no restart gained 0.1 % in the last {schedule.patience} iterations"
@@ -203,17 +214,17 @@ def _rungs(schedule: Schedule, restarts: int) -> list[_Rung]:
 
 
 def _starts(
-    surrogate: Surrogate,
+    measure: Measure,
     space: SearchSpace,
     count: int,
     seed: int,
     given: Sequence[Float[Tensor, "s k n"]],
 ) -> Float[Tensor, "g r k n"]:
     """Random points, the first of them replaced by those given."""
-    unit = space.random((len(surrogate.groups), count), torch.Generator().manual_seed(seed))
+    unit = space.random((len(measure.groups), count), torch.Generator().manual_seed(seed))
     for group, points in enumerate(given):
         unit[group, : len(points)] = points[:count]
-    return unit.to(surrogate.device)
+    return unit.to(measure.device)
 
 
 def _strongest(state: dict[str, Tensor], count: int) -> Float[Tensor, "g r k n"]:
@@ -227,12 +238,12 @@ def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:
     return {"unit": unit, "best_unit": unit.clone(), "best": best, "history": best.new_empty(0, *best.shape)}
 
 
-def _step(surrogate: Surrogate, space: SearchSpace, schedule: Schedule, state: dict[str, Tensor]) -> dict[str, Tensor]:
+def _step(measure: Measure, space: SearchSpace, schedule: Schedule, state: dict[str, Tensor]) -> dict[str, Tensor]:
     iteration = len(state["history"])
     fresh = iteration == 0 or iteration in schedule.drops
     unit = state["best_unit"] if iteration in schedule.drops else state["unit"]
     first_stage = iteration < min(schedule.drops, default=schedule.iterations)
-    value, gradient = surrogate.values_and_gradients(space, unit, coarse=first_stage)
+    value, gradient = measure.values_and_gradients(space, unit, coarse=first_stage)
     if not bool(value.isfinite().all() and gradient.isfinite().all()):
         raise RoadproofError(
             f"the controller's answer or gradient is NaN at iteration {iteration}; try --dtype float32, or check it"
@@ -262,10 +273,10 @@ def _stalled(history: Float[Tensor, "i g r"], schedule: Schedule) -> bool:
 
 
 def random_search(
-    surrogate: Surrogate, space: SearchSpace, *, patterns: int, seed: int
+    measure: Measure, space: SearchSpace, *, patterns: int, seed: int
 ) -> tuple[Float[Tensor, "g k n"], Float[Tensor, " g"]]:
     """The best of a number of random patterns for every group: the least an attack has to beat."""
-    unit = space.random((1, patterns), torch.Generator().manual_seed(seed)).to(surrogate.device)
-    unit = unit.expand(len(surrogate.groups), -1, -1, -1)
-    best, index = surrogate.values(space, unit).max(1)
+    unit = space.random((1, patterns), torch.Generator().manual_seed(seed)).to(measure.device)
+    unit = unit.expand(len(measure.groups), -1, -1, -1)
+    best, index = measure.values(space, unit).max(1)
     return unit[torch.arange(len(unit)), index], best

@@ -20,6 +20,8 @@ from roadproof.search_space import SearchSpace
 
 FORMAT = "roadproof-attack"
 FORMAT_VERSION = 1
+_LATER = ("objective", "predicted_m")
+_PLAIN = ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed", *_LATER)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -42,28 +44,33 @@ class Candidate:
     Args:
         pattern: its best.
         group: the drives it was found on.
-        surrogate_shift: its mean steering shift a frame towards that group's side.
+        surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames.
+        predicted_m: the paper's deviation in the recorded world; None where nothing was driven there.
     """
 
     pattern: Pattern
     group: str
     surrogate_shift: float
+    predicted_m: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class AttackResult:
     """The pattern an attack found on recorded drives, and how it was found.
 
-    Every number in it is a *surrogate* number, from composited frames; driving says what the car does.
+    Its numbers come from composited frames: the *surrogate*'s of single recorded ones, *predicted* ones of drives in
+    the recorded world. What the car does is for driving to say.
 
     Args:
         pattern: the strongest pattern.
         group: the group it was found for, e.g. "clean+right".
+        objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
         surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
-        by_group: the best mean shift of every group.
-        candidates: every start's best, the strongest first; the surrogate ranks only coarsely, so that driving over
-            the first few finds a stronger one than the first.
-        history: mean shift at every iteration after the heats, (iterations, groups, restarts).
+        predicted_m: the paper's deviation in the recorded world; None where the search did not drive there.
+        by_group: the best value of every group, in the objective's unit: steer a frame, or metres.
+        candidates: every start's best, the strongest first: by the predicted deviation where there is one. The
+            steering shift ranks only coarsely, so that driving over its first few finds a stronger one than the first.
+        history: value at every iteration after the heats, (iterations, groups, restarts).
         stopped: why the search ended.
         cost: what it took.
         checks: what the attack found when it distrusted itself.
@@ -86,6 +93,8 @@ class AttackResult:
     schedule: Schedule
     restarts: int
     seed: int
+    objective: str = "steering shift"
+    predicted_m: float | None = None
 
     def save(self, folder: Path) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
@@ -99,15 +108,13 @@ class AttackResult:
         content = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "kind": "surrogate: composited frames, not driving",
-            **{name: getattr(self, name) for name in ("group", "surrogate_shift", "by_group", "stopped")},
-            "candidates": [[each.group, each.surrogate_shift] for each in self.candidates],
+            "kind": "surrogate and predicted: composited frames, not driving",
+            **{name: getattr(self, name) for name in _PLAIN},
+            "candidates": [[each.group, each.surrogate_shift, each.predicted_m] for each in self.candidates],
             "cost": asdict(self.cost),
             "checks": [asdict(check) for check in self.checks],
             "space": asdict(self.space),
             "schedule": asdict(self.schedule),
-            "restarts": self.restarts,
-            "seed": self.seed,
             "history": np.round(self.history.astype(float), 6).tolist(),
         }
         write_atomically(folder / "result.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
@@ -124,21 +131,24 @@ class AttackResult:
             return AttackResult(
                 pattern=load_pattern(folder / "pattern.json"),
                 candidates=tuple(
-                    Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), str(group), float(shift))
-                    for rank, (group, shift) in enumerate(fields["candidates"], 1)
+                    Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), str(each[0]), *_numbers(each[1:]))
+                    for rank, each in enumerate(fields["candidates"], 1)
                 ),
                 cost=Cost(**fields["cost"]),
                 checks=tuple(Check(**check) for check in fields["checks"]),
                 space=_space(fields["space"]),
                 schedule=_schedule(fields["schedule"]),
                 history=np.array(fields["history"], dtype=np.float64),
-                **{
-                    name: fields[name]
-                    for name in ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed")
-                },
+                # Results that do not name their objective are older than the word.
+                **{name: fields[name] for name in _PLAIN if name in fields or name not in _LATER},
             )
         except (KeyError, TypeError, ValueError) as error:
             raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None
+
+
+def _numbers(stored: list[Any]) -> tuple[float, float | None]:
+    shift, predicted = stored if len(stored) == 2 else (*stored, None)
+    return float(shift), None if predicted is None else float(predicted)
 
 
 def _schedule(stored: dict[str, Any]) -> Schedule:

@@ -135,6 +135,10 @@ class Surrogate:
             gradients.append(gradient)
         return torch.cat(values, 1), torch.cat(gradients, 1)
 
+    def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> tuple[Float[Tensor, "g r"], None]:
+        """The shift itself; where the car goes is not known."""
+        return self.values(space, unit), None
+
     def fingerprint(self) -> str:
         """Tells this surrogate from another: drives, calibration, controller (by its clean answers)."""
         digest = hashlib.sha256(repr((self.groups, self.lengths)).encode())

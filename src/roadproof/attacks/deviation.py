@@ -1,0 +1,134 @@
+"""How far a pattern takes the car aside in the recorded world: the measure of a search in metres, with gradients.
+
+Patterns × starts are driven side by side (`recorded.world`). The value of a pattern for a side is the mean, over starts
+and over the instants at which the canvas is in view, of
+
+    s tanh(d / s)
+
+with d the offset from the clean path to that side and s some metres: a car that has left the road need not go further.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.attacks.surrogate import Surrogate
+from roadproof.controllers import Controller
+from roadproof.objectives import Direction, Group
+from roadproof.recorded.world import RecordedWorld, Start
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import SearchSpace
+
+MAX_PICTURES = 800
+"""Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
+
+
+class DeviationMeasure:
+    """Predicted offset of patterns in a recorded world, for every group at once.
+
+    Args:
+        recordings: with canvas and tracks.
+        controller: on `device`.
+        groups: give the sides; all drives of the set are driven in, whatever group they belong to.
+        starts: of the drives over each pattern.
+        every: steps from one picture to the next.
+        saturation_m: s.
+        device: where to drive.
+
+    Raises:
+        RecordingError: poses are not known, or the vehicle cannot be identified.
+        ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
+    """
+
+    def __init__(
+        self,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        starts: tuple[Start, ...] = (Start(),),
+        every: int = 2,
+        saturation_m: float = 3.0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        # Refuses controllers and groups that do not fit, and is what a search begins with.
+        self._open_loop = Surrogate(recordings, controller, groups, device=device)
+        self.groups = tuple(groups)
+        self.controller = controller
+        self.world = RecordedWorld(recordings, device=device)
+        self.world.fit(controller)
+        self.device = self.world.device
+        self.frames_evaluated = 0
+        self._starts, self._every, self._saturation_m = starts, every, saturation_m
+
+    def thinned(self, every: int) -> Surrogate:
+        """What chooses among many starts for less: the steering shift on every n-th recorded frame."""
+        return self._open_loop.thinned(every)
+
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """Metres to each group's side at points of a search space, without gradients."""
+        with torch.no_grad():
+            return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
+
+    def values_and_gradients(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+        """Metres to each group's side and their gradient at points of a search space.
+
+        The gradient of each point is scaled to unit length: closed loops amplify, and how much says nothing about how
+        far a step should go.
+
+        Args:
+            space: the patterns.
+            unit: R points a group.
+            coarse: whether the search is still in its first stage; this gradient does not care.
+        """
+        del coarse
+        values: list[Tensor] = []
+        gradients: list[Tensor] = []
+        for part in self._parts(unit):
+            leaf = part.detach().requires_grad_()
+            value = self._values(space, leaf)
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+            flat = gradient.flatten(2)
+            length = flat.square().sum(2, keepdim=True).sqrt().clamp_min(1e-12)
+            values.append(value.detach())
+            gradients.append((flat / length).view_as(gradient))
+        return torch.cat(values, 1), torch.cat(gradients, 1)
+
+    def readings(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r"]]:
+        """Steering shift on the recorded frames, and the paper's deviation as predicted from the clean start."""
+        predicted = self.world.deviations_m(self.controller, space.pattern(unit.flatten(0, 1)))
+        return self._open_loop.values(space, unit), torch.tensor(predicted).view(unit.shape[:2])
+
+    def fingerprint(self) -> str:
+        """Tells this measure from another: drives, calibration, controller, starts."""
+        more = repr((self._starts, self._every, self._saturation_m, self.world.vehicle))
+        return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
+
+    def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
+        pictures = len(self.groups) * len(self._starts) * -(-self.world.course.count // self._every)
+        at_once = max(1, MAX_PICTURES // pictures)
+        yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
+
+    def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        patterns = space.pattern(unit.flatten(0, 1))
+        rolled = self.world.roll(self.controller, patterns, starts=self._starts, every=self._every)
+        self.frames_evaluated += len(rolled.right_m) * -(-self.world.course.count // self._every)
+        soft = self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)
+        right = soft.mean(1).view(*unit.shape[:2], -1)
+        sides = [_to_side(part, group.direction) for group, part in zip(self.groups, right, strict=True)]
+        return torch.stack(sides).mean(-1).float()
+
+
+def _to_side(right_m: Tensor, direction: Direction) -> Tensor:
+    if direction is Direction.EITHER:
+        return right_m.abs()
+    return right_m if direction is Direction.RIGHT else -right_m

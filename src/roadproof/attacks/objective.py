@@ -1,0 +1,158 @@
+"""What a search makes large, as an object: a steering shift as published, a path deviation, or one of the user's own.
+
+    attack(recordings, controller, space, objective=PathDeviation())
+
+An objective is a description; `measure` makes of it what values patterns on a set of recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias, get_args, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.published import PublishedSurrogate
+from roadproof.attacks.surrogate import Surrogate
+from roadproof.controllers import Controller
+from roadproof.errors import RoadproofError
+from roadproof.objectives import Group
+from roadproof.recorded.world import Start
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import SearchSpace
+
+Gradient = Literal["exact", "published"]
+GRADIENTS: tuple[Gradient, ...] = get_args(Gradient)
+
+Readings: TypeAlias = tuple[Float[Tensor, "g r"], Float[Tensor, "g r"] | None]
+"""Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is."""
+
+
+@runtime_checkable
+class Measure(Protocol):
+    """Values patterns for every group at once; what `gradopt` climbs."""
+
+    groups: tuple[Group, ...]
+    frames_evaluated: int
+
+    @property
+    def device(self) -> torch.device:
+        """Where patterns are valued."""
+        ...
+
+    def thinned(self, every: int) -> Measure:
+        """A cheaper measure on every n-th recorded frame, whose order of starts is much the same."""
+        ...
+
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """Values of R points a group, without gradients."""
+        ...
+
+    def values_and_gradients(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+        """Values of R points a group, and the directions in which they rise."""
+        ...
+
+    def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Readings:
+        """What is told of R points a group in the end."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Tells this measure from every other, so that an interrupted search goes on with its own."""
+        ...
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """What a search makes large."""
+
+    @property
+    def name(self) -> str:
+        """In words, for results and reports."""
+        ...
+
+    def measure(
+        self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
+    ) -> Measure:
+        """The measure of patterns on a set of recordings.
+
+        Raises:
+            RoadproofError: recordings or controller do not allow it.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringShift:
+    """How far steering moves on recorded frames, open loop, as published; its value is steer units a frame.
+
+    Args:
+        gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
+    """
+
+    gradient: Gradient = "exact"
+
+    @property
+    def name(self) -> str:
+        """In words, for results and reports."""
+        return "steering shift"
+
+    def measure(
+        self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
+    ) -> Surrogate:
+        """The surrogate on the groups' frames."""
+        kind = PublishedSurrogate if self.gradient == "published" else Surrogate
+        return kind(recordings, controller, groups, device=device)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PathDeviation:
+    """How far aside the car goes in the recorded world, closed loop; its value is metres.
+
+    Args:
+        starts: of the drives over each pattern; several make what is found less particular to one way.
+        every: steps from one picture to the next while searching; a prediction looks at every step.
+        saturation_m: an offset of so many metres counts hardly less than a larger one.
+
+    Raises:
+        RoadproofError: there is no start, or a number is not positive.
+    """
+
+    starts: tuple[Start, ...] = (Start(),)
+    every: int = 2
+    saturation_m: float = 3.0
+
+    def __post_init__(self) -> None:
+        if not self.starts or self.every < 1 or not self.saturation_m > 0:
+            raise RoadproofError(
+                f"path deviation with {len(self.starts)} starts, a picture every {self.every} steps, saturation "
+                f"{self.saturation_m} m; expected one start or more, 1 or more, and above 0"
+            )
+
+    @property
+    def name(self) -> str:
+        """In words, for results and reports."""
+        return "path deviation"
+
+    def measure(
+        self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
+    ) -> DeviationMeasure:
+        """The recorded world of the whole set."""
+        return DeviationMeasure(
+            recordings,
+            controller,
+            groups,
+            starts=self.starts,
+            every=self.every,
+            saturation_m=self.saturation_m,
+            device=device,
+        )
+
+
+OBJECTIVES: dict[str, Objective] = {"deviation": PathDeviation(), "steering": SteeringShift()}
+"""Those that a command or a plan can name."""

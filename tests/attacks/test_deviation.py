@@ -1,0 +1,100 @@
+"""Searching where the car goes: what is found moves it further than chance, and the result says how far."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from painted_ground import RampFollower, recorded_road
+from roadproof.attacks import PathDeviation, Schedule, SteeringShift, attack
+from roadproof.attacks.result import AttackResult
+from roadproof.errors import RecordingError, RoadproofError
+from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
+from roadproof.recorded import RecordedWorld, Start, Vehicle
+from roadproof.search_space import SearchSpace
+
+SPACE = SearchSpace(figures=1)
+SHORT = dataclasses.replace(Schedule.closed_loop(8), heats=())
+VEHICLE = dataclasses.replace(
+    Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
+)
+
+
+@pytest.fixture(autouse=True)
+def known_vehicle(monkeypatch):
+    """The straight drives of the set say nothing of the steering."""
+    monkeypatch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+
+
+@pytest.fixture(scope="module")
+def road():
+    return recorded_road(every=2)
+
+
+def search(road, **options):
+    return attack(
+        road, RampFollower(), SPACE, **{"objective": PathDeviation(), "schedule": SHORT, "restarts": 2, **options}
+    )
+
+
+def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp_path):
+    result = search(road)
+    world = RecordedWorld(road)
+    world.fit(RampFollower())
+    by_chance = SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9)))
+    assert result.predicted_m > 1.2 * np.mean(world.deviations_m(RampFollower(), by_chance))
+    assert (result.history[-1] >= result.history[0] - 1e-3).all()
+    found = [candidate.predicted_m for candidate in result.candidates]
+    assert found == sorted(found, reverse=True)
+    assert result.predicted_m == found[0]
+    again = world.deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]))
+    assert again[0] == pytest.approx(found[0], abs=0.02)
+    result.save(tmp_path)
+    loaded = AttackResult.load(tmp_path)
+    assert (loaded.objective, loaded.predicted_m) == ("path deviation", result.predicted_m)
+    assert [each.predicted_m for each in loaded.candidates] == found
+
+
+def test_the_same_seed_finds_the_same_and_an_interrupted_search_goes_on_to_it(road, tmp_path):
+    whole, stopped = search(road), tmp_path / "search.safetensors"
+
+    def interrupt(step, _):
+        if step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search(road, checkpoint=stopped, on_step=interrupt)
+    gone_on = search(road, checkpoint=stopped)
+    assert torch.equal(gone_on.pattern.boxes, whole.pattern.boxes)
+    assert gone_on.predicted_m == whole.predicted_m
+    assert np.array_equal(gone_on.history, whole.history)
+
+
+def test_several_starts_are_valued_by_their_mean(road):
+    unit = SPACE.random((2, 1), torch.Generator().manual_seed(2))
+    starts = (Start(right_m=0.3), Start(right_m=-0.3))
+
+    def value(*chosen):
+        measure = PathDeviation(starts=chosen).measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+        return measure.values(SPACE, unit)
+
+    apart = (value(starts[0]) + value(starts[1])) / 2
+    assert torch.allclose(value(*starts), apart, atol=2e-3)
+    # What goes to the right for one group counts against the other.
+    right, left = value(Start())[:, 0].tolist()
+    same = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    both = same.values(SPACE, unit[:1].expand(2, -1, -1, -1))[:, 0]
+    assert float(both[0]) == pytest.approx(-float(both[1]))
+    assert right == pytest.approx(float(both[0]), abs=1e-4)
+    assert left != right
+
+
+def test_objectives_that_make_no_sense_are_one_clear_line(road):
+    with pytest.raises(RoadproofError, match="0 starts, a picture every 2 steps"):
+        PathDeviation(starts=())
+    with pytest.raises(RoadproofError, match="saturation 0"):
+        PathDeviation(saturation_m=0.0)
+    with pytest.raises(RecordingError, match="where its canvas lies"):
+        search(dataclasses.replace(road, canvas=None))
+    assert (SteeringShift().name, PathDeviation().name) == ("steering shift", "path deviation")
