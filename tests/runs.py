@@ -12,7 +12,7 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
 from roadproof.coverage import Shape
-from roadproof.datatypes import Event, EventKind, Weather
+from roadproof.datatypes import Ending, Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window
 from roadproof.drives.drives import Settings, write_drive, write_settings
 from roadproof.evaluation import Evaluation, Selection
@@ -22,7 +22,7 @@ from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Push, save_recordings
 from roadproof.report.film import Strip
-from roadproof.rollout import Ending, Episode
+from roadproof.rollout import Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.maps import load_map, scenario_route

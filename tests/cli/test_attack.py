@@ -67,7 +67,7 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke
     code, printed = invoke(*command("--out", str(tmp_path / "out")))
     assert code == 0, printed.err
     assert "Strongest for clean+" in printed.out
-    assert "predicted" in printed.out
+    assert "on recorded frames" in printed.out
     assert printed.err == ""
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"pattern.json", "pattern.png", "result.json", "search.png", "film-clean.png"} <= names

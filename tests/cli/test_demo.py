@@ -6,12 +6,21 @@ import pytest
 
 import needs
 from paint_shy import along_a_street
-from roadproof.attacks import Schedule
+from roadproof.attacks import Schedule, SteeringShift
 from roadproof.datatypes import Weather
 from roadproof.loop import BUDGETS, Budget
 from roadproof.scenarios import save_scenarios
 
-TINY = Budget(frames=4, schedule=Schedule.stretched(2), restarts=1, select=1, weathers=(Weather.CLEAR_NOON,), runs=0)
+TINY = Budget(
+    objective=SteeringShift(),
+    deviations_m=(1.5,),
+    frames=4,
+    schedule=Schedule.stretched(2),
+    restarts=1,
+    select=1,
+    weathers=(Weather.CLEAR_NOON,),
+    runs=0,
+)
 
 
 @pytest.fixture

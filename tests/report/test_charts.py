@@ -37,7 +37,7 @@ def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drive
     drawn = [
         charts.offsets([("clear-noon", *drives)], SCENARIO.canvas),
         charts.steering(*drives, None, SCENARIO.canvas),
-        charts.search(np.zeros((5, 2, 3)), ["clean+right", "clean+left"]),
+        charts.search(np.zeros((5, 2, 3)), ["clean+right", "clean+left"], "path deviation"),
     ]
     for chart in drawn:
         assert not re.search(r"#0101", chart.svg)

@@ -19,7 +19,7 @@ SCENARIO = builtin_scenarios()[0]
 @pytest.fixture(scope="module")
 def parts():
     roads = load_map(SCENARIO.map_name)
-    return {"roads": roads, "route": scenario_route(SCENARIO, roads), "canvas": SCENARIO.canvas}
+    return {"roads": roads, "way": scenario_route(SCENARIO, roads).points[:, :2], "canvas": SCENARIO.canvas}
 
 
 def observation(time_s=0.0, x_m=None, picture=True, events=()):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from roadproof.cli.options import ControllerSpec, Device, choice
+from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult, ShownDrive
+    from roadproof.attacks import AttackResult, Schedule, ShownDrive
     from roadproof.search_space import SearchSpace
 
 
@@ -27,6 +29,14 @@ def attack(
     max_painted_share: Annotated[
         float | None, typer.Option(help="Largest share of the canvas that may be painted.", show_default=False)
     ] = None,
+    objective: Annotated[
+        str | None,
+        typer.Option(
+            help="deviation: metres aside, driven in the recordings; steering: shift on recorded frames, as published."
+            "  [default: deviation where the set has poses and both sides]",
+            show_default=False,
+        ),
+    ] = None,
     groups: Annotated[
         str, typer.Option(help="Drives attacked together: clean+right,clean+left, or all.")
     ] = "clean+right,clean+left",
@@ -34,7 +44,10 @@ def attack(
         str, typer.Option(help="heats: many starts on few frames, the best go on; published: random starts.")
     ] = "heats",
     iterations: Annotated[
-        int | None, typer.Option(help="Steps of every restart; 100 after heats, 250 as published.", show_default=False)
+        int | None,
+        typer.Option(
+            help="Steps of every restart; after heats 100, for a deviation 40; 250 as published.", show_default=False
+        ),
     ] = None,
     restarts: Annotated[int, typer.Option(help="Patterns of every group that are searched to the end.")] = 4,
     gradient: Annotated[str, typer.Option(help="exact, or published: the authors' way, to compare with.")] = "exact",
@@ -49,9 +62,9 @@ def attack(
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/attack"),
 ) -> None:
-    """Find the painted pattern that shifts a controller's steering most on recorded drives."""
+    """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import GRADIENTS, Schedule, show_pattern
+    from roadproof.attacks import GRADIENTS, OBJECTIVES, SteeringShift, show_pattern
     from roadproof.attacks import attack as run
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
@@ -59,7 +72,7 @@ def attack(
     from roadproof.coverage import Shape
     from roadproof.files import check_writable
     from roadproof.objectives import parse_groups
-    from roadproof.recordings import load_recordings
+    from roadproof.recordings import Push, load_recordings
     from roadproof.search_space import FAMILIES, SearchSpace
 
     space = SearchSpace(
@@ -70,12 +83,17 @@ def attack(
         albedo=albedo,
         max_painted_share=max_painted_share,
     )
-    make = {"heats": Schedule.in_heats, "published": Schedule.stretched}[
-        choice(schedule, "schedule", ("heats", "published"))
-    ]
-    steps = make(patience=patience) if iterations is None else make(iterations, patience=patience)
     check_writable(out)
     drives = load_recordings(recordings)
+    pushed = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in drives.recordings}
+    driven_in = gradient == "exact" and drives.is_placed and pushed
+    word = objective or ("deviation" if driven_in else "steering")
+    wanted = OBJECTIVES[choice(word, "objective", tuple(OBJECTIVES))]
+    if gradient != "exact":
+        if word != "steering":
+            raise RoadproofError(f"--gradient {gradient} is of the steering shift; expected --objective steering")
+        wanted = SteeringShift(choice(gradient, "gradient", GRADIENTS))
+    steps = _schedule(choice(schedule, "schedule", ("heats", "published")), word, iterations, patience)
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
@@ -86,12 +104,12 @@ def attack(
             drives,
             attacked,
             space,
+            objective=wanted,
             groups=chosen,
             schedule=steps,
             restarts=restarts,
             seed=seed,
             device=device,
-            gradient=choice(gradient, "gradient", GRADIENTS),
             random_patterns=random_patterns,
             checkpoint=checkpoint,
             on_step=on_step,
@@ -102,6 +120,15 @@ def attack(
     _draw(result, shown, out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, space, out)
+
+
+def _schedule(kind: str, objective: str, iterations: int | None, patience: int | None) -> Schedule:
+    from roadproof.attacks import Schedule
+
+    if kind == "heats" and objective == "deviation":
+        return replace(Schedule.closed_loop(iterations or 40), patience=patience)
+    make = Schedule.in_heats if kind == "heats" else Schedule.stretched
+    return make(patience=patience) if iterations is None else make(iterations, patience=patience)
 
 
 def _draw(result: AttackResult, shown: tuple[ShownDrive, ...], out: Path) -> None:
@@ -125,7 +152,11 @@ def _summarise(result: AttackResult, space: SearchSpace, out: Path) -> None:
 
     say = Console(soft_wrap=True, highlight=False).print
     sides = ", ".join(f"{name} {value:+.3f}" for name, value in result.by_group.items())
-    say(f"Strongest for {result.group}: {result.surrogate_shift:+.3f} steer a frame, predicted ({sides})")
+    shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
+    if result.predicted_m is not None:
+        shift = f"{result.predicted_m:.2f} m of deviation predicted, nothing was driven for real; {shift}"
+    say(f"Strongest for {result.group}: {shift}")
+    say(f"Best {result.objective} of each group: {sides}")
     say(
         f"{space.figures} figures, {result.restarts} restarts × {len(result.history)} iterations, {result.stopped}; "
         f"{result.cost.controller_frames} frames in {result.cost.seconds:.0f} s"

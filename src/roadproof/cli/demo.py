@@ -33,6 +33,14 @@ def demo(
     scenarios: ScenarioFile = None,
     controller: ControllerSpec = "pilotnet",
     budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
+    objective: Annotated[
+        str | None,
+        typer.Option(
+            help="What the search makes large: deviation, driven in the recordings, or steering, as published."
+            "  [default: the budget's]",
+            show_default=False,
+        ),
+    ] = None,
     rounds: Annotated[int, typer.Option(help="Rounds of searching on along the way that the attacked car took.")] = 0,
     attack_weathers: Annotated[
         str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
@@ -48,6 +56,7 @@ def demo(
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.attacks import OBJECTIVES
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.files import write_atomically
@@ -59,6 +68,8 @@ def demo(
     tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
     check_processes(processes, simulator)
     spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
+    if objective is not None:
+        spent = replace(spent, objective=OBJECTIVES[choice(objective, "objective", tuple(OBJECTIVES))])
     spent = replace(spent, rounds=rounds, attack_weathers=weathers_of(attack_weathers, "attack-weathers"))
     space = SearchSpace(figures=figures)
     who = load_controller(controller, device=device)
@@ -88,6 +99,7 @@ def demo(
         "figures": figures,
         "seed": seed,
         "simulator": simulator,
+        **({"objective": objective} if objective else {}),
         **({"scenarios": scenarios} if scenarios else {}),
         "out": out,
     }
@@ -126,6 +138,11 @@ def _report(result: StressTest, out: Path) -> None:
     page = write_report(out)
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     say(verdict(read_run(out)).sentence)
+    if (foretold := result.prediction) is not None:
+        say(
+            f"Predicted in the recordings {foretold.predicted_m:.2f} m of deviation, driven {foretold.driven_m:.2f} m; "
+            f"{foretold.path_error_m:.2f} m between the paths on average"
+        )
     for stage, cost in result.cost.items():
         if cost == StageCost():
             continue

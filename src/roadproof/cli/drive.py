@@ -13,25 +13,38 @@ from roadproof.cli.options import (
     Device,
     DriverSpec,
     ScenarioFile,
-    ScenarioName,
-    SimulatorSpec,
-    WeatherName,
+    ScenarioOrRecorded,
+    WorldSpec,
     choice,
     driver_of,
 )
+from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
     from roadproof.datatypes import Control, Observation
+    from roadproof.evaluation.episodes import AnyDriver
+    from roadproof.recorded.simulator import RecordedSimulator
     from roadproof.report.video import DriveVideo
     from roadproof.rollout import Episode, OnStep
+    from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
+    from roadproof.simulators.town.roadmap import RoadMap
 
 
 def drive(
-    scenario: ScenarioName = "left-03",
+    scenario: ScenarioOrRecorded = None,
     scenarios: ScenarioFile = None,
     driver: DriverSpec = "expert",
-    weather: WeatherName = "clear-noon",
+    weather: Annotated[
+        str | None,
+        typer.Option(
+            help="One of the eight, for instance rainy-noon; clear-noon by default, or that of the recordings.",
+            show_default=False,
+        ),
+    ] = None,
     pattern: Annotated[
         Path | None,
         typer.Option(help="pattern.json of an attack, or a 400×400 picture, painted on the road.", show_default=False),
@@ -39,7 +52,7 @@ def drive(
     cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
     pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
     seed: Annotated[int, typer.Option(help="Of the other cars and the people.")] = 0,
-    simulator: SimulatorSpec = "town",
+    simulator: WorldSpec = "town",
     device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),
 ) -> None:
@@ -49,29 +62,29 @@ def drive(
     from roadproof.files import check_writable
     from roadproof.patterns import read_paint
     from roadproof.rollout import rollout
-    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
-    from roadproof.simulators.loading import open_simulator
-    from roadproof.simulators.town.maps import scenario_route
 
-    driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
-    sky = Weather(choice(weather, "weather", tuple(Weather)))
+    inside = recorded_in(simulator)
+    asked = scenario_asked(inside, scenario, scenarios)
+    sky = Weather.CLEAR_NOON if inside is None else inside.weather
+    if weather is not None:
+        sky = Weather(choice(weather, "weather", tuple(Weather)))
+    if inside is not None:
+        check_driver(driver)
     paint = None if pattern is None else read_paint(pattern)
     check_writable(out)
-    who = driver_of(driver, device)
+    who: AnyDriver = driver_of(driver, device)
 
     # PyAV is an extra.
     from roadproof.report.video import DriveVideo
 
     with ExitStack() as stack:
-        world = stack.enter_context(open_simulator(simulator))
-        roads = world.road_map(driven.map_name)
-        route = scenario_route(driven, roads)
+        world = stack.enter_context(open_world(simulator, device))
+        driven = stretch_of(world, asked)
+        roads, way = _map_of(world, driven)
         film = stack.enter_context(
-            DriveVideo(
-                out / "drive.mp4", roads=roads, route=route, canvas=driven.canvas, pattern=paint, dt_s=world.dt_s
-            )
+            DriveVideo(out / "drive.mp4", roads=roads, way=way, canvas=driven.canvas, pattern=paint, dt_s=world.dt_s)
         )
-        on_step = stack.enter_context(_watched(world, film, f"Driving {driven.name}", route.length_m))
+        on_step = stack.enter_context(_watched(world, film, f"Driving {driven.name}", way))
         episode = rollout(
             world,
             who,
@@ -88,24 +101,41 @@ def drive(
     _summarise(episode, out)
 
 
+def _map_of(
+    world: MappedSimulator | RecordedSimulator, scenario: Scenario
+) -> tuple[RoadMap | None, Float[np.ndarray, "n 2"]]:
+    """The roads, where they are known, and world x, y of the way from start to goal."""
+    from roadproof.recorded.simulator import RecordedSimulator
+    from roadproof.simulators.town.maps import scenario_route
+
+    if isinstance(world, RecordedSimulator):
+        return None, world.way
+    roads = world.road_map(scenario.map_name)
+    return roads, scenario_route(scenario, roads).points[:, :2]
+
+
 @contextmanager
-def _watched(world: MappedSimulator, film: DriveVideo, title: str, length_m: float) -> Generator[OnStep]:
-    """Films every step and shows how far the car is."""
+def _watched(
+    world: MappedSimulator | RecordedSimulator, film: DriveVideo, title: str, way: Float[np.ndarray, "n 2"]
+) -> Generator[OnStep]:
+    """Films every step and shows how far the car has driven."""
     import numpy as np
 
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Control
+    from roadproof.recorded.simulator import RecordedSimulator
 
-    at_m = 0.0
+    driven_m = 0.0
 
     def on_step(seen: Observation, control: Control | None) -> None:
-        nonlocal at_m
-        others, people = (np.column_stack([agents.x_m, agents.y_m]) for agents in (world.cars, world.pedestrians))
-        film.add(seen, Control(0.0) if control is None else control, cars=others, people=people)
-        at_m = world.route.locate(seen.state.x_m, seen.state.y_m, at_m).arclength_m
-        show(round(at_m), 3.6 * seen.state.speed_mps)
+        nonlocal driven_m
+        around = () if isinstance(world, RecordedSimulator) else (world.cars, world.pedestrians)
+        others = [np.column_stack([agents.x_m, agents.y_m]) for agents in around]
+        film.add(seen, Control(0.0) if control is None else control, *others)
+        driven_m += abs(seen.state.speed_mps) * world.dt_s
+        show(round(driven_m), 3.6 * seen.state.speed_mps)
 
-    with progress(title, round(length_m), "m, {:.0f} km/h") as show:
+    with progress(title, round(np.hypot(*np.diff(way, axis=0).T).sum()), "m, {:.0f} km/h") as show:
         yield on_step
 
 
@@ -114,10 +144,12 @@ def _summarise(episode: Episode, out: Path) -> None:
 
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     road = f"painted road ({episode.paint})" if episode.painted else "bare road"
+    events = f"{len(episode.events) or 'no'} event{'' if len(episode.events) == 1 else 's'}"
+    if episode.paint.predicted:
+        events = "predicted: nothing was driven for real, and infractions are not known"
     say(
         f"{episode.scenario}, {episode.weather}, {road}, {episode.cars} cars, {episode.pedestrians} pedestrians: "
-        f"{episode.ending} after {episode.time_s[-1]:.1f} s, {len(episode.events) or 'no'} event"
-        f"{'' if len(episode.events) == 1 else 's'}"
+        f"{episode.ending} after {episode.time_s[-1]:.1f} s, {events}"
     )
     for event in episode.events:
         say(f"  {event.time_s:5.1f} s  {event.kind}  {event.detail}")

@@ -13,16 +13,17 @@ from roadproof.cli.options import (
     DriverSpec,
     Processes,
     ScenarioFile,
-    ScenarioName,
-    SimulatorSpec,
+    ScenarioOrRecorded,
+    WorldSpec,
     check_processes,
     driver_of,
     weathers_of,
 )
+from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
-    from roadproof.evaluation import Evaluation, Fidelity
+    from roadproof.evaluation import Evaluation, Fidelity, Row
     from roadproof.patterns import Pattern
     from roadproof.recordings import RecordingSet
     from roadproof.simulators.protocol import Simulator
@@ -33,12 +34,22 @@ def evaluate(
         Path, typer.Argument(help="pattern.json of an attack, or a 400×400 picture.", show_default=False)
     ],
     controller: DriverSpec = "cil",
-    scenario: ScenarioName = "left-03",
+    scenario: ScenarioOrRecorded = None,
     scenarios: ScenarioFile = None,
     weathers: Annotated[
-        str, typer.Option(help="Weathers, with commas between; the paper's four by default.")
-    ] = "clear-noon,cloudy-noon,rainy-noon,clear-sunset",
-    runs: Annotated[int, typer.Option(help="Drives with traffic in each weather, besides the one alone.")] = 10,
+        str | None,
+        typer.Option(
+            help="Weathers, with commas between; the paper's four by default, or that of the recordings.",
+            show_default=False,
+        ),
+    ] = None,
+    runs: Annotated[
+        int | None,
+        typer.Option(
+            help="Drives with traffic in each weather, besides the one alone; 10 by default, 0 in recordings.",
+            show_default=False,
+        ),
+    ] = None,
     cars: Annotated[int, typer.Option(help="Other cars in those.")] = 20,
     pedestrians: Annotated[int, typer.Option(help="People about in those.")] = 20,
     random: Annotated[int, typer.Option(help="Random patterns to compare with.")] = 0,
@@ -48,7 +59,7 @@ def evaluate(
     ] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
     processes: Processes = 1,
-    simulator: SimulatorSpec = "town",
+    simulator: WorldSpec = "town",
     seed: Annotated[int, typer.Option(help="Of the first run with traffic; the others count on.")] = 0,
     device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
@@ -60,16 +71,21 @@ def evaluate(
     from roadproof.cli.progress import progress
     from roadproof.controllers import Controller
     from roadproof.errors import PatternError
+    from roadproof.evaluation import PAPER_WEATHERS, random_patterns
     from roadproof.evaluation import evaluate as run
-    from roadproof.evaluation import random_patterns
     from roadproof.files import check_writable
     from roadproof.patterns import load_pattern, read_paint
     from roadproof.recordings import load_recordings
-    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
-    from roadproof.simulators.loading import open_simulator
 
-    driven = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
-    skies = weathers_of(weathers, "weathers")
+    inside = recorded_in(simulator)
+    asked = scenario_asked(inside, scenario, scenarios)
+    skies = PAPER_WEATHERS if inside is None else (inside.weather,)
+    if weathers is not None:
+        skies = weathers_of(weathers, "weathers")
+    if inside is not None:
+        check_driver(controller)
+        _check_recorded(runs, recordings)
+        cars = pedestrians = 0
     check_processes(processes, simulator)
     figures = load_pattern(pattern) if pattern.suffix == ".json" else None
     paint = read_paint(pattern)
@@ -78,17 +94,18 @@ def evaluate(
     recorded = None if recordings is None else load_recordings(recordings)
     check_writable(out)
     who = driver_of(controller, device)
-    with open_simulator(simulator) as world:
+    with open_world(simulator, device) as world:
+        driven = stretch_of(world, asked)
         with progress(f"Driving {driven.name}", 100, "%, {:.0f} drives") as show:
             evaluation = run(
-                partial(open_simulator, simulator) if processes > 1 else world,
+                partial(open_world, simulator, device) if processes > 1 else world,
                 who,
                 driven,
                 paint if figures is None else figures,
                 folder=out,
                 driver_name=controller,
                 weathers=skies,
-                runs=runs,
+                runs=runs if runs is not None else 10 if inside is None else 0,
                 cars=cars,
                 pedestrians=pedestrians,
                 seed=seed,
@@ -104,6 +121,20 @@ def evaluate(
         if recorded is not None and figures is not None and isinstance(who, Controller):
             fidelity = _compared(world, who, evaluation, figures, recorded, out)
     _summarise(evaluation, fidelity, recorded, out)
+
+
+def _check_recorded(runs: int | None, recordings: Path | None) -> None:
+    """Refuse what recordings cannot give, before anything is driven.
+
+    Raises:
+        RoadproofError: traffic, or renders to compare with, are asked for.
+    """
+    from roadproof.errors import RoadproofError
+
+    if runs:
+        raise RoadproofError(f"--runs is {runs}, but recordings hold no others on the road; expected 0")
+    if recordings is not None:
+        raise RoadproofError("--recordings compares with what a simulator renders; nothing is rendered in recordings")
 
 
 def _compared(
@@ -123,16 +154,26 @@ def _compared(
     return fidelity
 
 
+def _infractions(row: Row) -> list[str]:
+    from roadproof.report.words import mean_in_words
+
+    return [mean_in_words(row.points, 1), mean_in_words(row.clean_points, 1), f"{row.failed:.0%}"]
+
+
 def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: RecordingSet | None, out: Path) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    from roadproof.report.words import mean_in_words
+    from roadproof.report.words import UNKNOWN, mean_in_words
 
     console = Console(soft_wrap=True, highlight=False, markup=False)
-    table = Table("pattern", "weather", "with", box=box.SIMPLE)
-    for column in ("drives", "deviation m", "furthest m", "points", "clean points", "with events"):
+    foreseen = evaluation.predicted
+    title = "Predicted: composited into recorded frames, nothing was driven for real" if foreseen else None
+    table = Table("pattern", "weather", "with", box=box.SIMPLE, title=title, title_justify="left")
+    driven = ("deviation m", "furthest m", "points", "clean points", "with events")
+    predicted = ("predicted deviation m", "predicted furthest m", "infractions")
+    for column in ("drives", *(predicted if foreseen else driven)):
         table.add_column(column, justify="right")
     for row in evaluation.rows():
         traffic = f"{evaluation.cars} cars, {evaluation.pedestrians} people" if row.traffic else "nobody"
@@ -140,12 +181,10 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: Reco
             row.pattern,
             row.weather or "all",
             traffic,
-            str(row.points.count),
+            str(row.count),
             mean_in_words(row.deviation_m, 2),
             mean_in_words(row.lateral_m, 2),
-            mean_in_words(row.points, 1),
-            mean_in_words(row.clean_points, 1),
-            f"{row.failed:.0%}",
+            *([UNKNOWN] if row.failed is None else _infractions(row)),
         )
     console.print(table)
     if fidelity is not None:
@@ -157,6 +196,7 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: Reco
     elif recorded is not None:
         console.print("The recordings are not of this clean drive, so composites were not compared with renders")
     console.print(
-        f"{evaluation.simulator_calls} drives, paint {evaluation.paint}, {evaluation.seconds:.0f} s; "
+        f"{evaluation.drives} {'predicted ' if foreseen else ''}drives, paint {evaluation.paint}, "
+        f"{evaluation.seconds:.0f} s; "
         f"results in {out}: evaluation.json, episodes"
     )

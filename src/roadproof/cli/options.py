@@ -28,12 +28,26 @@ DriverSpec: TypeAlias = Annotated[
     str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {CONTROLLERS}")
 ]
 ScenarioName: TypeAlias = Annotated[str, typer.Option(help="One of those that `roadproof scenarios` lists.")]
+ScenarioOrRecorded: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        help="One of those that `roadproof scenarios` lists; left-03 by default, or that of the recordings.",
+        show_default=False,
+    ),
+]
 ScenarioFile: TypeAlias = Annotated[
     Path | None,
     typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
 ]
 WeatherName: TypeAlias = Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")]
 SimulatorSpec: TypeAlias = Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")]
+WorldSpec: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--simulator",
+        help="Where it is driven: town, carla://HOST:PORT, or recorded:FOLDER for a prediction in recordings.",
+    ),
+]
 Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
 Processes: TypeAlias = Annotated[int, typer.Option(help="Drives of the evaluation made at once.")]

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import ControllerSpec, Device, SimulatorSpec
+from roadproof.cli.options import ControllerSpec, Device, WorldSpec
+from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult
@@ -18,10 +19,13 @@ def select(
     run: Annotated[Path, typer.Argument(help="A run that was recorded, calibrated and attacked.", show_default=False)],
     controller: ControllerSpec,
     best: Annotated[int, typer.Option(help="How many of the attack's candidates are driven, once each.")] = 6,
-    simulator: SimulatorSpec = "town",
+    simulator: WorldSpec = "town",
     device: Device = "cpu",
 ) -> None:
-    """Drive over the best candidates of an attack, which composites rank only coarsely, and keep the strongest."""
+    """Drive over the best candidates of an attack, which composites rank only coarsely, and keep the strongest.
+
+    In recordings the drives are predicted.
+    """
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks import AttackResult
     from roadproof.cli.progress import progress
@@ -31,7 +35,6 @@ def select(
     from roadproof.evaluation import select_by_driving
     from roadproof.files import check_writable
     from roadproof.patterns import save_pattern
-    from roadproof.simulators.loading import open_simulator
 
     if best < 1:
         raise RoadproofError(f"--best is {best}, expected 1 or more")
@@ -44,10 +47,11 @@ def select(
         )
     found = AttackResult.load(place)
     check_writable(run)
+    inside = recorded_in(simulator)
     who = load_controller(controller, device=device)
     total = 1 + min(best, len(found.candidates))
     with (
-        open_simulator(simulator) as world,
+        open_world(simulator, device) as world,
         progress(f"Driving {recorded.scenario.name}", total, "drives, {:.2f} m") as show,
     ):
         selection = select_by_driving(
@@ -56,7 +60,7 @@ def select(
             recorded.scenario,
             found.candidates,
             best=best,
-            weather=recorded.weather,
+            weather=recorded.weather if inside is None else inside.weather,
             folder=run / "selection",
             on_drive=show,
         )
@@ -68,12 +72,15 @@ def _summarise(selection: Selection, found: AttackResult, run: Path) -> None:
     from rich.console import Console
 
     say = Console(soft_wrap=True, highlight=False, markup=False).print
+    driven = "predicted drive" if selection.predicted else "driven"
     for k, each in enumerate(selection.driven):
-        predicted = found.candidates[each.rank - 1].surrogate_shift
+        shift = found.candidates[each.rank - 1].surrogate_shift
+        points = "points not known" if each.trial.points is None else f"{each.trial.points:g} points"
         say(
-            f"  {each.rank:2} {each.group:12} predicted {predicted:+.3f}, driven: deviation "
-            f"{each.trial.deviation_m:.2f} m, {abs(each.trial.lateral_m):.2f} m aside, {each.trial.points:g} points"
+            f"  {each.rank:2} {each.group:12} predicted {shift:+.3f}, {driven}: deviation "
+            f"{each.trial.deviation_m:.2f} m, {abs(each.trial.lateral_m):.2f} m aside, {points}"
             f"{'  <- kept' if k == selection.chosen else ''}"
         )
     pattern = run / "pattern.json"
-    say(f"{selection.simulator_calls} drives; the strongest is {pattern}; next: roadproof evaluate {pattern} ...")
+    drives = "nothing was driven for real" if selection.predicted else f"{selection.simulator_calls} drives"
+    say(f"{drives}; the strongest is {pattern}; next: roadproof evaluate {pattern} ...")

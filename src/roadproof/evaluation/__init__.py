@@ -10,6 +10,8 @@ from roadproof.evaluation.fidelity import is_drive_of as is_drive_of
 from roadproof.evaluation.fidelity import rendered_frames as rendered_frames
 from roadproof.evaluation.objective import DrivenObjective as DrivenObjective
 from roadproof.evaluation.objective import Effect as Effect
+from roadproof.evaluation.prediction import Prediction as Prediction
+from roadproof.evaluation.prediction import predict as predict
 from roadproof.evaluation.result import Evaluation as Evaluation
 from roadproof.evaluation.result import Row as Row
 from roadproof.evaluation.result import Trial as Trial

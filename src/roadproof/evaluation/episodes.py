@@ -23,7 +23,7 @@ from roadproof.datatypes import Weather
 from roadproof.evaluation.result import Trial, judge
 from roadproof.rollout import Driver, Episode, rollout
 from roadproof.scenarios import Scenario, identity
-from roadproof.simulators.protocol import PaintKind, PatternImage, Simulator
+from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
 
 CLEAN = "clean"
 
@@ -181,4 +181,6 @@ def _identity(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> st
     }
     if simulator.paint is not PaintKind.RENDERED:
         parts["paint"] = simulator.paint
+    if isinstance(simulator, Identified):
+        parts["world"] = simulator.identity
     return json.dumps(parts, sort_keys=True, default=cast("Callable[[object], str]", str))

@@ -53,6 +53,7 @@ def evaluate(
 
     Args:
         simulator: an open one, or a function that makes one, such as `TownSimulator`; needed for several processes.
+            What a recorded world answers is predicted, and the evaluation says so.
         driver: a controller, or a function as `training.expert.expert`; for several processes it must be picklable.
         scenario: where.
         pattern: what is painted.
@@ -108,7 +109,7 @@ def evaluate(
         pedestrians=pedestrians,
         seed=seed,
         trials=tuple(episodes.trial(clean, painted) for clean, painted in planned),
-        simulator_calls=len(drives),
+        simulator_calls=0 if world.paint.predicted else len(drives),
         seconds=time.perf_counter() - started,
         paint=world.paint,
     )

@@ -1,5 +1,8 @@
 """What came of an evaluation, its table, and its folder.
 
+Where a simulator composites paint into recorded frames, all that is told here is predicted, and nothing is known of
+infractions.
+
     EVALUATION/evaluation.json   conditions, every trial with its numbers, cost
     EVALUATION/scenario.toml     what was driven
     EVALUATION/paint.png         what was painted
@@ -11,8 +14,9 @@ Nothing is pickled, and no path in a file leaves the folder.
 from __future__ import annotations
 
 import json
+import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +29,7 @@ from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.files import read_json, write_atomically
 from roadproof.geometry import CanvasPlacement
 from roadproof.metrics import (
+    HORIZON_M,
     Mean,
     Path2D,
     deviation_m,
@@ -54,7 +59,7 @@ _UNITS = {
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Trial:
-    """One drive over a pattern against the same drive without it. All numbers are of driving.
+    """One drive over a pattern against the same drive without it. All numbers are of driving, or all predicted.
 
     Args:
         pattern: "attack", or "random-N".
@@ -65,11 +70,11 @@ class Trial:
         painted: file of the drive with it.
         deviation_m: between them (`metrics.deviation_m`).
         lateral_m: largest offset from the clean path, left positive.
-        points: infraction points with paint.
+        points: infraction points with paint; None where nothing is known of them, as for the next three.
         clean_points: without.
         leaderboard: the Leaderboard's factor with paint.
         clean_leaderboard: without.
-        first_event_s: when something first went wrong; None where nothing did.
+        first_event_s: when something first went wrong; None where nothing did, or nothing is known of it.
         clean_first_event_s: the same without paint.
         ending: why the painted drive ended.
     """
@@ -82,10 +87,10 @@ class Trial:
     painted: str
     deviation_m: float
     lateral_m: float
-    points: float
-    clean_points: float
-    leaderboard: float
-    clean_leaderboard: float
+    points: float | None
+    clean_points: float | None
+    leaderboard: float | None
+    clean_leaderboard: float | None
     first_event_s: float | None
     clean_first_event_s: float | None
     ending: str
@@ -101,7 +106,8 @@ class Row:
         traffic: whether there were other cars and people.
         deviation_m: the paper's deviation.
         lateral_m: largest offset from the clean path, to whichever side.
-        points: infraction points with paint.
+        count: how many trials.
+        points: infraction points with paint; None where nothing is known of them, as for the next three.
         clean_points: without.
         leaderboard: the Leaderboard's factor with paint.
         failed: share of the drives with any event.
@@ -113,10 +119,11 @@ class Row:
     traffic: bool
     deviation_m: Mean
     lateral_m: Mean
-    points: Mean
-    clean_points: Mean
-    leaderboard: Mean
-    failed: float
+    count: int
+    points: Mean | None
+    clean_points: Mean | None
+    leaderboard: Mean | None
+    failed: float | None
     first_event_s: Mean | None
 
 
@@ -133,7 +140,7 @@ class Evaluation:
         pedestrians: about in those.
         seed: of the first run; the others count on from it.
         trials: every drive over paint.
-        simulator_calls: drives that all this takes, clean ones included.
+        simulator_calls: drives that all this takes, clean ones included; 0 where they are predicted.
         seconds: wall time of the drives made now; those found in the folder cost nothing.
         paint: how the simulator puts a pattern on the road.
     """
@@ -149,6 +156,16 @@ class Evaluation:
     simulator_calls: int
     seconds: float
     paint: PaintKind = PaintKind.RENDERED
+
+    @property
+    def predicted(self) -> bool:
+        """Whether all this is predicted, and nothing was driven for real."""
+        return self.paint.predicted
+
+    @property
+    def drives(self) -> int:
+        """How many drives are compared, clean ones included."""
+        return len({name for trial in self.trials for name in (trial.clean, trial.painted)})
 
     def of(self, pattern: str = ATTACK, *, traffic: bool, weather: Weather | None = None) -> tuple[Trial, ...]:
         """The trials of "attack" or "random" in one weather, or in all."""
@@ -185,7 +202,12 @@ class Evaluation:
         _save_scenario(self.scenario, folder)
         picture = Image.fromarray(paint)
         write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
-        content: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop", "units": _UNITS}
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "kind": kind_of(self.paint),
+            "units": _UNITS,
+        }
         content |= {"scenario": self.scenario.name}
         content |= {name: getattr(self, name) for name in self.__slots__ if name not in ("scenario", "trials")}
         content |= {"trials": [asdict(trial) for trial in self.trials], "rows": [asdict(row) for row in self.rows()]}
@@ -220,17 +242,37 @@ class Evaluation:
             raise EpisodeError(f"{path} is incomplete or damaged ({error}); evaluate again") from None
 
 
+def kind_of(paint: PaintKind) -> str:
+    """What numbers over such paint are called in files."""
+    return "predicted" if paint.predicted else "closed loop"
+
+
 def path_of(episode: Episode) -> Path2D:
     """World x, y of the car at each observation."""
     return np.column_stack([episode.x_m, episode.y_m])
 
 
 def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> float:
-    """The paper's deviation between two drives, over the instants at which the clean one has the canvas in view."""
+    """The paper's deviation between two drives, over the instants at which the clean one has the canvas in view.
+
+    Predicted drives begin where the first frame was recorded, nearer to the canvas. The way up to there is the same for
+    both, straight and at one speed, so that predicted and driven deviations are means over equal stretches.
+    """
     bare, driven = path_of(clean), path_of(painted)
+    if clean.paint.predicted:
+        before = _approach(clean, HORIZON_M + canvas.length_m)
+        bare, driven = np.concatenate([before, bare]), np.concatenate([before, driven])
     seen = passage(bare, canvas)
     # A painted drive that ended before has its last position left.
     return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
+
+
+def _approach(episode: Episode, length_m: float) -> Path2D:
+    """Positions straight behind the first one, as far apart as the first speed says, in the order of driving."""
+    apart_m = max(float(episode.speed_mps[0]), 1.0) * episode.dt_s
+    back_m = apart_m * np.arange(math.ceil(length_m / apart_m), 0, -1)
+    yaw_rad = float(episode.yaw_rad[0])
+    return path_of(episode)[0] - back_m[:, None] * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
 
 
 def judge(
@@ -242,6 +284,7 @@ def judge(
     whole painted drive.
     """
     beside = lateral_m(path_of(clean), path_of(painted))
+    known = not painted.paint.predicted
     return Trial(
         pattern=pattern,
         weather=painted.weather,
@@ -251,10 +294,10 @@ def judge(
         painted=painted_file,
         deviation_m=passage_deviation_m(clean, painted, canvas),
         lateral_m=float(beside[np.abs(beside).argmax()]),
-        points=infraction_points(painted.events),
-        clean_points=infraction_points(clean.events),
-        leaderboard=leaderboard_factor(painted.events),
-        clean_leaderboard=leaderboard_factor(clean.events),
+        points=infraction_points(painted.events) if known else None,
+        clean_points=infraction_points(clean.events) if known else None,
+        leaderboard=leaderboard_factor(painted.events) if known else None,
+        clean_leaderboard=leaderboard_factor(clean.events) if known else None,
         first_event_s=first_event_s(painted.events),
         clean_first_event_s=first_event_s(clean.events),
         ending=str(painted.ending),
@@ -265,21 +308,28 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
     # Alone, one pattern has one drive a weather, and the weathers asked for are no sample of all there are.
     drawn = traffic or pattern != ATTACK
 
-    def mean(value: Callable[[Trial], float]) -> Mean:
-        found = mean_95([value(trial) for trial in trials])
+    def mean(values: Sequence[float]) -> Mean:
+        found = mean_95(values)
         return found if drawn else replace(found, low=None, high=None)
 
+    def known(value: Callable[[Trial], float | None]) -> Mean | None:
+        values = [value(trial) for trial in trials]
+        told = [each for each in values if each is not None]
+        return mean(told) if len(told) == len(values) else None
+
+    points = known(lambda trial: trial.points)
     first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
     return Row(
         pattern=pattern,
         weather=weather,
         traffic=traffic,
-        deviation_m=mean(lambda trial: trial.deviation_m),
-        lateral_m=mean(lambda trial: abs(trial.lateral_m)),
-        points=mean(lambda trial: trial.points),
-        clean_points=mean(lambda trial: trial.clean_points),
-        leaderboard=mean(lambda trial: trial.leaderboard),
-        failed=len(first) / len(trials),
+        count=len(trials),
+        deviation_m=mean([trial.deviation_m for trial in trials]),
+        lateral_m=mean([abs(trial.lateral_m) for trial in trials]),
+        points=points,
+        clean_points=known(lambda trial: trial.clean_points),
+        leaderboard=known(lambda trial: trial.leaderboard),
+        failed=None if points is None else len(first) / len(trials),
         first_event_s=mean_95(first) if first else None,
     )
 

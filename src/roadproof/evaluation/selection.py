@@ -51,13 +51,15 @@ class Selection:
         pattern: it.
         driven: every candidate driven, in the surrogate's order.
         chosen: index of it among them.
-        simulator_calls: drives, the clean one included where it was made for this.
+        simulator_calls: drives, the clean one included where it was made for this; 0 where they are predicted.
+        predicted: nothing was driven for real.
     """
 
     pattern: Pattern
     driven: tuple[Driven, ...]
     chosen: int
     simulator_calls: int
+    predicted: bool = False
 
     @property
     def deviation_m(self) -> float:
@@ -74,7 +76,7 @@ class Selection:
         content = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "kind": "closed loop",
+            "kind": "predicted" if self.predicted else "closed loop",
             "driven": [asdict(each) for each in self.driven],
             "chosen": self.chosen,
             "simulator_calls": self.simulator_calls,
@@ -102,7 +104,11 @@ class Selection:
         except (KeyError, TypeError, ValueError) as error:
             raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove {folder}") from None
         return Selection(
-            pattern=load_pattern(folder / "pattern.json"), driven=driven, chosen=chosen, simulator_calls=calls
+            pattern=load_pattern(folder / "pattern.json"),
+            driven=driven,
+            chosen=chosen,
+            simulator_calls=calls,
+            predicted=content.get("kind") == "predicted",
         )
 
 
@@ -168,7 +174,8 @@ def select_by_driving(
         pattern=chosen[winner][1].pattern,
         driven=tuple(driven),
         chosen=winner,
-        simulator_calls=calls + len(driven),
+        simulator_calls=0 if simulator.paint.predicted else calls + len(driven),
+        predicted=simulator.paint.predicted,
     )
     selection.save(folder)
     return selection

@@ -6,6 +6,7 @@ Charts are drawn in stand-in colours, each of which becomes a CSS variable of th
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 
 from roadproof.datatypes import Event
 from roadproof.evaluation.fidelity import Fidelity
+from roadproof.evaluation.prediction import Prediction
 from roadproof.evaluation.result import path_of
 from roadproof.geometry import CanvasPlacement
 from roadproof.metrics import HORIZON_M, lateral_m
@@ -47,6 +49,7 @@ SERIES = (PAINTED, PREDICTED, VARIABLES["third"], VARIABLES["fourth"])
 WIDTH_IN, HEIGHT_IN = 5.2, 3.0
 _STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 BEHIND_M = 20.0
+_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +101,10 @@ def steering(clean: Episode, painted: Episode, fidelity: Fidelity | None, canvas
     """Steering of the clean drive, what the surrogate predicts, and what the car did over the paint."""
     figure, axes = _axes("metres past the canvas’ near edge", "steering (right > 0)")
     _mark_canvas(axes, canvas)
-    at = metres_past(clean, canvas)
+    at, predicted = metres_past(clean, canvas), painted.paint.predicted
     for episode, colour, style, label in (
         (clean, CLEAN, _STYLES[0], "bare road"),
-        (painted, PAINTED, _STYLES[0], "driven over the paint"),
+        (painted, PAINTED, _STYLES[0], "over the paint, predicted" if predicted else "driven over the paint"),
     ):
         where = metres_past(episode, canvas)[:-1]
         axes.plot(where, episode.steer, color=colour, linewidth=1.8, linestyle=style, label=label)
@@ -132,13 +135,36 @@ def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacem
         axes.plot(where, beside, color=colour, linestyle=_STYLES[k % 4], linewidth=1.8, label=label)
     axes.set_xlim(-HORIZON_M - 2, None)
     _legend(axes, columns=2)
-    words = "Distance from the clean path along the drive, alone on the road"
+    predicted = any(painted.paint.predicted for _, _, painted in drives)
+    words = f"Distance from the clean path along the drive, alone on the road{', predicted' if predicted else ''}"
     return Chart(svg_of(figure, "offsets", words), words + ". The shaded stretch is the canvas.")
 
 
-def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str]) -> Chart:
+def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
+    """The chosen pattern's predicted path beside the one that was driven."""
+    figure, axes = _axes("metres past the canvas’ near edge", "metres right of the clean path")
+    _mark_canvas(axes, canvas)
+    axes.axhline(0.0, color=CLEAN, linewidth=1.4)
+    ahead = np.array([math.cos(canvas.yaw_rad), math.sin(canvas.yaw_rad)])
+    for path, label, colour, style in (
+        (prediction.predicted_xy, "predicted in the recorded world", PREDICTED, _STYLES[1]),
+        (prediction.driven_xy, "driven", PAINTED, _STYLES[0]),
+    ):
+        where = (path - (canvas.x_m, canvas.y_m)) @ ahead + canvas.length_m / 2
+        beside = -lateral_m(prediction.clean_xy, path)
+        axes.plot(where, beside, color=colour, linestyle=style, linewidth=1.8, label=label)
+    axes.set_xlim(-HORIZON_M - 2, None)
+    _legend(axes, columns=1)
+    words = (
+        f"Where the recorded world said the pattern takes the car, and where it went: deviation "
+        f"{prediction.predicted_m:.2f} m predicted, {prediction.driven_m:.2f} m driven"
+    )
+    return Chart(svg_of(figure, "foretold", words), words + ". The shaded stretch is the canvas.")
+
+
+def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], objective: str) -> Chart:
     """The search: every start thin, the best so far of each group bold."""
-    figure, axes = _axes("iteration", "predicted steering shift a frame")
+    figure, axes = _axes("iteration", f"{objective}, {_UNITS.get(objective, 'its own unit')}")
     steps = np.arange(1, len(history) + 1)
     for k, name in enumerate(groups):
         colour = SERIES[k % len(SERIES)]

@@ -22,7 +22,9 @@ def commands_of(run: Run) -> tuple[str, ...]:
         lines[-1] += ["--out", str(folder / "attack")]
     if run.judged is not None:
         paint = folder / "attack" / "pattern.json" if run.attack is not None else folder / "evaluation" / "paint.png"
-        lines.append(["roadproof", "evaluate", str(paint), *_evaluate(run.judged.evaluation)])
+        judged = run.judged.evaluation
+        options = _foresee(run, judged) if judged.predicted else _evaluate(judged)
+        lines.append(["roadproof", "evaluate", str(paint), *options])
         lines[-1] += ["--out", str(folder / "evaluation")]
     lines.append(["roadproof", "report", str(folder)])
     return tuple(map(shlex.join, lines))
@@ -39,11 +41,21 @@ def _evaluate(evaluation: Evaluation) -> list[str]:
     options = ["--scenario", evaluation.scenario.name, "--controller", evaluation.controller]
     options += ["--weathers", ",".join(evaluation.weathers), "--runs", str(evaluation.runs)]
     options += ["--cars", str(evaluation.cars), "--pedestrians", str(evaluation.pedestrians)]
-    random = {trial.pattern for trial in evaluation.trials if trial.pattern.startswith("random")}
     # Where a server stood is nobody's to keep; that it was one is.
     where = (
         ["--simulator", f"carla://HOST:PORT?paint={evaluation.paint}"]
         if evaluation.paint is not PaintKind.RENDERED
         else []
     )
-    return [*options, "--random", str(len(random)), "--seed", str(evaluation.seed), *where]
+    return [*options, *_random(evaluation), *where]
+
+
+def _foresee(run: Run, evaluation: Evaluation) -> list[str]:
+    """Scenario and weather are those of the recordings; where these lay is not kept, if not in the run."""
+    recordings = str(run.folder) if run.recordings is not None else "RECORDINGS"
+    return ["--controller", evaluation.controller, *_random(evaluation), "--simulator", f"recorded:{recordings}"]
+
+
+def _random(evaluation: Evaluation) -> list[str]:
+    random = {trial.pattern for trial in evaluation.trials if trial.pattern.startswith("random")}
+    return ["--random", str(len(random)), "--seed", str(evaluation.seed)]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from roadproof.evaluation import Selection
-from roadproof.report.words import in_words
+from roadproof.report.words import MISSING, in_words
 
 
 def driven_candidates(selections: Sequence[Selection]) -> dict[str, Any] | None:
@@ -21,6 +21,7 @@ def driven_candidates(selections: Sequence[Selection]) -> dict[str, Any] | None:
     return {
         "weather": in_words(selections[0].driven[0].trial.weather),
         "rounds": len(selections) > 1,
+        "predicted": best.predicted,
         "rows": [
             {
                 "found_by": f"round {number}" if number else "the search",
@@ -28,7 +29,7 @@ def driven_candidates(selections: Sequence[Selection]) -> dict[str, Any] | None:
                 "rank": one.rank,
                 "deviation": f"{one.trial.deviation_m:.2f}",
                 "lateral": f"{abs(one.trial.lateral_m):.2f}",
-                "points": f"{one.trial.points:.0f}",
+                "points": MISSING if one.trial.points is None else f"{one.trial.points:.0f}",
                 "chosen": selection is best and index == selection.chosen,
             }
             for number, selection in enumerate(selections)

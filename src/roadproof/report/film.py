@@ -171,7 +171,10 @@ class _Pages:
         bare: Sequence[bytes],
         driven: Sequence[bytes],
     ) -> None:
-        self._sides = ((clean, bare, "without paint", CLEAN), (painted, driven, "with paint", PAINTED))
+        titles = ["without paint", "with paint"]
+        if painted.paint.predicted:
+            titles = [f"{title}, predicted" for title in titles]
+        self._sides = ((clean, bare, titles[0], CLEAN), (painted, driven, titles[1], PAINTED))
         self._beside = beside
         self._fonts = [cast("ImageFont.FreeTypeFont", ImageFont.load_default(size)) for size in (26, 19)]
 

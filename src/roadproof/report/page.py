@@ -27,18 +27,21 @@ from roadproof.report.html import data_url, encoded, environment
 from roadproof.report.run import Judged, Run, read_run
 from roadproof.report.top_view import top_view
 from roadproof.report.verdict import verdict
-from roadproof.report.words import MISSING, in_words, mean_in_words
+from roadproof.report.words import MISSING, UNKNOWN, in_words, mean_in_words
 from roadproof.simulators.protocol import PaintKind
 
 FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
 SHOWN_COMPOSITES = 3
+FORETOLD = ("predicted_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad")
 
 PAINTED = {
     PaintKind.RENDERED: "It is part of the simulator’s world, rendered with the road.",
     PaintKind.NATIVE: "It is part of the CARLA server’s world: the texture of a piece of its road (paint: native).",
     PaintKind.INJECT: "It is put into the pictures of the car’s camera, where they show free road; the CARLA server’s "
     "world is bare (paint: inject).",
+    PaintKind.COMPOSITED: "It is composited into pictures made from recorded frames; nobody has driven over it "
+    "(paint: composited).",
 }
 
 Fields = dict[str, Any]
@@ -79,6 +82,7 @@ def render(run: Run) -> str:
             pattern=_pattern(run),
             attack=_attack(run),
             driven=driven_candidates(run.selections),
+            foretold=_foretold(run),
             fidelity=_fidelity(run.judged),
             recorded=_recorded(run),
             calibration=_calibration(run),
@@ -90,20 +94,23 @@ def render(run: Run) -> str:
 
 
 def result_of(run: Run) -> Fields:
-    """The report's numbers; those of driving and those of the surrogate apart."""
+    """The report's numbers; those of driving, those predicted in recordings and those of the surrogate apart."""
     found = verdict(run)
     content: Fields = {"format": FORMAT, "version": FORMAT_VERSION, "verdict": asdict(found), "name": _name(run)}
     if run.judged is not None:
         evaluation = run.judged.evaluation
-        content["closed_loop"] = {
+        content["foreseen" if evaluation.predicted else "closed_loop"] = {
             "controller": evaluation.controller,
             "paint": evaluation.paint,
             "trials": [asdict(trial) for trial in evaluation.trials],
             "rows": [asdict(row) for row in evaluation.rows()],
         }
+    if run.prediction is not None:
+        content["predicted"] = {name: getattr(run.prediction, name) for name in FORETOLD}
     surrogate: Fields = {}
     if run.attack is not None:
-        surrogate |= {"shift": run.attack.surrogate_shift, "by_group": run.attack.by_group}
+        surrogate |= {"shift": run.attack.surrogate_shift}
+        content["search"] = {"objective": run.attack.objective, "by_group": run.attack.by_group}
     if run.judged is not None and run.judged.fidelity is not None:
         surrogate |= {"agreement": asdict(run.judged.fidelity.agreement)}
     calibration = None if run.calibration is None else asdict(run.calibration)
@@ -119,33 +126,36 @@ def _name(run: Run) -> str:
 
 
 def _key_figures(run: Run) -> list[Fields]:
-    """The numbers beside the verdict; of driving alone."""
+    """The numbers beside the verdict; of driving alone, or predicted and called so."""
     if run.judged is None:
         return []
     evaluation = run.judged.evaluation
+    predicted = ", predicted" if evaluation.predicted else ""
     trials = [*evaluation.of(traffic=False), *evaluation.of(traffic=True)]
     alone, traffic = (evaluation.of(traffic=each) for each in (False, True))
     furthest = max(trials, key=lambda trial: abs(trial.lateral_m))
-    failed, before = (
-        sum(points > 0 for points in each) for each in ([t.points for t in trials], [t.clean_points for t in trials])
-    )
-    penalty = traffic or alone
-    return [
+    paths: list[Fields] = [
         {
             "value": f"{abs(furthest.lateral_m):.2f} m",
-            "label": "furthest from the clean path",
+            "label": f"furthest from the clean path{predicted}",
             "note": f"to the {'left' if furthest.lateral_m > 0 else 'right'}, {in_words(furthest.weather)}",
         },
         {
             "value": f"{np.mean([t.deviation_m for t in alone]):.2f} m",
-            "label": "mean deviation",
+            "label": f"mean deviation{predicted}",
             "note": f"the paper’s measure, {len(alone)} weather{'s' if len(alone) != 1 else ''}, alone on the road",
         },
+    ]
+    if evaluation.predicted:
+        return [*paths, {"value": UNKNOWN, "label": "infractions", "note": "recordings have no map"}]
+    failed, before = (sum(map(bool, each)) for each in ([t.points for t in trials], [t.clean_points for t in trials]))
+    points, clean_points = zip(*((t.points or 0.0, t.clean_points or 0.0) for t in traffic or alone), strict=True)
+    return [
+        *paths,
         {
-            "value": f"{np.mean([t.points for t in penalty]):.1f}",
+            "value": f"{np.mean(points):.1f}",
             "label": "penalty points a drive",
-            "note": f"{np.mean([t.clean_points for t in penalty]):.1f} on the bare road"
-            f"{', in traffic' if traffic else ''}",
+            "note": f"{np.mean(clean_points):.1f} on the bare road{', in traffic' if traffic else ''}",
         },
         {
             "value": f"{failed} of {len(trials)}",
@@ -162,6 +172,7 @@ def _judged(judged: Judged | None) -> Fields | None:
     strip = judged.strip
     return {
         "controller": evaluation.controller,
+        "predicted": evaluation.predicted,
         "weather": in_words(shown.weather),
         "traffic": f"{evaluation.cars} cars and {evaluation.pedestrians} people",
         "film": data_url("video/mp4", judged.film),
@@ -189,13 +200,13 @@ def _judged(judged: Judged | None) -> Fields | None:
                 "weather": "all weathers" if row.weather is None else in_words(row.weather),
                 "all": row.weather is None,
                 "traffic": "in traffic" if row.traffic else "alone",
-                "count": row.points.count,
+                "count": row.count,
                 "deviation": mean_in_words(row.deviation_m, 2),
                 "lateral": mean_in_words(row.lateral_m, 2),
                 "points": mean_in_words(row.points, 1),
                 "clean_points": mean_in_words(row.clean_points, 1),
                 "leaderboard": mean_in_words(row.leaderboard, 2),
-                "failed": f"{row.failed:.0%}",
+                "failed": MISSING if row.failed is None else f"{row.failed:.0%}",
                 "first": mean_in_words(row.first_event_s, 1),
             }
             for row in evaluation.rows()
@@ -253,13 +264,31 @@ def _attack(run: Run) -> Fields | None:
         return None
     starts = f"{attack.restarts} start{'s' if attack.restarts != 1 else ''}"
     return {
-        "chart": charts.search(attack.history, tuple(attack.by_group)),
+        "chart": charts.search(attack.history, tuple(attack.by_group), attack.objective),
+        "objective": attack.objective,
+        "predicted": "" if attack.predicted_m is None else f"{attack.predicted_m:.2f} m",
         "shift": f"{attack.surrogate_shift:+.3f}",
         "group": attack.group,
         "groups": [(name, f"{value:+.3f}") for name, value in attack.by_group.items()],
         "how": f"{starts} a group, {len(attack.history)} iterations, {attack.space.figures} figures of the "
         f"{attack.space.family} family, seed {attack.seed}; {attack.stopped}",
         "checks": [asdict(check) for check in attack.checks],
+    }
+
+
+def _foretold(run: Run) -> Fields | None:
+    """The recorded world's word against the drive."""
+    prediction = run.prediction
+    if prediction is None:
+        return None
+    canvas = run.recordings and run.recordings.canvas
+    return {
+        "chart": None if canvas is None else charts.foretold(prediction, canvas),
+        "predicted": f"{prediction.predicted_m:.2f}",
+        "driven": f"{prediction.driven_m:.2f}",
+        "error": f"{prediction.error_m:+.2f}",
+        "path_error": f"{prediction.path_error_m:.2f}",
+        "gap": f"{prediction.gap_m:.2f} m, {np.degrees(prediction.gap_rad):.0f}°",
     }
 
 

@@ -6,6 +6,7 @@ RUN/attack/                    what the attack found (`roadproof.attacks`)
 RUN/selection/                 optional: its candidates, driven (`roadproof.evaluation`)
 RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.rounds`)
 RUN/evaluation/                what driving over it showed (`roadproof.evaluation`)
+RUN/prediction.npz             optional: the path foretold beside the driven one (`roadproof.evaluation`)
 RUN/pattern.json               optional: the pattern that was chosen in the end
 RUN/run.json                   optional: what the stages took (`roadproof.ledger`)
 RUN/commands.txt               optional: the commands that made it, one a line
@@ -25,7 +26,7 @@ from roadproof.calibration.report import CalibrationReport, load_report
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.evaluation import Evaluation, Fidelity, Selection, Trial
+from roadproof.evaluation import Evaluation, Fidelity, Prediction, Selection, Trial
 from roadproof.evaluation.result import load_paint
 from roadproof.ledger import StageCost, read_cost
 from roadproof.patterns import Pattern, load_pattern
@@ -76,6 +77,7 @@ class Run:
         attack: the attack's result.
         selections: candidates that were driven, of the search and of each round, in that order.
         judged: the evaluation.
+        prediction: where the recorded world said the chosen pattern takes the car, beside where it went.
         pattern: that was chosen in the end; the attack's own where the run says nothing else.
         cost: of each stage since the run began; empty where the run keeps no ledger.
         commands: that made it, where they were kept.
@@ -88,6 +90,7 @@ class Run:
     attack: AttackResult | None
     selections: tuple[Selection, ...]
     judged: Judged | None
+    prediction: Prediction | None
     pattern: Pattern | None
     cost: dict[str, StageCost]
     commands: tuple[str, ...]
@@ -111,6 +114,7 @@ def read_run(folder: Path) -> Run:
         attack=attack,
         selections=_selections(folder),
         judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,
+        prediction=Prediction.load(path) if (path := folder / "prediction.npz").exists() else None,
         pattern=chosen,
         cost=read_cost(folder),
         commands=_commands(folder / "commands.txt"),

@@ -69,8 +69,9 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(left, right), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
-    axes.add_patch(Rectangle((left, low), right - left, high - low, color=VARIABLES["grass"]))
     road = _road(scenario)
+    around_it = VARIABLES["asphalt" if road is None else "grass"]
+    axes.add_patch(Rectangle((left, low), right - left, high - low, color=around_it))
     if road is not None:
         draw_road(axes, road, around, (left, low, right, high), GROUND)
     _draw_canvas(axes, scenario.canvas, paint)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from roadproof.datatypes import Ending
 from roadproof.evaluation import Evaluation
 from roadproof.metrics import mean_95
 from roadproof.report.run import Run
@@ -20,7 +21,7 @@ class Verdict:
     """What came out.
 
     Args:
-        key: "fails", "swayed", "holds", "unfit", "predicted" or "recorded".
+        key: "fails", "swayed", "holds", "unfit", "foreseen", "predicted" or "recorded".
         title: the same in two or three words.
         sentence: the whole finding.
     """
@@ -33,9 +34,17 @@ class Verdict:
 def verdict(run: Run) -> Verdict:
     """What a run shows; without driving it shows a prediction at most."""
     if run.judged is not None:
-        return _driven(run.judged.evaluation)
+        evaluation = run.judged.evaluation
+        return _foreseen(evaluation) if evaluation.predicted else _driven(evaluation)
     if run.attack is not None:
         attack = run.attack
+        if attack.predicted_m is not None:
+            return Verdict(
+                "predicted",
+                "Predicted, not driven",
+                f"Driven in the recorded frames, the pattern makes the car deviate by {attack.predicted_m:.2f} m "
+                f"({attack.group}); nobody has driven over it for real yet.",
+            )
         return Verdict(
             "predicted",
             "Predicted, not driven",
@@ -46,15 +55,30 @@ def verdict(run: Run) -> Verdict:
     return Verdict("recorded", "Not attacked yet", f"{drives} drives are recorded; no pattern was searched yet.")
 
 
+def _foreseen(evaluation: Evaluation) -> Verdict:
+    trials = evaluation.of(traffic=False)
+    furthest = max(abs(trial.lateral_m) for trial in trials)
+    deviation = float(np.mean([trial.deviation_m for trial in trials]))
+    left = [trial.ending for trial in trials if trial.ending == Ending.LEFT_RECORDED]
+    more = " or more: it leaves what was recorded" if left else ""
+    return Verdict(
+        "foreseen",
+        "Predicted, not driven",
+        f"Nothing was driven for real: in pictures made from recorded frames of {evaluation.scenario.name} the pattern "
+        f"is predicted to move {evaluation.controller} by up to {furthest:.2f} m{more} (deviation {deviation:.2f} m). "
+        "Infractions are not known, since recordings have no map.",
+    )
+
+
 def _driven(evaluation: Evaluation) -> Verdict:
     trials = [*evaluation.of(traffic=False), *evaluation.of(traffic=True)]
     alone = evaluation.of(traffic=False)
-    worse = sum(trial.points > trial.clean_points for trial in trials)
+    worse = sum((trial.points or 0.0) > (trial.clean_points or 0.0) for trial in trials)
     furthest = max(abs(trial.lateral_m) for trial in trials)
     who, where, n = evaluation.controller, evaluation.scenario.name, len(trials)
-    points = mean_in_words(mean_95([trial.points for trial in trials]), 1)
-    before = mean_in_words(mean_95([trial.clean_points for trial in trials]), 1)
-    if all(trial.clean_points > 0 for trial in alone):
+    points = mean_in_words(mean_95([trial.points or 0.0 for trial in trials]), 1)
+    before = mean_in_words(mean_95([trial.clean_points or 0.0 for trial in trials]), 1)
+    if all(trial.clean_points for trial in alone):
         return Verdict(
             "unfit",
             "Fails without paint",

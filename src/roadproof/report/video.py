@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -20,12 +20,12 @@ from roadproof.errors import OutputError
 from roadproof.geometry import CanvasPlacement
 from roadproof.simulators.protocol import PatternImage
 from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
 
 SIZE = (1280, 720)
 VIEW = (0, 0, 800, 600)
 ABOVE_PX = 480
 PIXELS_PER_M = 6.0
+UNKNOWN_M = 60.0
 EVENT_SHOWN_S = 3.0
 
 INK, PAPER, FAINT = (32, 34, 38), (246, 246, 243), (208, 208, 203)
@@ -44,8 +44,8 @@ class DriveVideo:
 
     Args:
         path: of the film; ends in .mp4.
-        roads: the map driven on.
-        route: the way from start to goal.
+        roads: the map driven on; None where it is not known.
+        way: world x, y of the way from start to goal.
         canvas: where the canvas lies.
         pattern: what is painted on it.
         dt_s: seconds between observations.
@@ -58,8 +58,8 @@ class DriveVideo:
         self,
         path: Path,
         *,
-        roads: RoadMap,
-        route: Route,
+        roads: RoadMap | None,
+        way: Plan,
         canvas: CanvasPlacement,
         pattern: PatternImage | None = None,
         dt_s: float = 0.05,
@@ -69,7 +69,7 @@ class DriveVideo:
         self._path = path
         self._partial = path.with_name(f".{os.getpid()}.{path.name}")
         self._rate = Fraction(1 / dt_s).limit_denominator(1000)
-        self._plan, self._low = _plan(roads, route, canvas, pattern)
+        self._plan, self._low = _plan(roads, way, canvas, pattern)
         self._driven: list[tuple[float, float]] = []
         self._events: list[Event] = []
         self._font = ImageFont.load_default(18)
@@ -103,7 +103,7 @@ class DriveVideo:
         else:
             self._partial.unlink(missing_ok=True)
 
-    def add(self, seen: Observation, control: Control, *, cars: Plan = NOBODY, people: Plan = NOBODY) -> None:
+    def add(self, seen: Observation, control: Control, cars: Plan = NOBODY, people: Plan = NOBODY) -> None:
         """Append one observation and the control given after it.
 
         Args:
@@ -199,18 +199,33 @@ def _bar(
 
 
 def _plan(
-    roads: RoadMap, route: Route, canvas: CanvasPlacement, pattern: PatternImage | None
+    roads: RoadMap | None, way: Plan, canvas: CanvasPlacement, pattern: PatternImage | None
 ) -> tuple[Image.Image, tuple[float, float]]:
-    """The map from above with route and canvas, and the world x, y of its lower left corner."""
-    x0, y0, x1, y1 = roads.bounds_m
-    low = (x0 - 10.0, y0 - 10.0)
-    size = (round((x1 - x0 + 20.0) * PIXELS_PER_M), round((y1 - y0 + 20.0) * PIXELS_PER_M))
-    plan = Image.new("RGB", size, LAWN)
+    """The map from above with way and canvas, and the world x, y of its lower left corner."""
+    x0, y0, x1, y1 = (*way.min(0), *way.max(0)) if roads is None else roads.bounds_m
+    margin = UNKNOWN_M if roads is None else 10.0
+    low = (float(x0) - margin, float(y0) - margin)
+    size = (round((x1 - x0 + 2 * margin) * PIXELS_PER_M), round((y1 - y0 + 2 * margin) * PIXELS_PER_M))
+    plan = Image.new("RGB", size, GROUND["driving"] if roads is None else LAWN)
     pen = ImageDraw.Draw(plan)
 
     def at(points: np.ndarray) -> list[tuple[float, float]]:
         return [((x - low[0]) * PIXELS_PER_M, size[1] - (y - low[1]) * PIXELS_PER_M) for x, y in points[:, :2].tolist()]
 
+    if roads is not None:
+        _draw_roads(pen, roads, at)
+    pen.line(at(way), fill=WAY, width=2)
+    corners = np.array([(-0.5, -0.5, 1), (399.5, -0.5, 1), (399.5, 399.5, 1), (-0.5, 399.5, 1)])
+    if pattern is not None:
+        _paint(plan, canvas, pattern, low)
+    outline = at((corners @ canvas.world_from_canvas.T)[:, :2])
+    pen.line([*outline, outline[0]], fill=INK, width=1)
+    return plan, low
+
+
+def _draw_roads(
+    pen: ImageDraw.ImageDraw, roads: RoadMap, at: Callable[[np.ndarray], list[tuple[float, float]]]
+) -> None:
     for kind in ("sidewalk", "shoulder", "driving"):
         for lane in roads.lanes:
             if lane.kind == kind:
@@ -220,13 +235,6 @@ def _plan(
     for line in roads.mark_lines:
         if line.junction is None:
             pen.line(at(line.points), fill=(242, 200, 80) if line.mark.colour == "yellow" else (240, 240, 238), width=1)
-    pen.line(at(route.points), fill=WAY, width=2)
-    corners = np.array([(-0.5, -0.5, 1), (399.5, -0.5, 1), (399.5, 399.5, 1), (-0.5, 399.5, 1)])
-    if pattern is not None:
-        _paint(plan, canvas, pattern, low)
-    outline = at((corners @ canvas.world_from_canvas.T)[:, :2])
-    pen.line([*outline, outline[0]], fill=INK, width=1)
-    return plan, low
 
 
 def _paint(plan: Image.Image, canvas: CanvasPlacement, pattern: PatternImage, low: tuple[float, float]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from roadproof.metrics import Mean
 
 MISSING = "–"
+UNKNOWN = "not known"
 
 
 def in_words(name: str) -> str:

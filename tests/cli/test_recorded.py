@@ -1,0 +1,92 @@
+"""The commands that drive in recordings, as their users call them."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from recorded_drives import drivable_set
+from roadproof.coverage import Shape
+from roadproof.datatypes import Weather
+from roadproof.evaluation import Evaluation
+from roadproof.patterns import Pattern, save_pattern
+from roadproof.recordings import save_recordings
+from roadproof.rollout import Episode
+
+TESTS = Path(__file__).parents[1]
+BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    recordings = drivable_set()
+    folder = tmp_path_factory.mktemp("workplace")
+    save_recordings(recordings, folder / "run" / "recordings")
+    save_recordings(dataclasses.replace(recordings, canvas=None), folder / "nowhere-known")
+    save_pattern(BAR, folder / "pattern.json")
+    return folder
+
+
+def call(workplace, *words):
+    """In a process of its own where nothing checks types, as the installed command has it."""
+    return subprocess.run(
+        [sys.executable, "-c", "from roadproof.cli import main; main()", *words],
+        cwd=workplace,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)])},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.mark.parametrize("folder", ["run", "run/recordings"])
+def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path, folder):
+    options = ["--simulator", f"recorded:{folder}", "--controller", "paint_shy:paint_shy", "--no-film"]
+    done = call(workplace, "evaluate", "pattern.json", *options, "--out", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    for words in ("nothing was driven for real", "predicted", "not known", "2 predicted drives", "paint composited"):
+        assert words in done.stdout
+    evaluation = Evaluation.load(tmp_path)
+    assert (evaluation.scenario.name, evaluation.weathers, evaluation.runs) == ("test-road", (Weather.CLEAR_NOON,), 0)
+
+
+def test_the_command_drives_in_recordings_and_films_it(workplace, tmp_path):
+    av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
+    options = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--pattern", "pattern.json"]
+    done = call(workplace, "drive", *options, "--out", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "predicted: nothing was driven for real, and infractions are not known" in done.stdout
+    with av.open(str(tmp_path / "drive.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == len(Episode.load(tmp_path / "episode.npz"))
+
+
+EVALUATE = ["evaluate", "pattern.json", "--controller", "pilotnet", "--simulator", "recorded:run"]
+MISTAKES = {
+    "runs": ([*EVALUATE, "--runs", "2"], "--runs is 2, but recordings hold no others"),
+    "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),
+    "another scenario": ([*EVALUATE, "--scenario", "left-03"], "the scenario's canvas has y_m"),
+    "no folder": ([*EVALUATE[:-1], "recorded:"], "expected the folder of recordings"),
+    "missing set": ([*EVALUATE[:-1], "recorded:nobody"], "no folder nobody"),
+    "no canvas": ([*EVALUATE[:-1], "recorded:nowhere-known"], "canvas"),
+    "expert": (["drive", "--simulator", "recorded:run"], "the expert needs a map"),
+    "traffic": (
+        ["drive", "--simulator", "recorded:run", "--controller", "pilotnet", "--cars", "3"],
+        "recordings hold no others",
+    ),
+    "recording": (["record", "left-03", "--simulator", "recorded:run"], "evaluate, select and drive alone"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_clear_line(workplace, tmp_path, invoke, monkeypatch, name):
+    words, message = MISTAKES[name]
+    monkeypatch.chdir(workplace)
+    code, said = invoke(*words, "--out", tmp_path / "out")
+    assert code == 2
+    assert message in said.err
+    assert said.err.count("\n") == 1
