@@ -11,6 +11,8 @@ For every controller, scenario and seed, closed loop, alone on the road, in the 
   + driven       of its candidates the one that deviates most when driven at noon
   + rounds       searched on along the way the attacked car took, the best driven of all (`roadproof.rounds`)
   + weathers     as "+ driven", searched in expectation over a dry and a rainy noon instead, half the frames of each
+  T=5 steering   five drives pushed aside by metres, 40 frames each, the surrogate's strongest
+  T=5 deviation  the same five drives, searched in the recorded world: the first choice by its predicted deviation
 All searches have the same schedule and two-paint calibration, so that rows differ in what they are named after.
 
 Numbers are means over weathers, then over scenarios and seeds, with 95 % intervals over the latter. Simulator calls
@@ -34,7 +36,7 @@ import numpy as np
 import torch
 
 import roadproof
-from roadproof.attacks import Heat, Schedule
+from roadproof.attacks import Heat, Schedule, SteeringShift
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
@@ -51,14 +53,28 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
 
 SCENARIOS = ("left-03", "right-05", "straight-04", "left-07", "right-02", "straight-09")
-METHODS = ("no paint", "random", "T=1", "T=3 published", "T=3 metres", "+ driven", "+ rounds", "+ weathers")
-OTHERS = ("T=1", "T=3 published", "+ weathers")
+METHODS = (
+    "no paint",
+    "random",
+    "T=1",
+    "T=3 published",
+    "T=3 metres",
+    "+ driven",
+    "+ rounds",
+    "+ weathers",
+    "T=5 steering",
+    "T=5 deviation",
+)
+OTHERS = ("T=1", "T=3 published", "+ weathers", "T=5 steering", "T=5 deviation")
 FOUND_BY = ("record", "calibrate", "attack")
 SCHEDULE = replace(
     Schedule.in_heats(24),
     heats=(Heat(starts=16, iterations=20, every=4), Heat(starts=6, iterations=20, every=2)),
 )
-BASE = Budget(frames=14, schedule=SCHEDULE, select=4, runs=0)
+BASE = Budget(
+    objective=SteeringShift(), deviations_m=(1.5,), frames=14, schedule=SCHEDULE, restarts=4, select=4, runs=0
+)
+FIVE = Budget(select=0, runs=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,6 +198,8 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
         "+ weathers": replace(
             BASE, frames=BASE.frames // 2, attack_weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON)
         ),
+        "T=5 steering": replace(FIVE, objective=SteeringShift(), schedule=Schedule.in_heats(30)),
+        "T=5 deviation": FIVE,
     }  # fmt: skip
     for method, budget in others.items():
         if method not in cell.others:
@@ -193,8 +211,8 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
             # A published push may leave the road before the canvas, however small it is made.
             rows.append(rows[0] | {"method": method, "error": str(error)})
             continue
-        pushed = _pushed(cell, name)
-        rows.append(row(cell, method, result.evaluation, **cost(result, *FOUND_BY, "select"), pushed_m=pushed))
+        told = {"pushed_m": _pushed(cell, name), "predicted_m": result.attack.predicted_m}
+        rows.append(row(cell, method, result.evaluation, **cost(result, *FOUND_BY, "select"), **told))
     return sorted(rows, key=lambda each: METHODS.index(each["method"]))
 
 

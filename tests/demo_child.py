@@ -5,13 +5,14 @@ import os
 import sys
 
 from paint_shy import along_a_street
-from roadproof.attacks import Heat, Schedule
+from roadproof.attacks import Heat, Schedule, SteeringShift
 from roadproof.cli import main
 from roadproof.datatypes import Weather
 from roadproof.loop import BUDGETS, Budget
 from roadproof.scenarios import save_scenarios
 
 TINY = Budget(
+    objective=SteeringShift(),
     deviations_m=(0.5,),
     frames=4,
     schedule=Schedule(iterations=12, drops=(), heats=(Heat(starts=3, iterations=12, every=2),)),

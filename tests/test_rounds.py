@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from paint_shy import PaintShy, along_a_street
-from roadproof.attacks import Heat, Schedule
+from roadproof.attacks import Heat, Schedule, SteeringShift
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives.drives import read_drive
@@ -21,6 +21,7 @@ from roadproof.search_space import SearchSpace
 pytestmark = pytest.mark.slow
 NOON, RAIN = Weather.CLEAR_NOON, Weather.RAINY_NOON
 BUDGET = Budget(
+    objective=SteeringShift(),
     deviations_m=(0.8,),
     frames=6,
     schedule=Schedule(iterations=6, drops=(), heats=(Heat(starts=16, iterations=3, every=3),)),

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult as AttackResult
+    from roadproof.attacks import PathDeviation as PathDeviation
     from roadproof.attacks import Schedule as Schedule
+    from roadproof.attacks import SteeringShift as SteeringShift
     from roadproof.attacks import attack as attack
     from roadproof.attacks import show_pattern as show_pattern
     from roadproof.compositing import CanvasView as CanvasView
@@ -45,6 +47,9 @@ if TYPE_CHECKING:
     from roadproof.photometry import AffineResponse as AffineResponse
     from roadproof.photometry import ColourTransform as ColourTransform
     from roadproof.photometry import fit_colour as fit_colour
+    from roadproof.poses import placed as placed
+    from roadproof.recorded import RecordedSimulator as RecordedSimulator
+    from roadproof.recorded import Vehicle as Vehicle
     from roadproof.recordings import Push as Push
     from roadproof.recordings import Recording as Recording
     from roadproof.recordings import RecordingSet as RecordingSet
@@ -60,7 +65,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ROOMS = {
-    "attacks": ("AttackResult", "Schedule", "attack", "show_pattern"),
+    "attacks": ("AttackResult", "PathDeviation", "Schedule", "SteeringShift", "attack", "show_pattern"),
     "compositing": ("CanvasView", "composite", "view_canvas"),
     "controllers": ("Controller", "CruiseControl", "check_controller", "load_controller"),
     "coverage": ("Shape",),
@@ -72,6 +77,8 @@ _ROOMS = {
     "objectives": ("Group", "parse_groups"),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
     "photometry": ("AffineResponse", "ColourTransform", "fit_colour"),
+    "poses": ("placed",),
+    "recorded": ("RecordedSimulator", "Vehicle"),
     "recordings": ("Push", "Recording", "RecordingSet", "load_recordings", "save_recordings"),
     "report.page": ("write_report",),
     "scenarios": ("Scenario", "builtin_scenarios", "find_scenario"),

@@ -1,10 +1,11 @@
-"""The whole loop for one scenario: record, calibrate, attack, choose by driving, evaluate.
+"""The whole loop for one scenario: record, calibrate, attack, verify by driving, evaluate.
 
     RUN/record/        drives past the bare canvas (`drives.record`)
     RUN/calibration/   replays over painted targets, and how good they are (`calibration.calibrate`)
     RUN/recordings/    the drives, calibrated (`recordings`)
     RUN/attack/        what the search found (`attacks.attack`)
     RUN/selection/     which of it was strongest when driven (`evaluation.select_by_driving`)
+    RUN/prediction.npz the chosen pattern's predicted path beside the driven one (`evaluation.Prediction`)
     RUN/round-1/       searching on where the attacked car went (`rounds`), where rounds are asked for
     RUN/pattern.json   the pattern that was chosen in the end
     RUN/evaluation/    how bad that is, by weather, alone and in traffic (`evaluation.evaluate`)
@@ -22,13 +23,31 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, Schedule, attack, kept_attack
+from roadproof.attacks import (
+    AttackResult,
+    Objective,
+    PathDeviation,
+    Schedule,
+    SteeringShift,
+    attack,
+    kept_attack,
+)
 from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, Scheme, SteeringNoise, Swerve, Trajectories, Window, record
 from roadproof.errors import RoadproofError
-from roadproof.evaluation import PAPER_WEATHERS, Evaluation, Opening, Selection, evaluate, select_by_driving
+from roadproof.evaluation import (
+    PAPER_WEATHERS,
+    Evaluation,
+    Opening,
+    Prediction,
+    Selection,
+    evaluate,
+    predict,
+    select_by_driving,
+)
+from roadproof.evaluation.episodes import load_episodes
 from roadproof.files import check_writable
 from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
@@ -50,6 +69,8 @@ class Budget:
     """How much is spent on one scenario.
 
     Args:
+        objective: what the search makes large: a path deviation in the recorded world, or a steering shift as
+            published.
         deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each; T = 1 without.
         scheme: whether those pairs are pushed right and left, or each drive to both sides at random.
         pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
@@ -58,7 +79,7 @@ class Budget:
         calibration: how the drives are calibrated.
         schedule: steps of the search.
         restarts: starts of it, for each side; of those that came through the heats, where there are some.
-        select: candidates driven once each, of which the strongest is kept; 0 believes the surrogate.
+        select: candidates driven once each, of which the strongest is kept; 1 verifies the first choice, 0 believes it.
         weathers: of the evaluation.
         runs: drives with traffic in each weather.
         rounds: of searching on along the way that the attacked car took (`rounds`).
@@ -70,14 +91,15 @@ class Budget:
             that hold in one alone.
     """
 
-    deviations_m: tuple[float, ...] = (1.5,)
+    objective: Objective = field(default_factory=PathDeviation)
+    deviations_m: tuple[float, ...] = (1.5, 0.5)
     scheme: Scheme = Scheme.GROUP
     pooled: bool = False
-    frames: int = 24
+    frames: int = 40
     calibration: Method = Method.TWO_PAINT
-    schedule: Schedule = field(default_factory=Schedule)
-    restarts: int = 4
-    select: int = 6
+    schedule: Schedule = field(default_factory=Schedule.closed_loop)
+    restarts: int = 3
+    select: int = 1
     weathers: tuple[Weather, ...] = PAPER_WEATHERS
     runs: int = 10
     rounds: int = 0
@@ -96,6 +118,16 @@ class Budget:
                 f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "
                 f"choose {Method.TWO_PAINT}"
             )
+        if self.is_predicted and (len(self.recorded_in) > 1 or self.pooled or self.scheme is Scheme.RANDOM):
+            raise RoadproofError(
+                "a path deviation is searched in one weather for each side apart; attack several weathers, or drives "
+                "pooled or pushed at random, by their steering shift: objective=SteeringShift()"
+            )
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether the search drives in the recorded world."""
+        return isinstance(self.objective, PathDeviation)
 
     @property
     def recorded_in(self) -> tuple[Weather, ...]:
@@ -115,10 +147,18 @@ class Budget:
         return Swerve(self.deviations_m) if self.deviations_m else Swerve()
 
 
-QUICK = Budget(frames=14, schedule=Schedule.in_heats(30), runs=0)
-"""Minutes on a laptop: fewer frames and steps, driven alone."""
+QUICK = Budget(schedule=Schedule.closed_loop(24), runs=0)
+"""Minutes on a laptop: fewer steps, driven alone."""
 
-PAPER = Budget(calibration=Method.PUBLISHED)
+PAPER = Budget(
+    objective=SteeringShift(),
+    deviations_m=(1.5,),
+    frames=24,
+    calibration=Method.PUBLISHED,
+    schedule=Schedule(),
+    restarts=4,
+    select=6,
+)
 """As much as the paper spends: 61 calls to calibrate, 4 × 250 iterations, ten runs in traffic a weather."""
 
 BUDGETS = {"quick": QUICK, "paper": PAPER}
@@ -132,6 +172,8 @@ class StressTest:
         attack: the search; its numbers are the surrogate's.
         selection: the drives over its candidates; None where the surrogate was believed.
         rounds: what came of searching on; None where that was not asked for.
+        prediction: where the recorded world says the chosen pattern takes the car, beside where it went; None where
+            the search did not drive there, or nothing was driven to compare.
         evaluation: the drives over the chosen pattern; closed loop.
         cost: of each stage, since the run began.
     """
@@ -139,6 +181,7 @@ class StressTest:
     attack: AttackResult
     selection: Selection | None
     rounds: Rounds | None
+    prediction: Prediction | None
     evaluation: Evaluation
     cost: dict[str, StageCost]
 
@@ -223,7 +266,7 @@ def stress_test(
     selection, rounds = None, None
     if budget.select:
         with ledger.stage("select"):
-            selection = _select(run, found)
+            selection = _select(run, found, drives[0])
             ledger.calls("select", selection.simulator_calls)
     if selection is not None and budget.rounds:
         with ledger.stage("rounds"):
@@ -231,10 +274,18 @@ def stress_test(
             ledger.calls("rounds", rounds.simulator_calls)
     pattern = _chosen(found, selection, rounds)
     save_pattern(pattern, folder / "pattern.json")
+    prediction = _predict(run, recordings, pattern, selection, rounds)
     with ledger.stage("evaluate"):
         evaluation = _evaluate(run, pattern, another if another and processes > 1 else simulator, processes)
         ledger.calls("evaluate", evaluation.simulator_calls)
-    return StressTest(attack=found, selection=selection, rounds=rounds, evaluation=evaluation, cost=ledger.cost)
+    return StressTest(
+        attack=found,
+        selection=selection,
+        rounds=rounds,
+        prediction=prediction,
+        evaluation=evaluation,
+        cost=ledger.cost,
+    )
 
 
 def _chosen(found: AttackResult, selection: Selection | None, rounds: Rounds | None) -> Pattern:
@@ -306,13 +357,14 @@ def _attack(run: _Run, recordings: RecordingSet, groups: tuple[Group, ...]) -> A
             recordings,
             run.controller,
             run.space,
+            objective=run.budget.objective,
             groups=groups,
             schedule=run.budget.schedule,
             restarts=run.budget.restarts,
             seed=run.seed,
             device=run.device,
             checkpoint=checkpoint,
-            on_step=lambda step, best: run.on_progress("Searching", step, steps, f"shift {best:.3f}"),
+            on_step=lambda step, best: run.on_progress("Searching", step, steps, f"{best:.2f}"),
         ),
     )
 
@@ -333,6 +385,7 @@ def _search_on(
         groups,
         found,
         selection,
+        objective=run.budget.objective,
         rounds=run.budget.rounds,
         best=run.budget.select,
         method=run.budget.calibration,
@@ -342,7 +395,7 @@ def _search_on(
     )
 
 
-def _select(run: _Run, found: AttackResult) -> Selection:
+def _select(run: _Run, found: AttackResult, drives: Drives) -> Selection:
     total = 1 + min(run.budget.select, len(found.candidates))
     return select_by_driving(
         run.simulator,
@@ -352,8 +405,29 @@ def _select(run: _Run, found: AttackResult) -> Selection:
         best=run.budget.select,
         weather=run.budget.recorded_in[0],
         folder=run.folder / "selection",
-        on_drive=lambda done, best: run.on_progress("Choosing by driving", done, total, f"{best:.2f} m"),
+        # The simulator repeats itself, so the recorded clean drive is the one to compare with.
+        clean=drives.drives[0].episode,
+        on_drive=lambda done, best: run.on_progress("Verifying by driving", done, total, f"{best:.2f} m"),
     )
+
+
+def _predict(
+    run: _Run, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None
+) -> Prediction | None:
+    """The predicted path of the chosen pattern beside the one driven over it; kept with the run."""
+    chosen = selection if rounds is None else rounds.best
+    if chosen is None or not run.budget.is_predicted:
+        return None
+    path = run.folder / "prediction.npz"
+    if path.exists():
+        return Prediction.load(path)
+    number = 0 if rounds is None else next((k for k, each in enumerate(rounds.done, 1) if each.selection is chosen), 0)
+    place = run.folder / f"round-{number}" if number else run.folder
+    trial = chosen.driven[chosen.chosen].trial
+    clean, painted = load_episodes(place / "selection", (trial.clean, trial.painted))
+    prediction = predict(recordings, run.controller, pattern, clean, painted, device=run.device)
+    prediction.save(path)
+    return prediction
 
 
 def _evaluate(run: _Run, pattern: Pattern, simulator: Opening | Simulator, processes: int) -> Evaluation:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from roadproof.attacks import AttackResult, Candidate, attack, kept_attack
+from roadproof.attacks import AttackResult, Candidate, Objective, attack, kept_attack
 from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.drives import Drives, record_along
@@ -81,6 +81,7 @@ def search_on(
     found: AttackResult,
     selection: Selection,
     *,
+    objective: Objective,
     rounds: int,
     best: int,
     method: Method,
@@ -101,6 +102,7 @@ def search_on(
         groups: of it.
         found: by it.
         selection: of it; its drives are in `folder`/selection.
+        objective: of it.
         rounds: how many.
         best: candidates driven in each.
         method: of calibration.
@@ -129,7 +131,7 @@ def search_on(
         if groups[0].direction is Direction.EITHER:
             groups = parse_groups("all", recordings)
         starts = [candidate for _, candidate in known]
-        again = _searched(recordings, controller, groups, found, starts, place / "attack", device, tell)
+        again = _searched(recordings, controller, groups, found, objective, starts, place / "attack", device, tell)
         chosen = select_by_driving(
             simulator,
             controller,
@@ -190,6 +192,7 @@ def _searched(
     controller: Controller,
     groups: Sequence[Group],
     found: AttackResult,
+    objective: Objective,
     starts: Sequence[Candidate],
     place: Path,
     device: torch.device | str,
@@ -202,6 +205,7 @@ def _searched(
             recordings,
             controller,
             found.space,
+            objective=objective,
             groups=groups,
             schedule=replace(found.schedule, heats=()),
             restarts=found.restarts,
@@ -209,6 +213,6 @@ def _searched(
             starts=starts,
             device=device,
             checkpoint=checkpoint,
-            on_step=lambda step, best: tell(step, f"shift {best:.3f}"),
+            on_step=lambda step, best: tell(step, f"{best:.2f}"),
         ),
     )

@@ -77,13 +77,13 @@ def test_gradopt_finds_and_is_judged_in_every_condition(tmp_path):
     ]
     assert all(tuple(row) == (*JOB_COLUMNS, *MEASURED) for row in result.rows)
     first = result.rows[0]
-    # One drive recorded, two to calibrate, one clean and one over the only candidate; a pair for each row.
-    assert (first["search_calls"], first["evaluation_calls"]) == (5, 6)
+    # One drive recorded, two to calibrate, one over the only candidate; a pair for each row.
+    assert (first["search_calls"], first["evaluation_calls"]) == (4, 6)
     assert 0 < first["search_seconds"] < first["seconds"]
     history = json.loads(result.files["history.json"])
     assert (history["kind"], history["calls"]) == ("surrogate", [3, 3])
     assert history["best"] == sorted(history["best"])
-    assert history["driven"]["calls"] == [5]
+    assert history["driven"]["calls"] == [4]
     assert history["driven"]["best"] == [first["deviation_m"]]
     check_files(result, figures=1, weathers=("clear-noon", "rainy-noon"))
 

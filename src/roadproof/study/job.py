@@ -41,7 +41,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 
-from roadproof.attacks import Schedule
+from roadproof.attacks import OBJECTIVES, Schedule
 from roadproof.attacks.blackbox import Method as BlackBox
 from roadproof.attacks.blackbox import blackbox_search
 from roadproof.calibration import Method as Calibration
@@ -181,8 +181,10 @@ def history(
 
 def budget_of(method: MethodPlan, weather: Weather) -> Budget:
     """What a gradopt method spends on finding a pattern."""
-    schedule = Schedule.in_heats if method.schedule == "heats" else Schedule.stretched
+    heats = Schedule.closed_loop if method.objective == "deviation" else Schedule.in_heats
+    schedule = heats if method.schedule == "heats" else Schedule.stretched
     return Budget(
+        objective=OBJECTIVES[method.objective],
         deviations_m=SWERVES_M[: (method.trajectories - 1) // 2],
         scheme=Scheme.RANDOM if method.scheme == "random" else Scheme.GROUP,
         pooled=method.scheme != "group",
@@ -222,7 +224,7 @@ def _by_gradient(job: Job, world: Simulator, controller: Controller, folder: Pat
             [sum(cost.simulator_calls for cost in before)] * len(strongest),
             cast("list[float]", (sum(cost.seconds for cost in before) + steps).tolist()),
             cast("list[float]", np.maximum.accumulate(strongest).tolist()),
-            measure="steering shift",
+            measure=found.attack.objective,
             driven={
                 "calls": [calls] * driven,
                 "seconds": [seconds] * driven,

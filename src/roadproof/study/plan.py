@@ -84,7 +84,8 @@ class MethodPlan:
         schedule: gradopt: "published" steps, or in "heats".
         calibration: gradopt: how recorded drives are calibrated, a `calibration.Method`.
         frames: gradopt: kept of every recorded drive, at most.
-        objective: black box: what a drive is judged by, an `evaluation.objective.Measure`.
+        objective: what is made large. Black box: of a drive, an `evaluation.objective.Measure`. gradopt: "steering",
+            the shift on recorded frames, or "deviation", the car's path in the recorded world.
         start: black box: "gradopt" tries `select` patterns first that a gradopt search of these settings found.
     """
 
@@ -123,6 +124,11 @@ class MethodPlan:
             raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         if self.start and (self.search == "gradopt" or not self.select):
             raise StudyError(f"start is {self.start!r}, expected it with a black-box search and select of 1 or more")
+        sides = self.scheme == "group" and self.trajectories > 1
+        if self.search == "gradopt" and self.objective == "deviation" and not sides:
+            raise StudyError(
+                "objective deviation is searched for each side apart; expected scheme group and trajectories 3 or more"
+            )
         if self.trajectories not in COUNTS:
             raise StudyError(f"trajectories is {self.trajectories}, expected {', '.join(map(str, COUNTS))}")
 

@@ -21,7 +21,7 @@ from paint_shy import just_before_the_canvas
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
-from roadproof.attacks import Schedule
+from roadproof.attacks import Schedule, SteeringShift
 from roadproof.calibration import load_report
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
@@ -43,6 +43,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 CAMERA = CameraModel(width_px=400, height_px=300, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 INPUT = CropResize(left_px=0, top_px=57, right_px=400, bottom_px=255, width_px=200, height_px=88)
 BUDGET = Budget(
+    objective=SteeringShift(),
     deviations_m=(0.7,),
     frames=5,
     schedule=Schedule.stretched(12),
