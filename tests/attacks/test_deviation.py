@@ -56,6 +56,21 @@ def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp
     assert [each.predicted_m for each in loaded.candidates] == found
 
 
+def test_a_search_doubts_a_controller_that_was_not_recorded(road):
+    class Stray(RampFollower):
+        def steer(self, frames, speed_mps, command):
+            return super().steer(frames, speed_mps, command) + 0.15
+
+    found = {check.name: check for check in search(road, schedule=dataclasses.replace(SHORT, iterations=1)).checks}
+    assert found["keeps to the recorded road without paint"].passed
+    stray = attack(
+        road, Stray(), SPACE, objective=PathDeviation(), schedule=dataclasses.replace(SHORT, iterations=1), restarts=1
+    )
+    (doubt,) = (check for check in stray.checks if check.name == "keeps to the recorded road without paint")
+    assert not doubt.passed
+    assert "record with it" in doubt.advice
+
+
 def test_the_same_seed_finds_the_same_and_an_interrupted_search_goes_on_to_it(road, tmp_path):
     whole, stopped = search(road), tmp_path / "search.safetensors"
 

@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.checks import check_search
+from roadproof.attacks.checks import check_search, check_world
+from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Schedule, Search, gradopt
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.result import AttackResult, Candidate, Cost
@@ -77,6 +78,8 @@ def attack(
     candidates = _candidates(measure, search, space, groups)
     cost = Cost(controller_frames=measure.frames_evaluated, seconds=time.perf_counter() - start)
     checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
+    if isinstance(measure, DeviationMeasure):
+        checks += check_world(measure, candidates[0].pattern)
     return AttackResult(
         pattern=candidates[0].pattern,
         group=candidates[0].group,

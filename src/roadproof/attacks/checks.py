@@ -8,9 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search, random_search
 from roadproof.attacks.objective import Measure
+from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
+
+STRAYS_M = 0.5
+"""A controller that strays further on the bare road is not the one that was recorded."""
+
+ASIDE_M, TURNED_RAD = 1.0, 0.3
+"""Further from a recorded pose a picture shows much that was not recorded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +58,40 @@ def check_search(
     if random_patterns:
         checks.append(_check_against_random(measure, space, search, random_patterns, seed))
     return tuple(checks)
+
+
+def check_world(measure: DeviationMeasure, pattern: Pattern) -> tuple[Check, ...]:
+    """Look whether a recorded world may be believed: on the bare road, and over the pattern found.
+
+    Args:
+        measure: what was searched on.
+        pattern: one pattern.
+    """
+    on_device = Pattern(
+        pattern.shapes, pattern.boxes[None].to(measure.device), pattern.colours[None].to(measure.device)
+    )
+    with torch.no_grad():
+        bare = measure.world.roll(measure.controller)
+        painted = measure.world.roll(measure.controller, on_device)
+    strays_m = float(bare.right_m.abs().max())
+    aside_m, turned_rad = float(painted.left_m.abs().max()), float(painted.turned_rad.abs().max())
+    keeps, near = strays_m <= STRAYS_M, aside_m <= ASIDE_M and turned_rad <= TURNED_RAD
+    return (
+        Check(
+            "keeps to the recorded road without paint",
+            keeps,
+            f"on the bare road it goes up to {strays_m:.2f} m aside of the recorded clean drive",
+            ""
+            if keeps
+            else "it does not drive as the recorded controller did, so predicted paths mean little: record with it",
+        ),
+        Check(
+            "pictures near recorded ones",
+            near,
+            f"over the pattern it is up to {aside_m:.2f} m and {turned_rad:.2f} rad from the recorded poses shown",
+            "" if near else "metres are less certain there: drive over it, or re-record along its path (rounds)",
+        ),
+    )
 
 
 def _check_determinism(measure: Measure, space: SearchSpace, search: Search) -> Check:
