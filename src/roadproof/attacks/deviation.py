@@ -10,6 +10,7 @@ with d the offset from the clean path to that side and s some metres: a car that
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Iterator, Sequence
 
@@ -56,7 +57,7 @@ class DeviationMeasure:
         saturation_m: float = 3.0,
         device: torch.device | str = "cpu",
     ) -> None:
-        # Refuses controllers and groups that do not fit, and is what a search begins with.
+        # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
         self._open_loop = Surrogate(recordings, controller, groups, device=device)
         self.groups = tuple(groups)
         self.controller = controller
@@ -64,11 +65,13 @@ class DeviationMeasure:
         self.world.fit(controller)
         self.device = self.world.device
         self.frames_evaluated = 0
-        self._starts, self._every, self._saturation_m = starts, every, saturation_m
+        self._starts, self.every, self._saturation_m = starts, every, saturation_m
 
-    def thinned(self, every: int) -> Surrogate:
-        """What chooses among many starts for less: the steering shift on every n-th recorded frame."""
-        return self._open_loop.thinned(every)
+    def thinned(self, every: int) -> DeviationMeasure:
+        """The same world with a picture every n steps: it chooses among many starts for less."""
+        thin = copy.copy(self)
+        thin.every, thin.frames_evaluated = every, 0
+        return thin
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         """Metres to each group's side at points of a search space, without gradients."""
@@ -110,18 +113,18 @@ class DeviationMeasure:
 
     def fingerprint(self) -> str:
         """Tells this measure from another: drives, calibration, controller, starts."""
-        more = repr((self._starts, self._every, self._saturation_m, self.world.vehicle))
+        more = repr((self._starts, self.every, self._saturation_m, self.world.vehicle))
         return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
 
     def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
-        pictures = len(self.groups) * len(self._starts) * -(-self.world.course.count // self._every)
+        pictures = len(self.groups) * len(self._starts) * -(-self.world.course.count // self.every)
         at_once = max(1, MAX_PICTURES // pictures)
         yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
 
     def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         patterns = space.pattern(unit.flatten(0, 1))
-        rolled = self.world.roll(self.controller, patterns, starts=self._starts, every=self._every)
-        self.frames_evaluated += len(rolled.right_m) * -(-self.world.course.count // self._every)
+        rolled = self.world.roll(self.controller, patterns, starts=self._starts, every=self.every)
+        self.frames_evaluated += len(rolled.right_m) * -(-self.world.course.count // self.every)
         soft = self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)
         right = soft.mean(1).view(*unit.shape[:2], -1)
         sides = [_to_side(part, group.direction) for group, part in zip(self.groups, right, strict=True)]

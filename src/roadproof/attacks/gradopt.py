@@ -33,7 +33,7 @@ class Heat:
     Args:
         starts: of every group.
         iterations: steps of each, at the schedule's first learning rate.
-        every: the share of the frames used: every n-th of each drive.
+        every: the share of the frames used: every n-th of each drive; in the recorded world, of the steps.
     """
 
     starts: int
@@ -95,13 +95,13 @@ class Schedule:
 
     @staticmethod
     def closed_loop(iterations: int = 40) -> Schedule:
-        """For a search where the car goes: heats on the steering shift, then small steps, since a loop amplifies."""
+        """For a search where the car goes: heats with few pictures, then more of them; small steps, a loop amplifies."""
         return Schedule(
             iterations=iterations,
             learning_rate=0.05,
             drops=(iterations // 2, iterations * 4 // 5),
             factor=0.3,
-            heats=(Heat(starts=16, iterations=15, every=8), Heat(starts=6, iterations=15, every=4)),
+            heats=(Heat(starts=16, iterations=12, every=6), Heat(starts=6, iterations=10, every=4)),
         )
 
     @property

@@ -45,7 +45,7 @@ class Measure(Protocol):
         ...
 
     def thinned(self, every: int) -> Measure:
-        """A cheaper measure on every n-th recorded frame, whose order of starts is much the same."""
+        """A cheaper measure, on every n-th frame or step, whose order of starts is much the same."""
         ...
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
