@@ -95,7 +95,7 @@ class Schedule:
 
     @staticmethod
     def closed_loop(iterations: int = 40) -> Schedule:
-        """For a search where the car goes: heats with few pictures, then more of them; small steps, a loop amplifies."""
+        """For a search where the car goes: heats with few pictures, then more; small steps, since a loop amplifies."""
         return Schedule(
             iterations=iterations,
             learning_rate=0.05,
