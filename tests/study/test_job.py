@@ -17,7 +17,7 @@ from PIL import Image
 from safetensors.torch import load_file
 
 import needs
-from roadproof.attacks import AttackResult, Schedule, proposals
+from roadproof.attacks import AttackResult, PathDeviation, Schedule, SteeringShift, proposals
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme
@@ -187,6 +187,15 @@ def test_a_method_says_what_is_spent():
     for scheme, recorded in (("group-all", Scheme.GROUP), ("random", Scheme.RANDOM)):
         budget = budget_of(MethodPlan(name="c", search="gradopt", scheme=scheme), Weather.CLEAR_NOON)
         assert (budget.pooled, budget.scheme, budget.deviations_m) == (True, recorded, (1.5,))
+
+
+def test_a_black_box_begins_from_the_steering_shift_whatever_it_is_given_itself():
+    hybrid = MethodPlan(name="d", search="cma-es", objective="deviation", start="gradopt", select=4, schedule="heats")
+    assert budget_of(hybrid, Weather.CLEAR_NOON).objective == SteeringShift()
+    assert budget_of(hybrid, Weather.CLEAR_NOON).schedule == Schedule.in_heats(250)
+    own = MethodPlan(name="e", search="gradopt", objective="deviation", schedule="heats")
+    assert budget_of(own, Weather.CLEAR_NOON).objective == PathDeviation()
+    assert budget_of(own, Weather.CLEAR_NOON).schedule == Schedule.closed_loop(250)
 
 
 def test_the_baseline_has_bounds_of_its_own():

@@ -181,10 +181,12 @@ def history(
 
 def budget_of(method: MethodPlan, weather: Weather) -> Budget:
     """What a gradopt method spends on finding a pattern."""
-    heats = Schedule.closed_loop if method.objective == "deviation" else Schedule.in_heats
+    # A black box's objective is of its own drives; the search that it begins with stays the published one.
+    objective = method.objective if method.search == "gradopt" else "steering"
+    heats = Schedule.closed_loop if objective == "deviation" else Schedule.in_heats
     schedule = heats if method.schedule == "heats" else Schedule.stretched
     return Budget(
-        objective=OBJECTIVES[method.objective],
+        objective=OBJECTIVES[objective],
         deviations_m=SWERVES_M[: (method.trajectories - 1) // 2],
         scheme=Scheme.RANDOM if method.scheme == "random" else Scheme.GROUP,
         pooled=method.scheme != "group",
