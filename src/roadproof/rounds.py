@@ -102,7 +102,7 @@ def search_on(
         groups: of it.
         found: by it.
         selection: of it; its drives are in `folder`/selection.
-        objective: of it.
+        objective: what the search before made large, and each round's search makes large.
         rounds: how many.
         best: candidates driven in each.
         method: of calibration.

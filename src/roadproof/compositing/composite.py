@@ -107,8 +107,7 @@ def composite_own(pattern: Pattern, frames: Float[Tensor, "b 3 h w"], views: Own
     colours = canvas_colours(pattern, views)
     # A copy is written where its pixel is, with the same colour; the gradient goes to the pixel alone.
     colours = torch.where(views.valid[..., None], colours, colours.detach())
-    place = views.pixel[:, None].expand(-1, 3, -1)
-    return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+    return views.pasted(frames, colours)
 
 
 def canvas_colours(pattern: Pattern, view: CanvasView | OwnViews) -> Float[Tensor, "*b p 3"]:

@@ -36,8 +36,7 @@ def composite_raster(
     """
     seen = _averaged(_seen(paint, views), views)
     colours = (views.clean + views.gain * seen[..., :3] + views.bias * seen[..., 3:]).clamp(0.0, 1.0)
-    place = views.pixel[:, None].expand(-1, 3, -1)
-    return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+    return views.pasted(frames, colours)
 
 
 def _seen(paint: UInt8[np.ndarray, "400 400 4"], views: OwnViews) -> Float[Tensor, "n 4"]:

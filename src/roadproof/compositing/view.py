@@ -86,6 +86,11 @@ class OwnViews(NamedTuple):
         runs = Runs.of(footprints.features[:, 0], clean, gain, bias)
         return OwnViews(pixel, valid, footprints, clean, gain, bias, response, runs)
 
+    def pasted(self, frames: Float[Tensor, "b 3 h w"], colours: Float[Tensor, "b p 3"]) -> Float[Tensor, "b 3 h w"]:
+        """The pictures with other colours in the canvas' pixels; the rest is copied bit for bit."""
+        place = self.pixel[:, None].expand(-1, 3, -1)
+        return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+
 
 def view_canvas(
     frames: UInt8[np.ndarray, "f h w 3"],

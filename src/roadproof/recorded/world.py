@@ -97,7 +97,6 @@ class RecordedWorld:
         tracks = [drive.track for drive in recordings.recordings if drive.track is not None]
         self.vehicle = vehicle or Vehicle.identified(tracks)
         self.course = Course(clean.track, self.bank.canvas, int(clean.frame_number[0]), device=device)
-        self.command = self.bank.command[: len(clean.frames)]
         self.device = self.bank.device
 
     def fit(self, controller: Controller) -> None:

@@ -266,7 +266,6 @@ def _attack(run: Run) -> Fields | None:
     return {
         "chart": charts.search(attack.history, tuple(attack.by_group), attack.objective),
         "objective": attack.objective,
-        "predicted": "" if attack.predicted_m is None else f"{attack.predicted_m:.2f} m",
         "shift": f"{attack.surrogate_shift:+.3f}",
         "group": attack.group,
         "groups": [(name, f"{value:+.3f}") for name, value in attack.by_group.items()],
