@@ -31,7 +31,7 @@ from roadproof.attacks import PathDeviation, Schedule, Surrogate
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import gradopt
 from roadproof.calibration import calibrate
-from roadproof.drives import Trajectories, Window, record
+from roadproof.drives import Trajectories, record
 from roadproof.evaluation import DrivenObjective
 from roadproof.files import write_atomically
 from roadproof.loop import Budget
@@ -79,7 +79,7 @@ def cell(controller_name: str, scenario: Scenario, seed: int) -> dict[str, Any]:
             controller,
             scenario,
             trajectories=Trajectories(count=budget.trajectories, perturbation=budget.perturbation),
-            window=Window(frames=budget.frames),
+            window=budget.window,
             seed=seed,
         )
         calibrated = calibrate(town, drives, budget.calibration)

@@ -41,13 +41,13 @@ def picture(state):
     return np.clip(np.round(shown), 0, 255).astype(np.uint8).T.reshape(VIEW.height_px, VIEW.width_px, 3)
 
 
-def recorded(push=Push.CLEAN, left_m=0.0, *, every=1, name=None):
-    """A straight drive past the canvas, so far to the left."""
+def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None):
+    """A straight drive past the canvas, so far to the left, looking that way."""
     ahead = np.arange(-32.0, 8.0, SPEED_MPS * DT_S)
     steps = np.arange(len(ahead))
     shown = steps[(ahead > -29.0) & (ahead < -1.5)][::every]
     count = len(ahead)
-    states = [pose(ahead[step], left_m) for step in shown]
+    states = [pose(ahead[step], left_m, yaw_rad) for step in shown]
     return Recording(
         name=name or str(push),
         push=push,
@@ -62,7 +62,7 @@ def recorded(push=Push.CLEAN, left_m=0.0, *, every=1, name=None):
             step=steps,
             x_m=CANVAS.x_m + ahead,
             y_m=np.full(count, CANVAS.y_m + left_m),
-            yaw_rad=np.zeros(count),
+            yaw_rad=np.full(count, yaw_rad),
             speed_mps=np.full(count, SPEED_MPS),
             steer=np.zeros(count),
             throttle=np.full(count, 0.1),

@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.geometry import Resampling
+from roadproof.geometry import CANVAS_SIZE_PX, Resampling
 
 FOOTPRINT_VARIANCE: dict[Resampling, float] = {"antialiased-bilinear": 1.0, "area": 0.5}
 """Squared half-width, in picture px, of the tent that stands for each resampling filter."""
@@ -152,6 +152,13 @@ def coverage(shape: Shape, box: Float[Tensor, "*b 5"], footprints: Footprints) -
             return _ellipse_coverage(box, footprints)
         case _:
             return _polygon_coverage(polygon_vertices(shape, box), footprints)
+
+
+def canvas_share(footprints: Footprints) -> Float[Tensor, "*v p"]:
+    """Share of every footprint that lies on the canvas."""
+    middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
+    whole = footprints.centre.new_tensor([middle, middle, size, size, 0.0])
+    return _rectangle_coverage(whole.expand(*footprints.centre.shape[:-2], 5), footprints)
 
 
 def _rectangle_coverage(box: Tensor, footprints: Footprints) -> Tensor:

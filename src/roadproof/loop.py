@@ -140,6 +140,11 @@ class Budget:
         return 1 + 2 * len(self.deviations_m)
 
     @property
+    def window(self) -> Window:
+        """Which frames are kept; a recorded world begins where deviation is measured from, however small the canvas."""
+        return Window(frames=self.frames, least_px=8) if self.is_predicted else Window(frames=self.frames)
+
+    @property
     def perturbation(self) -> Swerve | SteeringNoise:
         """How the pairs are pushed."""
         if self.noise_deg is not None:
@@ -323,7 +328,7 @@ def _record(run: _Run, number: int) -> Drives:
         run.scenario,
         weather=budget.recorded_in[number],
         trajectories=wanted,
-        window=Window(frames=budget.frames),
+        window=budget.window,
         seed=run.seed,
         driver_name=run.controller_name,
         folder=run.folder_of(number) / "record",

@@ -14,7 +14,7 @@ from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.patterns import Pattern
 from roadproof.recorded.pictures import FrameBank, Poses
-from roadproof.recordings import RecordingSet
+from roadproof.recordings import Push, RecordingSet
 from roadproof.search_space import SearchSpace
 from scenes import PLAIN
 
@@ -136,6 +136,21 @@ def test_the_nearest_frame_weighs_heading_against_distance(bank):
     gap = bank.nearest(poses)
     assert abs(float(gap.left_m[0]) + 0.1) < 1e-6  # of the drive to the left, which is at 1.5 m
     assert abs(float(gap.ahead_m[0])) <= 0.31
+
+
+def test_what_a_turned_car_sees_comes_from_a_frame_that_looked_that_way(bank):
+    road = recorded_road()
+    turned = recorded(Push.LEFT, 0.6, yaw_rad=0.3, name="left-2")
+    there = picture(pose(-14.0, 0.1, 0.3)).astype(float)
+    poses = Poses(*(torch.tensor([value], dtype=torch.float64) for value in (-14.0, 0.1, 0.3)))
+    straight_on = bank.nearest(poses)
+    more = FrameBank(dataclasses.replace(road, recordings=(*road.recordings, turned)))
+    alone, helped = (
+        np.abs(levels(each.show(poses, straight_on).frames)[0] - there)[40:].mean((0, 2)) for each in (bank, more)
+    )
+    # Some 60 columns to the left are beyond the edge of the frame that looked straight on.
+    assert np.allclose(alone[60:], helped[60:], atol=0.2)
+    assert helped[:40].mean() < 0.3 * alone[:40].mean()
 
 
 def test_a_set_that_cannot_be_driven_in_says_what_it_lacks():

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from roadproof.compositing.runs import Runs
-from roadproof.coverage import Footprints, Shape, coverage
+from roadproof.coverage import Footprints, canvas_share
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
 from roadproof.photometry import ColourTransform, PixelMaps, Response
@@ -123,10 +123,8 @@ def view_canvas(
     place = torch.as_tensor(index, device=device)
     clean = levels.reshape(-1, 3)[place]
     if maps is None:
-        gain, offset = colour.gain_and_offset(torch.as_tensor(_camera_points(index, view)))
-        middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
-        whole = torch.tensor([middle, middle, size, size, 0.0], device=device, dtype=dtype)
-        share = coverage(Shape.RECTANGLE, whole, footprints)
+        gain, offset = colour.gain_and_offset(camera_points(torch.as_tensor(index), view))
+        share = canvas_share(footprints)
     else:
         own = torch.as_tensor(index)
         gain, offset, share = maps.gain.flatten(0, 2)[own], maps.offset.flatten(0, 2)[own], maps.visible.flatten()[own]
@@ -176,8 +174,9 @@ def _dilated(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
     return rows[:, :, :-2] | rows[:, :, 1:-1] | rows[:, :, 2:]
 
 
-def _camera_points(index: Int[np.ndarray, " p"], view: CropResize) -> Float[np.ndarray, "p 2"]:
-    """Camera coordinates of the pixels at an index into flattened frames."""
-    rows, columns = np.divmod(index % (view.height_px * view.width_px), view.width_px)
-    camera_from_input = np.linalg.inv(view.input_from_camera)
-    return np.stack([columns, rows], -1) * np.diag(camera_from_input)[:2] + camera_from_input[:2, 2]
+def camera_points(index: Int[Tensor, "*n"], view: CropResize) -> Float[Tensor, "*n 2"]:
+    """Camera coordinates of the pixels at an index into flattened frames; float64."""
+    pixel = index % (view.height_px * view.width_px)
+    row, column = torch.div(pixel, view.width_px, rounding_mode="floor"), pixel % view.width_px
+    camera_from_input = torch.tensor(np.linalg.inv(view.input_from_camera), device=index.device)
+    return torch.stack([column, row], -1) * camera_from_input.diagonal()[:2] + camera_from_input[:2, 2]

@@ -97,6 +97,7 @@ class RecordedWorld:
         tracks = [drive.track for drive in recordings.recordings if drive.track is not None]
         self.vehicle = vehicle or Vehicle.identified(tracks)
         self.course = Course(clean.track, self.bank.canvas, int(clean.frame_number[0]), device=device)
+        self._shown_m = float(self.course.locate(self.bank.poses).s_m.max()) + PAST_M
         self.device = self.bank.device
 
     def fit(self, controller: Controller) -> None:
@@ -148,7 +149,7 @@ class RecordedWorld:
             if step % every == 0:
                 gap = self.bank.nearest(poses.detached())
                 answer = self._answer(controller, pattern, poses, car, gap)
-                past = gap.ahead_m > PAST_M
+                past = place.s_m > self._shown_m
                 steer = torch.where(past, course.law(place), answer[:, 0] + course.feedback(place)).clamp(-1.0, 1.0)
                 pedals = answer[:, 1:] if answer.shape[1] == 3 else self._recorded_pedals(place, car)
                 controls = torch.cat([steer[:, None], pedals], 1)

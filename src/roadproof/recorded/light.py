@@ -1,0 +1,84 @@
+"""The light on the canvas in recorded frames, read where another picture looks into them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from roadproof.compositing.view import camera_points, canvas_pixels
+from roadproof.coverage import Footprints, canvas_share
+from roadproof.geometry import CropResize
+from roadproof.recordings import RecordingSet
+
+_SEEN = 0.02
+_MOSTLY_ROAD = 0.05
+
+
+class Light:
+    """Gain and offset of the paint, and how much of the canvas nothing hides, in every pixel of every frame.
+
+    Args:
+        recordings: calibrated with maps of every pixel, or with one colour for all.
+        device: where it is read.
+    """
+
+    def __init__(self, recordings: RecordingSet, device: torch.device) -> None:
+        self._view, self._colour = recordings.view, recordings.colour
+        self._maps = _maps(recordings, device)
+
+    def at(
+        self,
+        pixel: Int[Tensor, "r p"],
+        source: Float[Tensor, "r p 2"],
+        frame: Int[Tensor, " r"],
+        footprints: Footprints,
+    ) -> tuple[Float[Tensor, "r p 3"], Float[Tensor, "r p 3"], Float[Tensor, "r p"]]:
+        """Gain and offset of pixels of R pictures, and the share of each through which the canvas is seen.
+
+        Args:
+            pixel: index into a flattened picture.
+            source: where in its frame each of them comes from, px.
+            frame: index of each picture's frame.
+            footprints: of the pixels on the canvas, (R, 1, P, ...).
+        """
+        share = canvas_share(footprints)[:, 0]
+        if self._maps is None:
+            gain, offset = self._colour.gain_and_offset(camera_points(pixel, self._view).float())
+            return gain, offset, share
+        height, width = self._view.height_px, self._view.width_px
+        # Light changes slowly across a frame: the nearest pixel's will do.
+        x, y = source.round().long().unbind(-1)
+        light = self._maps[frame[:, None] * (height * width) + y.clamp(0, height - 1) * width + x.clamp(0, width - 1)]
+        return light[..., :3], light[..., 3:6], share * light[..., 6]
+
+
+def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"] | None:
+    """Gain, offset and unoccluded share of every pixel of every frame; None where the set has one colour for all.
+
+    Where the canvas is not seen, the mean of the frame stands: a moved picture looks a little beyond its edge.
+    """
+    maps = [drive.maps for drive in recordings.recordings]
+    if any(each is None for each in maps):
+        return None
+    gain = torch.cat([each.gain for each in maps if each is not None])
+    offset = torch.cat([each.offset for each in maps if each is not None])
+    visible = torch.cat([each.visible for each in maps if each is not None])
+    homographies = np.concatenate([drive.image_from_canvas for drive in recordings.recordings])
+    expected = _expected_share(homographies, recordings.view)
+    values = torch.cat([gain, offset], -1).float()
+    known = (visible > _SEEN)[..., None]
+    mean = (values * known).sum((1, 2)) / known.sum((1, 2)).clamp_min(1)
+    values = torch.where(known, values, mean[:, None, None])
+    free = torch.where(expected > _MOSTLY_ROAD, visible / expected.clamp_min(_MOSTLY_ROAD), 1.0).clamp(0.0, 1.0)
+    return torch.cat([values, free[..., None]], -1).flatten(0, 2).to(device)
+
+
+def _expected_share(homographies: Float[np.ndarray, "f 3 3"], view: CropResize) -> Float[Tensor, "f h w"]:
+    """Share of every pixel that lies on the canvas, were nothing in its way."""
+    index, centre, jacobian = canvas_pixels(homographies, view)
+    footprints = Footprints.of(centre, jacobian, view.resampling)
+    share = torch.zeros(len(homographies) * view.height_px * view.width_px)
+    share[torch.as_tensor(index)] = canvas_share(footprints)
+    return share.view(-1, view.height_px, view.width_px)
