@@ -71,7 +71,8 @@ class Budget:
     Args:
         objective: what the search makes large: a path deviation in the recorded world, or a steering shift as
             published.
-        deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each; T = 1 without.
+        deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each; T = 1 without. Where
+            the search drives in the recorded world, the last of several weaves from side to side instead.
         scheme: whether those pairs are pushed right and left, or each drive to both sides at random.
         pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
         noise_deg: as many pairs, pushed as published instead: least and most degrees added to the steering.
@@ -149,6 +150,8 @@ class Budget:
         """How the pairs are pushed."""
         if self.noise_deg is not None:
             return SteeringNoise(*self.noise_deg)
+        if self.is_predicted and len(self.deviations_m) > 1:
+            return Swerve(self.deviations_m[:-1], weaves_m=self.deviations_m[-1:])
         return Swerve(self.deviations_m) if self.deviations_m else Swerve()
 
 

@@ -90,6 +90,22 @@ def test_offsets_begin_at_zero_with_the_view_and_differ_by_seed():
     assert np.abs(first.offset_m - second.offset_m).max() > 0.02
 
 
+def test_a_weave_turns_the_car_both_ways_about_the_clean_path():
+    path = CleanPath.of(episode(*drive(bend, 0.3)))
+    length_m = float(path.arclength_m[-1])
+    for push, side in ((Push.RIGHT, 1.0), (Push.LEFT, -1.0)):
+        wanted = offsets(push, 0.5, 15.0, 45.0, length_m, np.random.default_rng(3), weaves=True)
+        states, _ = drive(swerving(lambda _: Control(0.0, throttle=0.4), path, wanted, lambda _: None), 0.3, 130)
+        placed = [path.locate(state, None) for state in states]
+        s, aside = np.array(placed).T
+        turned = np.array([state.yaw_rad - path.at(path.heading_rad, at) for state, at in zip(states, s, strict=True)])
+        assert (side * aside[(s > 15.0) & (s < 20.0)]).max() > 0.3, "begins to its own side"
+        assert aside.min() < -0.3
+        assert aside.max() > 0.3
+        assert turned.min() < -0.2
+        assert turned.max() > 0.2
+
+
 def test_published_noise_is_whole_degrees_to_one_side_for_two_seconds():
     clean = episode(*drive(bend, 0.3))
     draws = [

@@ -20,14 +20,25 @@ def record(
     scenarios: ScenarioFile = None,
     driver: DriverSpec = "expert",
     weather: WeatherName = "clear-noon",
-    trajectories: Annotated[int, typer.Option(help="T, how many drives: 1, 3, 5 or 7.")] = 3,
+    objective: Annotated[
+        str, typer.Option(help="What will be searched in them: steering, or deviation in the recorded world.")
+    ] = "steering",
+    trajectories: Annotated[
+        int | None,
+        typer.Option(
+            help="T, how many drives: 1, 3, 5 or 7.  [default: a clean one and a pair for each size]",
+            show_default=False,
+        ),
+    ] = None,
     scheme: Annotated[
         str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
     ] = "group",
     deviation_m: Annotated[
         list[float] | None,
         typer.Option(
-            help="How far drives are pushed aside; several are taken in turn.  [default: 1.5]", show_default=False
+            help="How far drives are pushed aside; several are taken in turn, and for a deviation the last weaves.  "
+            "[default: 1.5; 1.5 and 0.5 for a deviation]",
+            show_default=False,
         ),
     ] = None,
     noise_deg: Annotated[
@@ -35,7 +46,10 @@ def record(
         typer.Option(help="Push by noise on the steering instead, least and most, as published.", show_default=False),
     ] = None,
     horizon_m: Annotated[float, typer.Option(help="Keep frames from so far before the canvas.")] = 25.0,
-    frames: Annotated[int, typer.Option(help="Keep at most so many a drive.")] = 24,
+    frames: Annotated[
+        int | None,
+        typer.Option(help="Keep at most so many a drive.  [default: 24; 40 for a deviation]", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the perturbations.")] = 0,
     simulator: SimulatorSpec = "town",
     device: Device = "cpu",
@@ -43,12 +57,16 @@ def record(
 ) -> None:
     """Record drives past the canvas: clean, and pushed to the side. A second call goes on where the first ended."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from dataclasses import replace
+
+    from roadproof.attacks import OBJECTIVES
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Weather
-    from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
+    from roadproof.drives import Scheme, Trajectories
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError
     from roadproof.files import check_writable
+    from roadproof.loop import PAPER, QUICK
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator
 
@@ -57,12 +75,19 @@ def record(
     sky = Weather(choice(weather, "weather", tuple(Weather)))
     if noise_deg is not None and deviation_m:
         raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to push drives aside")
-    wanted = Trajectories(
-        count=trajectories,
-        scheme=Scheme(choice(scheme, "scheme", tuple(Scheme))),
-        perturbation=Swerve(tuple(deviation_m or [1.5])) if noise_deg is None else SteeringNoise(*noise_deg),
+    usual = QUICK if choice(objective, "objective", tuple(OBJECTIVES)) == "deviation" else PAPER
+    budget = replace(
+        usual,
+        deviations_m=tuple(deviation_m or usual.deviations_m),
+        frames=usual.frames if frames is None else frames,
+        noise_deg=noise_deg,
     )
-    window = Window(horizon_m=horizon_m, frames=frames)
+    wanted = Trajectories(
+        count=budget.trajectories if trajectories is None else trajectories,
+        scheme=Scheme(choice(scheme, "scheme", tuple(Scheme))),
+        perturbation=budget.perturbation,
+    )
+    window = replace(budget.window, horizon_m=horizon_m)
     check_writable(out)
     who = driver_of(driver, device)
 

@@ -239,10 +239,16 @@ def _to_json(settings: Settings) -> dict[str, Any]:
         "trajectories": {
             "count": trajectories.count,
             "scheme": str(trajectories.scheme),
-            **({"swerve_m": how.deviations_m} if isinstance(how, Swerve) else {"noise_deg": astuple(how)}),
+            **_told(how),
         },
     }
     return json.loads(json.dumps(content))  # tuples become lists, as they will be read
+
+
+def _told(how: Swerve | SteeringNoise) -> dict[str, Any]:
+    if isinstance(how, SteeringNoise):
+        return {"noise_deg": astuple(how)}
+    return {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
 
 
 def _from_json(content: dict[str, Any], folder: Path) -> Settings:
@@ -261,7 +267,7 @@ def _from_json(content: dict[str, Any], folder: Path) -> Settings:
             trajectories=Trajectories(
                 count=chosen["count"],
                 scheme=Scheme(chosen["scheme"]),
-                perturbation=Swerve(tuple(map(float, chosen["swerve_m"])))
+                perturbation=Swerve(tuple(map(float, chosen["swerve_m"])), tuple(map(float, chosen.get("weave_m", ()))))
                 if "swerve_m" in chosen
                 else SteeringNoise(*map(int, chosen["noise_deg"])),
             ),

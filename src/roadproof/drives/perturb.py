@@ -31,6 +31,8 @@ _GAIN_PRIOR = 0.3
 """1/m: between a small car with a small steering angle (0.23) and CARLA's large ones (0.42)."""
 _GAIN_PRIOR_WEIGHT = 0.05
 _FINE_M = 0.25
+_WEAVE_M, _WEAVE_BEGINS_M = 12.0, 4.0
+"""Metres from one side to the other and back: half a metre aside turns a car by a quarter of a radian."""
 _NOISE_BEFORE_END_S, _NOISE_S = 1.5, 2.1
 _TEST_S = 0.4
 
@@ -114,7 +116,14 @@ class Offsets:
 
 
 def offsets(
-    push: Push, size_m: float, from_m: float, to_m: float, length_m: float, rng: np.random.Generator
+    push: Push,
+    size_m: float,
+    from_m: float,
+    to_m: float,
+    length_m: float,
+    rng: np.random.Generator,
+    *,
+    weaves: bool = False,
 ) -> Offsets:
     """An offset that grows from 0 while the canvas is in view, to one side or, at random, to both.
 
@@ -125,8 +134,14 @@ def offsets(
         to_m: arclength at which it is out of view.
         length_m: of the path.
         rng: draws where it rises.
+        weaves: from side to side, beginning to the right or the left.
     """
     s = np.arange(0.0, length_m + _FINE_M, _FINE_M)
+    side = 1.0 if push is Push.RIGHT else -1.0
+    if weaves:
+        since_m = np.maximum(s - from_m, 0.0)
+        grown = size_m * _smooth(np.minimum(since_m / _WEAVE_BEGINS_M, 1.0))
+        return Offsets.of(s, side * grown * np.sin(math.tau / _WEAVE_M * since_m))
     along = (s - from_m) / (to_m - from_m)
     if push is Push.RANDOM:
         knots = np.concatenate([[0.0], rng.uniform(-1.0, 1.0, 4)])
@@ -136,7 +151,6 @@ def offsets(
         rise = _smooth(at - below)
         return Offsets.of(s, knots[below] + rise * (knots[below + 1] - knots[below]))
     begins, ends = rng.uniform(0.0, 0.2), rng.uniform(0.6, 0.85)
-    side = 1.0 if push is Push.RIGHT else -1.0
     return Offsets.of(s, side * size_m * _smooth(np.clip((along - begins) / (ends - begins), 0.0, 1.0)))
 
 

@@ -234,7 +234,7 @@ def _astray(
             noise = steering_noise(plan.push, how, clean.episode, int(clean.frame_number[-1]), rng)
             return noisy(policy, clean.episode, share * noise, answers.append)
         length_m = float(path.arclength_m[-1])
-        wanted = offsets(plan.push, share * plan.deviation_m, first, last, length_m, rng)
+        wanted = offsets(plan.push, share * plan.deviation_m, first, last, length_m, rng, weaves=plan.weaves)
         swerve = swerving(policy, path, wanted, answers.append)
 
         def act(seen: Observation) -> Control:

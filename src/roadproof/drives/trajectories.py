@@ -29,16 +29,20 @@ class Swerve:
 
     Args:
         deviations_m: sizes; the pairs of a Group (or the drives of Random) take them in turn.
+        weaves_m: sizes of further ones that weave from side to side instead, beginning to their own: they show what a
+            car sees that has turned, as an attacked one does.
 
     Raises:
         RecordingError: there is none, or one is outside 0.1…5 m.
     """
 
     deviations_m: tuple[float, ...] = (1.5,)
+    weaves_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.deviations_m or not all(0.1 <= size <= 5.0 for size in self.deviations_m):
-            raise RecordingError(f"deviations are {self.deviations_m} m, expected one or more between 0.1 and 5")
+        sizes = self.deviations_m + self.weaves_m
+        if not sizes or not all(0.1 <= size <= 5.0 for size in sizes):
+            raise RecordingError(f"deviations are {sizes} m, expected one or more between 0.1 and 5")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +82,14 @@ class Plan:
         push: to which side.
         deviation_m: size of a swerve; 0 for a clean drive and for steering noise.
         stream: numbers its random draws.
+        weaves: whether it weaves from side to side.
     """
 
     name: str
     push: Push
     deviation_m: float
     stream: int
+    weaves: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -110,11 +116,14 @@ class Trajectories:
     def plans(self) -> tuple[Plan, ...]:
         """The drives, the clean one first."""
         pushes = (Push.RANDOM,) if self.scheme is Scheme.RANDOM else (Push.RIGHT, Push.LEFT)
-        sizes = self.perturbation.deviations_m if isinstance(self.perturbation, Swerve) else (0.0,)
+        how = self.perturbation
+        sizes = [(size, False) for size in how.deviations_m] if isinstance(how, Swerve) else [(0.0, False)]
+        sizes += [(size, True) for size in how.weaves_m] if isinstance(how, Swerve) else []
         rounds = -(-(self.count - 1) // len(pushes))
         perturbed = (
-            Plan(str(push) if k == 0 else f"{push}-{k + 1}", push, sizes[k % len(sizes)], k + 1)
+            Plan(str(push) if k == 0 else f"{push}-{k + 1}", push, size, k + 1, weaves)
             for k in range(rounds)
+            for size, weaves in sizes[k % len(sizes) :][:1]
             for push in pushes
         )
         return (Plan(str(Push.CLEAN), Push.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
