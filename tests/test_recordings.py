@@ -158,7 +158,7 @@ DAMAGE = {
     "no camera": (lambda s: edit_manifest(s, lambda m: m.pop("camera")), "camera"),
     "path out of the folder": (
         lambda s: edit_manifest(s, lambda m: m["drives"][0].update(name="../x")),
-        "plain folder",
+        "plain name",
     ),
     "drive missing": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(name="gone")), "gone"),
     "unknown push": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(push="up")), "expected one of clean"),

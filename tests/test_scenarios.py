@@ -14,7 +14,7 @@ from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario, load
 
 START = VehicleState(1.5, -2.0, 0.0, 0.25, 3.0)
 SCENARIO = Scenario(
-    name='odd "name" \\ ü',
+    name="odd (name), ü",
     kind="left",
     map_name="town",
     start=START,
@@ -76,7 +76,7 @@ def test_what_a_file_leaves_out_has_the_usual_values(tmp_path: Path) -> None:
         ("start = { x_m = 0, y_m = 0 }", "start = { x_m = 0, y_m = 0, speed_mps = -1 }", "expected 0 or more"),
         ("start = { x_m = 0, y_m = 0 }", "start = 7", "start is 7, expected a table"),
         ("x_m = 20.0, y_m = 0.0", "x_m = 20.0, y_m = 0.0, width_m = -2", "canvas is -2.0 m"),
-        ('map_name = "town"', 'map_name = "../town.xodr"', "expected a file name without folders"),
+        ('map_name = "town"', 'map_name = "../town.xodr"', "is not a plain name"),
         ("[[scenario]]", "[scenario]", "no [[scenario]]"),
         ("goal_m", "goal_m =", "not valid TOML"),
     ],

@@ -17,6 +17,61 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+_MARKS = frozenset(" ._+-=,()")
+_LONGEST_NAME = 100
+_DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
+
+
+def is_plain_name(name: object) -> bool:
+    """Whether a text can name a file or folder, and nothing else, on every system.
+
+    Letters, digits and " ._+-=,()", at most 100 of them; it begins with a letter, a digit or "_", does not end with "."
+    or a blank, and is no device ("nul").
+    """
+    if not isinstance(name, str) or not 0 < len(name) <= _LONGEST_NAME:
+        return False
+    if not all(mark.isalnum() or mark in _MARKS for mark in name):
+        return False
+    return (name[0].isalnum() or name[0] == "_") and name[-1] not in ". " and name.split(".")[0].lower() not in _DEVICES
+
+
+def check_name(name: object, what: str, error: type[RoadproofError]) -> str:
+    """A name from a file, once it is plain.
+
+    Args:
+        name: as it was read.
+        what: it names, for the message.
+        error: what to raise.
+
+    Raises:
+        error: it is not plain (`is_plain_name`).
+    """
+    if not is_plain_name(name):
+        raise error(
+            f"{what} {name!r:.120} is not a plain name; expected letters, digits, blanks and ._+-=,() alone, beginning "
+            "with a letter or digit"
+        )
+    return str(name)
+
+
+def inside(folder: Path, name: object, what: str, error: type[RoadproofError]) -> Path:
+    """The path of a name in a folder: the one way from a name in a file to a place on the disk.
+
+    Args:
+        folder: it stays in.
+        name: of a file or folder there.
+        what: it names, for the message.
+        error: what to raise.
+
+    Raises:
+        error: the name is not plain, or a link of this name leads out of the folder.
+    """
+    path = folder / check_name(name, what, error)
+    if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+        raise error(f"{path} is a link that leads out of {folder}; remove it, or choose another folder")
+    return path
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then move it into place.
 

@@ -27,7 +27,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
-from roadproof.files import read_json, write_folder_atomically
+from roadproof.files import check_name, inside, read_json, write_folder_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 from roadproof.tracks import Track
@@ -92,6 +92,7 @@ class Recording:
     track: Track | None = None
 
     def __post_init__(self) -> None:
+        check_name(self.name, "drive", RecordingError)
         count = len(self.frames)
         if count == 0:
             raise RecordingError(f"drive {self.name} has no frames, expected at least one that shows the canvas")
@@ -298,10 +299,8 @@ def _read_canvas(path: Path, stored: object) -> CanvasPlacement | None:
 
 
 def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Recording:
-    name = str(drive["name"])
-    folder = root / name
-    if Path(name).name != name or name in {"", ".", ".."}:
-        raise RecordingError(f"{root / 'recordings.json'}: drive name {name!r} is not a plain folder name")
+    name = drive["name"]
+    folder = inside(root, name, f"{root / 'recordings.json'}: drive", RecordingError)
     if not folder.is_dir():
         raise RecordingError(f"drive {name} is listed in recordings.json but {folder} is missing")
     try:

@@ -20,6 +20,7 @@ from typing import Any, Literal, cast, get_args
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
+from roadproof.files import check_name, inside
 from roadproof.geometry import CanvasPlacement
 
 Kind = Literal["straight", "left", "right"]
@@ -33,7 +34,7 @@ class Scenario:
     """One stretch of road to be driven.
 
     Args:
-        name: for people and files, for instance "left-03".
+        name: for people and folders, for instance "left-03".
         kind: whether the route keeps straight or veers to a side, in a bend or at a junction.
         map_name: a map the simulator knows by name ("town"), or the path of an OpenDRIVE file.
         start: where the car stands, and how fast it goes when the drive begins.
@@ -42,7 +43,7 @@ class Scenario:
         time_limit_s: after this many seconds the drive ends.
 
     Raises:
-        ScenarioError: a value is missing, not finite or out of range.
+        ScenarioError: the name cannot name a folder, or a value is missing, not finite or out of range.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Scenario:
     time_limit_s: float
 
     def __post_init__(self) -> None:
+        check_name(self.name, "scenario", ScenarioError)
         numbers = {**asdict(self.start), **asdict(self.canvas), "goal x": self.goal_m[0], "goal y": self.goal_m[1]}
         for what, value in {**numbers, "time_limit_s": self.time_limit_s}.items():
             if not math.isfinite(value):
@@ -200,9 +202,7 @@ def _kind(text: str) -> Kind:
 def _map_name(name: str, folder: Path) -> str:
     if not name.endswith(".xodr"):
         return name
-    if Path(name).name != name:
-        raise ScenarioError(f"map_name is {name!r}, expected a file name without folders; put the map beside the list")
-    return str(folder / name)
+    return str(inside(folder, name, "map_name", ScenarioError))
 
 
 def _known(entry: object, keys: set[str], what: str) -> dict[str, Any]:

@@ -102,6 +102,14 @@ def test_what_has_been_calibrated_is_not_mixed_with_another_method(run, call):
     assert "was calibrated by pose; remove it to calibrate again by published" in said
 
 
+def test_a_scenario_that_is_a_link_out_of_the_folder_is_not_followed(call, workplace):
+    (workplace / "linked").mkdir()
+    (workplace / "elsewhere").mkdir()
+    (workplace / "linked" / "straight-04").symlink_to(workplace / "elsewhere")
+    assert "leads out of linked" in call(*RECORD[:-1], "linked", code=2)
+    assert not any((workplace / "elsewhere").iterdir())
+
+
 def test_a_recording_is_not_mixed_with_another(run, call):
     said = call(*RECORD, "--weather", "rainy-noon", code=2)
     assert "holds a recording with weather 'clear-noon', now it is 'rainy-noon'" in said

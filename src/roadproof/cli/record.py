@@ -64,8 +64,8 @@ def record(
     from roadproof.datatypes import Weather
     from roadproof.drives import Scheme, Trajectories
     from roadproof.drives import record as run
-    from roadproof.errors import RecordingError
-    from roadproof.files import check_writable
+    from roadproof.errors import RecordingError, ScenarioError
+    from roadproof.files import check_writable, inside
     from roadproof.loop import PAPER, QUICK
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator
@@ -89,6 +89,7 @@ def record(
     )
     window = replace(budget.window, horizon_m=horizon_m)
     check_writable(out)
+    places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
     who = driver_of(driver, device)
 
     with open_simulator(simulator) as world:
@@ -103,10 +104,10 @@ def record(
                     window=window,
                     seed=seed,
                     driver_name=driver,
-                    folder=out / scenario.name / "record",
+                    folder=places[scenario.name] / "record",
                     on_drive=lambda done, show=show: show(done, 0.0),
                 )
-            _summarise(drives, out / scenario.name)
+            _summarise(drives, places[scenario.name])
 
 
 def _summarise(drives: Drives, run: Path) -> None:

@@ -20,7 +20,9 @@ import numpy as np
 import roadproof
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
+from roadproof.errors import EpisodeError
 from roadproof.evaluation.result import Trial, judge
+from roadproof.files import inside
 from roadproof.rollout import Driver, Episode, rollout
 from roadproof.scenarios import Scenario, identity
 from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
@@ -150,7 +152,7 @@ def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
     Raises:
         EpisodeError: one is missing or damaged.
     """
-    return tuple(Episode.load(folder / "episodes" / name) for name in names)
+    return tuple(Episode.load(inside(folder / "episodes", name, "episode", EpisodeError)) for name in names)
 
 
 def driver_in_words(driver: AnyDriver) -> str:

@@ -26,7 +26,7 @@ from PIL import Image
 
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.files import read_json, write_atomically
+from roadproof.files import check_name, read_json, write_atomically
 from roadproof.geometry import CanvasPlacement
 from roadproof.metrics import (
     HORIZON_M,
@@ -342,8 +342,8 @@ def trial_from_json(stored: dict[str, Any]) -> Trial:
         KeyError, TypeError, ValueError: something is missing or wrong.
     """
     for name in (stored["clean"], stored["painted"]):
-        if Path(name).name != name or not str(name).endswith(".npz"):
-            raise EpisodeError(f"episode {name!r} is not a plain file name")
+        if not check_name(name, "episode", EpisodeError).endswith(".npz"):
+            raise EpisodeError(f"episode {name!r} is not the name of an .npz file")
     fields: dict[str, Any] = {**stored, "weather": Weather(stored["weather"])}
     return Trial(**fields)
 

@@ -24,6 +24,7 @@ from torch import Tensor
 from roadproof.compositing.raster import composite_raster
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
+from roadproof.files import is_plain_name
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, Homography, homography_from_pose
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
@@ -163,7 +164,7 @@ class RecordedSimulator:
         kind: Kind = "straight" if abs(turned) <= TURNS_RAD else "left" if turned > 0 else "right"
         name = recordings.origin.split(",")[0].strip()
         return Scenario(
-            name=name or "recorded",
+            name=name if is_plain_name(name) else "recorded",
             kind=kind,
             map_name="recorded",
             start=self._state(self._world.begin()),

@@ -27,6 +27,7 @@ from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Prediction, Selection, Trial
+from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.result import load_paint
 from roadproof.ledger import StageCost, read_cost
 from roadproof.patterns import Pattern, load_pattern
@@ -145,7 +146,7 @@ def _judged(folder: Path) -> Judged:
     evaluation = Evaluation.load(folder)
     shown = evaluation.shown()
     alone = evaluation.of(traffic=False)
-    pairs = tuple((trial.weather, _episode(folder, trial.clean), _episode(folder, trial.painted)) for trial in alone)
+    pairs = tuple(_driven(folder, trial) for trial in alone)
     fidelity = folder / "fidelity.npz"
     return Judged(
         evaluation=evaluation,
@@ -161,8 +162,9 @@ def _judged(folder: Path) -> Judged:
     )
 
 
-def _episode(folder: Path, name: str) -> Episode:
-    return Episode.load(folder / "episodes" / name)
+def _driven(folder: Path, trial: Trial) -> tuple[Weather, Episode, Episode]:
+    clean, painted = load_episodes(folder, (trial.clean, trial.painted))
+    return trial.weather, clean, painted
 
 
 def _bytes(path: Path) -> bytes | None:

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from roadproof.controllers import Controller, load_controller
-from roadproof.errors import StudyError
+from roadproof.errors import ScenarioError, StudyError
 from roadproof.evaluation import evaluate
-from roadproof.files import write_atomically
+from roadproof.files import inside, write_atomically
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
@@ -68,7 +68,7 @@ def transfer(
 
 
 def _row(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> Row:
-    place = folder / "transfer" / re.sub(r"[^\w.-]", "_", spec) / job.scenario.name
+    place = inside(folder / "transfer" / re.sub(r"[^\w.-]", "_", spec), job.scenario.name, "scenario", ScenarioError)
     evaluation = evaluate(
         world,
         driver,
