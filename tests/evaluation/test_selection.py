@@ -124,5 +124,5 @@ def test_a_damaged_choice_is_refused_by_name(done, tmp_path):
     with pytest.raises(RoadproofError, match="chosen is 7 of 3"):
         Selection.load(tmp_path)
     path.write_text(path.read_text().replace('"clean": "', '"clean": "../'))
-    with pytest.raises(RoadproofError, match="is not a plain file name"):
+    with pytest.raises(RoadproofError, match="is not a plain name"):
         Selection.load(tmp_path)
