@@ -114,6 +114,9 @@ class Ending(StrEnum):
 
     GOAL_REACHED = "goal reached"
     TIME_LIMIT = "time limit"
+    OFF_ROUTE = "off the route"
+    STANDS = "standing after a collision"
+    BLOCKED = "blocked"
     STOPPED = "stopped"
     LEFT_RECORDED = "left the recorded stretch"
 
@@ -128,9 +131,9 @@ class Observation:
         command: what the route asks next.
         time_s: seconds since the reset.
         events: what happened since the last observation.
-        done: the drive is over: the goal is reached, the time limit has passed, or what `ending` says.
+        done: the drive is over.
         picture: the full camera picture, where it was asked for.
-        ending: why the drive is over, where it is neither the goal nor the time limit.
+        ending: why the drive is over; where a simulator does not say, it is the goal or the time limit.
     """
 
     frame: UInt8[np.ndarray, "h w 3"]

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from roadproof.datatypes import Weather
+from roadproof.datatypes import Ending, Event, EventKind, Weather
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.files import check_name, read_json, write_atomically
 from roadproof.geometry import CanvasPlacement
@@ -32,6 +32,7 @@ from roadproof.metrics import (
     HORIZON_M,
     Mean,
     Path2D,
+    counted,
     deviation_m,
     first_event_s,
     infraction_points,
@@ -77,6 +78,8 @@ class Trial:
         first_event_s: when something first went wrong; None where nothing did, or nothing is known of it.
         clean_first_event_s: the same without paint.
         ending: why the painted drive ended.
+        events: of the painted drive, those that count (`metrics.counted`), so that anyone can count again.
+        clean_events: of the clean one.
     """
 
     pattern: str
@@ -94,6 +97,8 @@ class Trial:
     first_event_s: float | None
     clean_first_event_s: float | None
     ending: str
+    events: tuple[Event, ...] = ()
+    clean_events: tuple[Event, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -263,6 +268,9 @@ def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacemen
         before = _approach(clean, HORIZON_M + canvas.length_m)
         bare, driven = np.concatenate([before, bare]), np.concatenate([before, driven])
     seen = passage(bare, canvas)
+    if painted.ending in (Ending.STANDS, Ending.BLOCKED):
+        # Whoever stands goes on standing there.
+        driven = np.concatenate([driven, np.repeat(driven[-1:], max(seen.stop - len(driven), 0), 0)])
     # A painted drive that ended before has its last position left.
     return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
 
@@ -301,6 +309,8 @@ def judge(
         first_event_s=first_event_s(painted.events),
         clean_first_event_s=first_event_s(clean.events),
         ending=str(painted.ending),
+        events=counted(painted.events),
+        clean_events=counted(clean.events),
     )
 
 
@@ -344,7 +354,12 @@ def trial_from_json(stored: dict[str, Any]) -> Trial:
     for name in (stored["clean"], stored["painted"]):
         if not check_name(name, "episode", EpisodeError).endswith(".npz"):
             raise EpisodeError(f"episode {name!r} is not the name of an .npz file")
-    fields: dict[str, Any] = {**stored, "weather": Weather(stored["weather"])}
+    events = {
+        name: tuple(Event(EventKind(each["kind"]), float(each["time_s"]), str(each["detail"])) for each in stored[name])
+        for name in ("events", "clean_events")
+        if name in stored
+    }
+    fields: dict[str, Any] = {**stored, **events, "weather": Weather(stored["weather"])}
     return Trial(**fields)
 
 

@@ -15,6 +15,7 @@ A row is one drive over the pattern against the same drive without it. Its colum
     clean_leaderboard             the same without
     first_event_s       s         when something first went wrong with paint; none where nothing did
     ending                        why the painted drive ended
+    events                        of the painted drive, those that count, as JSON: kind, seconds, with what or where
     search_calls        drives    of the simulator before the evaluation: recording, calibration and selection; in a
                                   black-box search one for each pattern tried and a clean one, and what its start took
     search_seconds      s         that finding the pattern took
@@ -78,6 +79,7 @@ MEASURED = (
     "clean_leaderboard",
     "first_event_s",
     "ending",
+    "events",
     "search_calls",
     "search_seconds",
     "evaluation_calls",
@@ -155,6 +157,7 @@ def measured(trial: Trial) -> Row:
         "clean_leaderboard": trial.clean_leaderboard,
         "first_event_s": trial.first_event_s,
         "ending": trial.ending,
+        "events": json.dumps([(each.kind, each.time_s, each.detail) for each in trial.events]),
     }
 
 

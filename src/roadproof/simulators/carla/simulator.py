@@ -33,6 +33,7 @@ from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import set_weather
+from roadproof.simulators.endings import Endings
 from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage, Pictures
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.judge import Judge
@@ -41,7 +42,6 @@ from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.routes import Route
 from roadproof.simulators.town.traffic import Traffic
 
-GOAL_M = 2.0
 SETTLE_TICKS = 10
 STOP = Control(0.0, brake=1.0)
 TRIED_M = 60.0
@@ -56,6 +56,7 @@ class _Drive:
     scenario: Scenario
     route: Route
     judge: Judge
+    endings: Endings
     ego: carla.Vehicle
     crowd: Crowd | None
     cameras: dict[str, Camera]
@@ -301,7 +302,17 @@ class CarlaSimulator:
         for camera in cameras.values():
             camera.begin()
         self._drive = _Drive(
-            scenario, route, Judge(roads), ego, crowd, cameras, collisions, paint, full_pictures, scenario.start
+            scenario=scenario,
+            route=route,
+            judge=Judge(roads),
+            endings=Endings(route, scenario.time_limit_s),
+            ego=ego,
+            crowd=crowd,
+            cameras=cameras,
+            collisions=collisions,
+            paint=paint,
+            full_pictures=full_pictures,
+            state=scenario.start,
         )
         return self._observe(self._drive, self._start(session, self._drive))
 
@@ -384,13 +395,15 @@ class CarlaSimulator:
         place = drive.route.locate(state.x_m, state.y_m, drive.arclength_m if drive.steps else None)
         drive.arclength_m = place.arclength_m
         people = np.column_stack([self.pedestrians.x_m, self.pedestrians.y_m])
-        arrived = place.arclength_m >= drive.route.length_m - GOAL_M
+        events = drive.judge.watch(state, time_s, drive.collisions.contacts(drive.crowd), people)
+        ending = drive.endings.watch(state, place, time_s, events)
         return Observation(
             frame=self._input(picture),
             state=state,
             command=place.command,
             time_s=time_s,
-            events=drive.judge.watch(state, time_s, drive.collisions.contacts(drive.crowd), people),
-            done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
+            events=events,
+            done=ending is not None,
             picture=picture if drive.full_pictures else None,
+            ending=ending,
         )

@@ -152,7 +152,9 @@ class Physics:
                 turn = core.Vec3(math.degrees(solid.pose.yaw_rad), 0.0, 0.0)
                 half = core.Vec3(solid.half_m[0], solid.half_m[1], solid.height_m / 2)
                 block.add_shape(bullet.BulletBoxShape(half), core.TransformState.make_pos_hpr(middle, turn))
-            self._parts[name] = [Contact("static", f"{self._solids[i].name} {i}") for i in self._blocks[key]]
+            self._parts[name] = [
+                Contact("static", self._solids[i].thing or f"{self._solids[i].name} {i}") for i in self._blocks[key]
+            ]
             self._near[key] = self._place(block)
 
     def _place(self, node: Node) -> Path:

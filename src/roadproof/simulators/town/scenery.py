@@ -20,18 +20,28 @@ GRID_M = 0.5
 STOREY_M, SHOP_M = 3.1, 3.6
 FACADES, SHOPS, TREES = 7, 4, 5
 ROOFS: tuple[Rgb, ...] = ((0.62, 0.36, 0.27), (0.52, 0.30, 0.24), (0.36, 0.36, 0.38), (0.46, 0.34, 0.28))
+_JOINED_M = 2.6
 POST: Rgb = (0.24, 0.26, 0.27)
 
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """Something one can hit: a box, `half_m` from its middle along and across, from the ground up."""
+    """Something one can hit: a box, `half_m` from its middle along and across, from the ground up.
+
+    Boxes with the same `thing` are one object, which is hit once, such as the pieces of a guard rail.
+    """
 
     name: str
     pose: Pose
     half_m: tuple[float, float]
     height_m: float
     casts_shadow: bool = True
+    thing: str = ""
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """World x, y."""
+        return self.pose.x_m, self.pose.y_m
 
     @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
@@ -78,6 +88,7 @@ class _Site:
     trees: list[Tree] = field(default_factory=list[Tree])
     solids: list[Solid] = field(default_factory=list[Solid])
     paved: list[np.ndarray] = field(default_factory=list[np.ndarray])
+    rails: list[Solid] = field(default_factory=list[Solid])
 
     def builder(self, texture: str) -> MeshBuilder:
         return self.builders.setdefault(texture, MeshBuilder())
@@ -162,7 +173,7 @@ class _Edge:
 
 
 def _rails(site: _Site, edge: _Edge) -> None:
-    """Guard rails outside bends, in pieces of two metres."""
+    """Guard rails outside bends, in pieces of two metres; what has no gap is one rail."""
     rail, post = site.builder("rail"), site.builder("concrete")
     reserved: list[Float[np.ndarray, "4 2"]] = []
     for station in np.arange(1.0, edge.length_m - 1.0, 2.0):
@@ -175,7 +186,11 @@ def _rails(site: _Site, edge: _Edge) -> None:
             continue
         rail.box((-half, -0.05, 0.45), (half, 0.05, 0.80), pose, tile_m=(2.0, 0.35), faces="yYZ")
         post.box((-0.07, -0.14, 0.0), (0.07, -0.04, 0.76), pose, (0.42, 0.42, 0.41))
-        site.solids.append(Solid("guard rail", pose, (half, 0.08), 0.80))
+        joined = (each for each in reversed(site.rails) if math.dist(each.middle, (pose.x_m, pose.y_m)) < _JOINED_M)
+        before = next(joined, None)
+        thing = before.thing if before else f"guard rail {len(site.solids)}"
+        site.solids.append(Solid("guard rail", pose, (half, 0.08), 0.80, thing=thing))
+        site.rails.append(site.solids[-1])
         reserved.append(edge_corners(pose.ahead(0.0, -3.0), half + 0.5, 3.4))
     for corners in reserved:
         site.take(corners)

@@ -20,6 +20,7 @@ from roadproof.geometry import (
 )
 from roadproof.scenarios import Scenario
 from roadproof.simulators.arguments import check_crop, check_pattern
+from roadproof.simulators.endings import Endings
 from roadproof.simulators.protocol import PaintKind, PatternImage, Pictures
 from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.engine import make_pipe
@@ -32,8 +33,6 @@ from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.routes import Route
 from roadproof.simulators.town.scenery import Scenery, build_scenery
 from roadproof.simulators.town.traffic import Traffic
-
-GOAL_M = 2.0
 
 
 @dataclass(slots=True)
@@ -54,6 +53,7 @@ class _Drive:
     route: Route
     physics: Physics
     judge: Judge
+    endings: Endings
     traffic: Traffic | None
     full_pictures: Pictures
     state: VehicleState
@@ -219,6 +219,7 @@ class TownSimulator:
             route=route,
             physics=Physics(town.scenery.solids, scenario.start, [] if traffic is None else _poses(traffic.cars)),
             judge=Judge(town.roads),
+            endings=Endings(route, scenario.time_limit_s),
             traffic=traffic,
             full_pictures=full_pictures,
             state=scenario.start,
@@ -289,15 +290,16 @@ class TownSimulator:
         # It takes several times as long as the frame.
         shown = wanted if isinstance(wanted, bool) else drive.steps in wanted
         picture = self._town.renderer.picture(state, drive.steps) if shown else None
-        arrived = place.arclength_m >= drive.route.length_m - GOAL_M
+        ending = drive.endings.watch(state, place, time_s, events)
         return Observation(
             frame=frame,
             state=state,
             command=place.command,
             time_s=time_s,
             events=events,
-            done=arrived or time_s >= drive.scenario.time_limit_s - 1e-9,
+            done=ending is not None,
             picture=picture,
+            ending=ending,
         )
 
 
