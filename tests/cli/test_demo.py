@@ -57,7 +57,7 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
         (["--attack-weathers", "clear-noon,rainy-noon", "--budget", "paper"], "choose two-paint"),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
-        (["--processes", "0"], "0 processes; expected 1"),
+        (["--processes", "0"], "--processes is 0, expected 1"),
         (["--rounds", "-1"], "-1 rounds"),
         (["--processes", "2", "--simulator", "carla://localhost:2000"], "would step the one server"),
     ):

@@ -73,7 +73,7 @@ def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call
     bright = ["--controller", "own_bright:Bright"]
     select = ["select", place, *bright, "--best", "2"]
     assert f"{place}/attack holds no attack; make it with: roadproof attack" in call(*select, code=2)
-    assert "--best is 0, expected 1 or more" in call(*select[:-1], "0", code=2)
+    assert "--best is 0, expected 1 to 1,000" in call(*select[:-1], "0", code=2)
     small = ["--groups", "all", "--figures", "1", "--iterations", "1", "--restarts", "2", "--random-patterns", "0"]
     call("attack", place / "recordings", *bright, *small, "--out", place / "attack")
     said = call(*select)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import ControllerSpec, Device, choice
+from roadproof.cli.options import MANY, MAX_SEED, ControllerSpec, Device, Figures, choice, number
 from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def attack(
     recordings: Annotated[Path, typer.Argument(help="Folder with a set of recorded drives.", show_default=False)],
     controller: ControllerSpec,
-    figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
+    figures: Figures = 5,
     family: Annotated[
         str, typer.Option(help="Where figures may lie: published, published-canvas-centre or free.")
     ] = "published",
@@ -27,7 +27,7 @@ def attack(
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
     albedo: Annotated[tuple[float, float], typer.Option(help="Darkest and brightest paint, 0 to 1.")] = (0.0, 1.0),
     max_painted_share: Annotated[
-        float | None, typer.Option(help="Largest share of the canvas that may be painted.", show_default=False)
+        float | None, number("Largest share of the canvas that may be painted.", 0.0, 1.0, show_default=False)
     ] = None,
     objective: Annotated[
         str | None,
@@ -45,19 +45,22 @@ def attack(
     ] = "heats",
     iterations: Annotated[
         int | None,
-        typer.Option(
-            help="Steps of every restart; after heats 100, for a deviation 40; 250 as published.", show_default=False
+        number(
+            "Steps of every restart; after heats 100, for a deviation 40; 250 as published.",
+            1,
+            MANY,
+            show_default=False,
         ),
     ] = None,
-    restarts: Annotated[int, typer.Option(help="Patterns of every group that are searched to the end.")] = 4,
+    restarts: Annotated[int, number("Patterns of every group that are searched to the end.", 1, 1000)] = 4,
     gradient: Annotated[str, typer.Option(help="exact, or published: the authors' way, to compare with.")] = "exact",
     patience: Annotated[
-        int | None, typer.Option(help="Stop after so many late steps without gain.", show_default=False)
+        int | None, number("Stop after so many late steps without gain.", 1, MANY, show_default=False)
     ] = None,
     random_patterns: Annotated[
-        int, typer.Option(help="Random patterns a group that the self-check compares with; 0 for none.")
+        int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
     ] = 100,
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    seed: Annotated[int, number("Of the random starts.", 0, MAX_SEED)] = 0,
     device: Device = "cpu",
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/attack"),

@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import number
+
 if TYPE_CHECKING:
     from roadproof.simulators.checks import Check
 
 carla = typer.Typer(no_args_is_help=True, add_completion=False, help="CARLA: serve the town as one, examine a server.")
 
 Host = Annotated[str, typer.Option(help="Address of the server.")]
-Port = Annotated[int, typer.Option(help="Port of its calls; sensor data goes through the next.")]
+Port = Annotated[int, number("Port of its calls; sensor data goes through the next.", 1, 65534)]
 
 
 @carla.command()
@@ -64,7 +66,7 @@ def scenario(
     start: Annotated[int, typer.Argument(help="Number of the spawn point where the drive starts.")],
     goal: Annotated[int, typer.Argument(help="Number of the spawn point it leads to.")],
     out: Annotated[Path, typer.Option(help="TOML file to write.")] = Path("carla.toml"),
-    canvas_at_m: Annotated[float, typer.Option(help="From the start to the middle of the canvas.")] = 25.0,
+    canvas_at_m: Annotated[float, number("From the start to the middle of the canvas.", 0.0, 10_000.0)] = 25.0,
     name: Annotated[str | None, typer.Option(help="Of the scenario; else MAP-START-GOAL.", show_default=False)] = None,
     map_name: Annotated[
         str | None, typer.Option("--map", help="Map of the server; else the one it has loaded.", show_default=False)
@@ -83,9 +85,9 @@ def scenario(
         where = map_name or simulator.session.map_name()
         roads = simulator.road_map(where)
         places = spawn_places(simulator.session)
-    for number in (start, goal):
-        if not 0 <= number < len(places):
-            raise ScenarioError(f"{where} has no spawn point {number}, expected 0 to {len(places) - 1}")
+    for place in (start, goal):
+        if not 0 <= place < len(places):
+            raise ScenarioError(f"{where} has no spawn point {place}, expected 0 to {len(places) - 1}")
     made = scenario_between(
         roads, where, places[start], places[goal], canvas_at_m=canvas_at_m, name=name or f"{where}-{start}-{goal}"
     )

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import CONTROLLERS, ScenarioFile, WeatherName, choice
+from roadproof.cli.options import (
+    CONTROLLERS,
+    MAX_PROCESSES,
+    Cars,
+    Pedestrians,
+    ScenarioFile,
+    WeatherName,
+    choice,
+    number,
+)
 
 if TYPE_CHECKING:
     from roadproof.controllers import ControllerReport
@@ -18,9 +27,9 @@ def check_controller(
     spec: Annotated[str, typer.Argument(help=f"What is checked: {CONTROLLERS}")],
     scenarios: ScenarioFile = None,
     weather: WeatherName = "clear-noon",
-    cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
-    pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
-    processes: Annotated[int, typer.Option(help="Simulators that drive at once; 0: one a core.")] = 0,
+    cars: Cars = 0,
+    pedestrians: Pedestrians = 0,
+    processes: Annotated[int, number("Simulators that drive at once; 0: one a core.", 0, MAX_PROCESSES)] = 0,
     drive: Annotated[bool, typer.Option(help="Also drive the scenarios.")] = True,
 ) -> None:
     """Check what attacks rely on, then drive every scenario and count those without any event."""

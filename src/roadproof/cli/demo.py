@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
+    MAX_SEED,
     ControllerSpec,
     Device,
+    Figures,
     Processes,
     ScenarioFile,
     ScenarioName,
     SimulatorSpec,
     check_processes,
     choice,
+    number,
     weathers_of,
 )
 
@@ -41,12 +44,12 @@ def demo(
             show_default=False,
         ),
     ] = None,
-    rounds: Annotated[int, typer.Option(help="Rounds of searching on along the way that the attacked car took.")] = 0,
+    rounds: Annotated[int, number("Rounds of searching on along the way that the attacked car took.", 0, 100)] = 0,
     attack_weathers: Annotated[
         str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
     ] = "clear-noon",
-    figures: Annotated[int, typer.Option(help="K, how many figures are painted.")] = 5,
-    seed: Annotated[int, typer.Option(help="Of recording, search and traffic.")] = 0,
+    figures: Figures = 5,
+    seed: Annotated[int, number("Of recording, search and traffic.", 0, MAX_SEED)] = 0,
     simulator: SimulatorSpec = "town",
     device: Device = "cpu",
     processes: Processes = 1,

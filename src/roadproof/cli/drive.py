@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
+    MAX_SEED,
+    Cars,
     Device,
     DriverSpec,
+    Pedestrians,
     ScenarioFile,
     ScenarioOrRecorded,
     WorldSpec,
     choice,
     driver_of,
+    number,
 )
 from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
 
@@ -49,9 +53,9 @@ def drive(
         Path | None,
         typer.Option(help="pattern.json of an attack, or a 400×400 picture, painted on the road.", show_default=False),
     ] = None,
-    cars: Annotated[int, typer.Option(help="Other cars on the road.")] = 0,
-    pedestrians: Annotated[int, typer.Option(help="People about.")] = 0,
-    seed: Annotated[int, typer.Option(help="Of the other cars and the people.")] = 0,
+    cars: Cars = 0,
+    pedestrians: Pedestrians = 0,
+    seed: Annotated[int, number("Of the other cars and the people.", 0, MAX_SEED)] = 0,
     simulator: WorldSpec = "town",
     device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
+    MAX_CROWD,
+    MAX_SEED,
     Device,
     DriverSpec,
     Processes,
@@ -17,6 +19,7 @@ from roadproof.cli.options import (
     WorldSpec,
     check_processes,
     driver_of,
+    number,
     weathers_of,
 )
 from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
@@ -45,14 +48,16 @@ def evaluate(
     ] = None,
     runs: Annotated[
         int | None,
-        typer.Option(
-            help="Drives with traffic in each weather, besides the one alone; 10 by default, 0 in recordings.",
+        number(
+            "Drives with traffic in each weather, besides the one alone; 10 by default, 0 in recordings.",
+            0,
+            10_000,
             show_default=False,
         ),
     ] = None,
-    cars: Annotated[int, typer.Option(help="Other cars in those.")] = 20,
-    pedestrians: Annotated[int, typer.Option(help="People about in those.")] = 20,
-    random: Annotated[int, typer.Option(help="Random patterns to compare with.")] = 0,
+    cars: Annotated[int, number("Other cars in those.", 0, MAX_CROWD)] = 20,
+    pedestrians: Annotated[int, number("People about in those.", 0, MAX_CROWD)] = 20,
+    random: Annotated[int, number("Random patterns to compare with.", 0, 1000)] = 0,
     recordings: Annotated[
         Path | None,
         typer.Option(help="The set attacked, to compare composites with what is rendered.", show_default=False),
@@ -60,7 +65,7 @@ def evaluate(
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
     processes: Processes = 1,
     simulator: WorldSpec = "town",
-    seed: Annotated[int, typer.Option(help="Of the first run with traffic; the others count on.")] = 0,
+    seed: Annotated[int, number("Of the first run with traffic; the others count on.", 0, MAX_SEED)] = 0,
     device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
         "out/evaluation"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 
 import typer
 
@@ -18,6 +18,33 @@ if TYPE_CHECKING:
     from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
+
+
+def number(about: str, least: int | float, most: int | float, *, show_default: bool = True) -> Any:  # noqa: ANN401
+    """An option that is a number in a range, which its help states; of a list, each is.
+
+    Args:
+        about: what it is, for the help.
+        least: it may be.
+        most: it may be.
+        show_default: whether the help shows the default.
+    """
+
+    # Typer tells parameters of its own types apart by annotation, and hands over others.
+    def check(_context: Any, parameter: Any, value: Any) -> Any:  # noqa: ANN401
+        given = cast("list[float]", value if isinstance(value, list) else [] if value is None else [value])
+        for each in given:
+            if not least <= each <= most:
+                raise RoadproofError(f"{parameter.opts[0]} is {each}, expected {least:,} to {most:,}")
+        return cast("Any", value)
+
+    return typer.Option(help=f"{about}  [{least:,} to {most:,}]", show_default=show_default, callback=check)
+
+
+MAX_SEED = 2**32 - 1
+MAX_PROCESSES = 256
+MAX_CROWD = 500
+MANY = 1_000_000
 
 CONTROLLERS = (
     "a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
@@ -50,7 +77,10 @@ WorldSpec: TypeAlias = Annotated[
 ]
 Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
-Processes: TypeAlias = Annotated[int, typer.Option(help="Drives of the evaluation made at once.")]
+Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, 64)]
+Cars: TypeAlias = Annotated[int, number("Other cars on the road.", 0, MAX_CROWD)]
+Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]
+Processes: TypeAlias = Annotated[int, number("Drives of the evaluation made at once.", 1, MAX_PROCESSES)]
 
 
 def check_processes(processes: int, simulator: str) -> None:

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import Device, DriverSpec, ScenarioFile, SimulatorSpec, WeatherName, choice, driver_of
+from roadproof.cli.options import (
+    MAX_SEED,
+    Device,
+    DriverSpec,
+    ScenarioFile,
+    SimulatorSpec,
+    WeatherName,
+    choice,
+    driver_of,
+    number,
+)
 
 if TYPE_CHECKING:
     from roadproof.drives import Drives
@@ -45,12 +55,12 @@ def record(
         tuple[int, int] | None,
         typer.Option(help="Push by noise on the steering instead, least and most, as published.", show_default=False),
     ] = None,
-    horizon_m: Annotated[float, typer.Option(help="Keep frames from so far before the canvas.")] = 25.0,
+    horizon_m: Annotated[float, number("Keep frames from so far before the canvas.", 1.0, 1000.0)] = 25.0,
     frames: Annotated[
         int | None,
-        typer.Option(help="Keep at most so many a drive.  [default: 24; 40 for a deviation]", show_default=False),
+        number("Keep at most so many a drive.  [default: 24; 40 for a deviation]", 1, 10_000, show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the perturbations.")] = 0,
+    seed: Annotated[int, number("Of the perturbations.", 0, MAX_SEED)] = 0,
     simulator: SimulatorSpec = "town",
     device: Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import ControllerSpec, Device, WorldSpec
+from roadproof.cli.options import ControllerSpec, Device, WorldSpec, number
 from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def select(
     run: Annotated[Path, typer.Argument(help="A run that was recorded, calibrated and attacked.", show_default=False)],
     controller: ControllerSpec,
-    best: Annotated[int, typer.Option(help="How many of the attack's candidates are driven, once each.")] = 6,
+    best: Annotated[int, number("How many of the attack's candidates are driven, once each.", 1, 1000)] = 6,
     simulator: WorldSpec = "town",
     device: Device = "cpu",
 ) -> None:

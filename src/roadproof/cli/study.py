@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.options import MAX_PROCESSES, number
+
 if TYPE_CHECKING:
     from roadproof.study.plan import Job
     from roadproof.study.rows import JobResult
@@ -20,7 +22,9 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
         "out/study"
     ),
-    workers: Annotated[int, typer.Option(help="Jobs at once on this machine, each in a process of its own.")] = 1,
+    workers: Annotated[
+        int, number("Jobs at once on this machine, each in a process of its own.", 1, MAX_PROCESSES)
+    ] = 1,
     cluster: Annotated[
         str | None,
         typer.Option(help="Address of a Ray cluster, or local for one on this machine.", show_default=False),

@@ -8,26 +8,28 @@ from typing import Annotated
 
 import typer
 
+from roadproof.cli.options import MANY, MAX_PROCESSES, MAX_SEED, number
+
 
 def train(
     out: Annotated[Path, typer.Option(help="Folder of drives, checkpoints and the controller.")] = Path("out/train"),
     network: Annotated[str, typer.Option(help="cil or pilotnet.")] = "cil",
-    width: Annotated[float, typer.Option(help="CIL: factor on channels and units.")] = 1.0,
+    width: Annotated[float, number("CIL: factor on channels and units.", 0.01, 16.0)] = 1.0,
     start: Annotated[
         str | None,
         typer.Option(help="Weights file or shipped controller to go on from; else fresh weights.", show_default=False),
     ] = None,
-    drives: Annotated[int, typer.Option(help="Drives of the expert.")] = 260,
-    painted_drives: Annotated[int, typer.Option(help="Drives of the expert over random paint, besides.")] = 0,
-    pasted: Annotated[float, typer.Option(help="Share of the pictures with rectangles pasted on the road.")] = 0.0,
-    samples: Annotated[int, typer.Option(help="Frames seen in the first training.")] = 200_000,
-    learning_rate: Annotated[float, typer.Option(help="The largest of the first training.")] = 1.2e-3,
-    rounds: Annotated[int, typer.Option(help="Rounds in which the network drives and the expert answers.")] = 0,
-    round_drives: Annotated[int, typer.Option(help="Drives of each round.")] = 100,
-    round_samples: Annotated[int, typer.Option(help="Frames seen in the training after each round.")] = 100_000,
-    seed: Annotated[int, typer.Option(help="Of everything.")] = 0,
+    drives: Annotated[int, number("Drives of the expert.", 1, MANY)] = 260,
+    painted_drives: Annotated[int, number("Drives of the expert over random paint, besides.", 0, MANY)] = 0,
+    pasted: Annotated[float, number("Share of the pictures with rectangles pasted on the road.", 0.0, 1.0)] = 0.0,
+    samples: Annotated[int, number("Frames seen in the first training.", 1, 10**9)] = 200_000,
+    learning_rate: Annotated[float, number("The largest of the first training.", 1e-9, 10.0)] = 1.2e-3,
+    rounds: Annotated[int, number("Rounds in which the network drives and the expert answers.", 0, 1000)] = 0,
+    round_drives: Annotated[int, number("Drives of each round.", 1, MANY)] = 100,
+    round_samples: Annotated[int, number("Frames seen in the training after each round.", 1, 10**9)] = 100_000,
+    seed: Annotated[int, number("Of everything.", 0, MAX_SEED)] = 0,
     device: Annotated[str, typer.Option(help="What the network learns on: cpu, cuda or cuda:N.")] = "cpu",
-    processes: Annotated[int, typer.Option(help="Simulators that drive at once; 0: one a core.")] = 0,
+    processes: Annotated[int, number("Simulators that drive at once; 0: one a core.", 0, MAX_PROCESSES)] = 0,
     collect_only: Annotated[bool, typer.Option("--collect-only", help="Stop before learning.")] = False,
 ) -> None:
     """Collect drives, learn from them, let the network drive, learn from that; goes on where it was interrupted."""
