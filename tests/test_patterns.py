@@ -132,6 +132,11 @@ def valid_file():
         (lambda c: c["figures"][0].update(rgb=[0, 0, 7]), r"\[0, 1\]"),
         (lambda c: c["figures"][0].update(width_px=-3), "above 0"),
         (lambda c: c["figures"][0].update(y_px=float("nan")), "not finite"),
+        (lambda c: c["figures"][0].update(x_px=1e39), r"figure 0 has 1e\+39, expected at most 100000"),
+        (lambda c: c["figures"][0].update(x_px=10**400), "figure 0 is not valid"),
+        (lambda c: c.update(figures=c["figures"] * 65), "has 65 figures, expected 64 at most"),
+        (lambda c: c.update(version=True), "version True, expected a whole number from 1"),
+        (lambda c: c.update(version=-1), "version -1"),
     ],
 )
 def test_a_damaged_pattern_file_is_refused_in_one_line(tmp_path, change, message):
@@ -146,6 +151,9 @@ def test_a_damaged_pattern_file_is_refused_in_one_line(tmp_path, change, message
 def test_files_that_are_missing_or_no_json_are_refused(tmp_path):
     with pytest.raises(PatternError, match="No such file"):
         load_pattern(tmp_path / "none.json")
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    with pytest.raises(PatternError, match="not valid JSON"):
+        load_pattern(tmp_path / "deep.json")
     (tmp_path / "text.json").write_text("hello")
     with pytest.raises(PatternError, match="not valid JSON"):
         load_pattern(tmp_path / "text.json")

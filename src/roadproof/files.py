@@ -164,13 +164,16 @@ def read_json(path: Path, file_format: str, version: int, error: type[RoadproofE
         content: Any = json.loads(path.read_text(encoding="utf-8"))
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}") from None
-    except ValueError as reason:
+    except (ValueError, RecursionError) as reason:
         raise error(f"{path} is not valid JSON ({reason})") from None
     if not isinstance(content, dict):
         raise error(f"{path} holds no JSON object, expected a {file_format} file")
     fields = cast("dict[str, Any]", content)
     if fields.get("format") != file_format:
         raise error(f"{path} has format {fields.get('format')!r}, expected {file_format!r}")
-    if not isinstance(fields.get("version"), int) or fields["version"] > version:
-        raise error(f"{path} has version {fields.get('version')!r}, this roadproof reads up to {version}; update it")
+    known = fields.get("version")
+    if not isinstance(known, int) or isinstance(known, bool) or known < 1:
+        raise error(f"{path} has version {known!r:.40}, expected a whole number from 1")
+    if known > version:
+        raise error(f"{path} has version {known!r:.40}, this roadproof reads up to {version}; update it")
     return fields

@@ -24,11 +24,13 @@ from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import PatternError
 from roadproof.files import read_json, write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.limits import MAX_FIGURES
 
 FORMAT = "roadproof-pattern"
 FORMAT_VERSION = 1
 
 _MIDDLE = CANVAS_SIZE_PX / 2
+_MOST_PX = 1e5
 _BOX_NAMES = ("x_px", "y_px", "width_px", "length_px", "rotation_deg")
 
 
@@ -207,6 +209,8 @@ def load_pattern(path: Path) -> Pattern:
     figures = content.get("figures")
     if not isinstance(figures, list) or not figures:
         raise PatternError(f"{path}: 'figures' is missing or empty, expected at least one figure")
+    if len(cast("list[Any]", figures)) > MAX_FIGURES:
+        raise PatternError(f"{path}: has {len(cast('list[Any]', figures))} figures, expected {MAX_FIGURES} at most")
     parsed = [_parse_figure(path, k, figure) for k, figure in enumerate(cast("list[Any]", figures))]
     shapes, boxes, colours = zip(*parsed, strict=True)
     return Pattern(tuple(shapes), torch.tensor(boxes), torch.tensor(colours))
@@ -240,11 +244,14 @@ def _parse_figure(path: Path, k: int, figure: Any) -> tuple[Shape, list[float], 
         shape = Shape(figure["shape"])
         box = [float(figure[name]) for name in _BOX_NAMES]
         rgb = [float(value) for value in figure["rgb"]]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         expected = ", ".join(("shape", *_BOX_NAMES, "rgb"))
         raise PatternError(f"{path}: figure {k} is not valid ({error!r}); expected {expected}") from None
     if len(rgb) != 3 or not np.isfinite([*box, *rgb]).all():
         raise PatternError(f"{path}: figure {k} has values that are not finite, or rgb is not three numbers")
+    # Far beyond the canvas a float32 could not tell where a figure is.
+    if max(map(abs, box)) > _MOST_PX:
+        raise PatternError(f"{path}: figure {k} has {max(box, key=abs):g}, expected at most {_MOST_PX:g} px or degrees")
     if min(rgb) < 0 or max(rgb) > 1 or box[2] <= 0 or box[3] <= 0:
         raise PatternError(f"{path}: figure {k} needs rgb in [0, 1] and a width and length above 0")
     return shape, box, rgb

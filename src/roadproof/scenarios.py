@@ -111,7 +111,7 @@ def load_scenarios(path: Path) -> tuple[Scenario, ...]:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ScenarioError(f"scenarios {path} cannot be read ({error.strerror}); check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ScenarioError(f"scenarios {path} is not valid TOML ({error})") from error
     entries = content.get("scenario")
     if not isinstance(entries, list) or not entries:
@@ -222,7 +222,9 @@ def _numbers(entry: object, keys: set[str], what: str) -> dict[str, float]:
 
 def _float(value: object, what: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScenarioError(f"{what} is {value!r}, expected a number")
+        raise ScenarioError(f"{what} is {value!r:.120}, expected a number")
+    if not abs(value) < 1e9:
+        raise ScenarioError(f"{what} is {value!r:.40}, expected a finite number below 1e9")
     return float(value)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.limits import MAX_FIGURES
 from roadproof.patterns import Pattern, boxes_from_published, published_from_boxes
 
 Family = Literal["published", "published-canvas-centre", "published-bo", "free"]
@@ -86,8 +87,8 @@ class SearchSpace:
     max_painted_share: float | None = None
 
     def __post_init__(self) -> None:
-        if self.figures < 1:
-            raise PatternError(f"number of figures is {self.figures}, expected 1 or more")
+        if not 1 <= self.figures <= MAX_FIGURES:
+            raise PatternError(f"number of figures is {self.figures}, expected 1 to {MAX_FIGURES}")
         if self.family != "free" and self.shape is not Shape.RECTANGLE:
             raise PatternError(f"the {self.family} family has rectangles only; use the free family for a {self.shape}")
         if not 0.0 <= self.albedo[0] < self.albedo[1] <= 1.0:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import MANY, MAX_SEED, ControllerSpec, Device, Figures, choice, number
+from roadproof.cli.options import ControllerSpec, Device, Figures, choice, number
 from roadproof.errors import RoadproofError
+from roadproof.limits import MANY, MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult, Schedule, ShownDrive

@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import (
-    CONTROLLERS,
-    MAX_PROCESSES,
-    Cars,
-    Pedestrians,
-    ScenarioFile,
-    WeatherName,
-    choice,
-    number,
-)
+from roadproof.cli.options import CONTROLLERS, Cars, Pedestrians, ScenarioFile, WeatherName, choice, number
+from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
     from roadproof.controllers import ControllerReport

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
-    MAX_SEED,
     ControllerSpec,
     Device,
     Figures,
@@ -24,6 +23,7 @@ from roadproof.cli.options import (
     number,
     weathers_of,
 )
+from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
-    MAX_SEED,
     Cars,
     Device,
     DriverSpec,
@@ -23,6 +22,7 @@ from roadproof.cli.options import (
     number,
 )
 from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
+from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     import numpy as np

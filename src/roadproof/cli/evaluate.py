@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
-    MAX_CROWD,
-    MAX_SEED,
     Device,
     DriverSpec,
     Processes,
@@ -23,6 +21,7 @@ from roadproof.cli.options import (
     weathers_of,
 )
 from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
+from roadproof.limits import MAX_CROWD, MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller

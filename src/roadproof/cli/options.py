@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 import typer
 
 from roadproof.errors import RoadproofError
+from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
@@ -40,11 +41,6 @@ def number(about: str, least: int | float, most: int | float, *, show_default: b
 
     return typer.Option(help=f"{about}  [{least:,} to {most:,}]", show_default=show_default, callback=check)
 
-
-MAX_SEED = 2**32 - 1
-MAX_PROCESSES = 256
-MAX_CROWD = 500
-MANY = 1_000_000
 
 CONTROLLERS = (
     "a shipped one (`roadproof controllers`), a .safetensors, .pt2 or .onnx file, cil:FILE, pilotnet:FILE or "
@@ -77,7 +73,7 @@ WorldSpec: TypeAlias = Annotated[
 ]
 Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
-Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, 64)]
+Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, MAX_FIGURES)]
 Cars: TypeAlias = Annotated[int, number("Other cars on the road.", 0, MAX_CROWD)]
 Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]
 Processes: TypeAlias = Annotated[int, number("Drives of the evaluation made at once.", 1, MAX_PROCESSES)]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
-    MAX_SEED,
     Device,
     DriverSpec,
     ScenarioFile,
@@ -18,6 +17,7 @@ from roadproof.cli.options import (
     driver_of,
     number,
 )
+from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.drives import Drives

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import MAX_PROCESSES, number
+from roadproof.cli.options import number
+from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
     from roadproof.study.plan import Job

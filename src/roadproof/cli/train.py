@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from roadproof.cli.options import MANY, MAX_PROCESSES, MAX_SEED, number
+from roadproof.cli.options import number
+from roadproof.limits import MANY, MAX_PROCESSES, MAX_SEED
 
 
 def train(

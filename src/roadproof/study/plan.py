@@ -53,6 +53,7 @@ from typing import Any, Literal, cast, get_args
 
 from roadproof.datatypes import Weather
 from roadproof.errors import StudyError
+from roadproof.limits import MANY, MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
 
@@ -118,8 +119,8 @@ class MethodPlan:
         _one_of(self.objective, "objective", MEASURES)
         _one_of(self.start, "start", ("", "gradopt"))
         for name in ("restarts", "iterations", "calls", "random_calls", "frames"):
-            _at_least(getattr(self, name), name, 1)
-        _at_least(self.select, "select", 0)
+            _within(getattr(self, name), name, 1, MANY)
+        _within(self.select, "select", 0, 1000)
         if self.search == "published-bo" and self.random_calls >= self.calls:
             raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         if self.start and (self.search == "gradopt" or not self.select):
@@ -151,10 +152,10 @@ class TrafficPlan:
 
     def __post_init__(self) -> None:
         for name in ("cars", "pedestrians"):
-            _at_least(getattr(self, name), name, 0)
+            _within(getattr(self, name), name, 0, MAX_CROWD)
         if not self.cars + self.pedestrians:
             raise StudyError("cars and pedestrians are 0; leave [traffic] out to drive alone")
-        _at_least(self.runs, "runs", 1)
+        _within(self.runs, "runs", 1, 10_000)
         _one_of(self.weathers, "weathers", ("all", "first"))
 
 
@@ -217,12 +218,15 @@ class Study:
             if not getattr(self, field):
                 raise StudyError(f"{field} is empty, expected at least one")
         for figures in self.figures:
-            if figures != BLACK and (not isinstance(figures, int) or isinstance(figures, bool) or figures < 1):
-                raise StudyError(f"figures has {figures!r}, expected numbers from 1, or {BLACK!r} for one black figure")
+            known = isinstance(figures, int) and not isinstance(figures, bool) and 1 <= figures <= MAX_FIGURES
+            if figures != BLACK and not known:
+                raise StudyError(
+                    f"figures has {figures!r}, expected 1 to {MAX_FIGURES}, or {BLACK!r} for one black figure"
+                )
         if self.simulator != "town" and not is_server(self.simulator):
             raise StudyError(f"simulator is {self.simulator!r}, expected {SPECS}")
         for seed in self.seeds:
-            _at_least(seed, "seeds", 0)
+            _within(seed, "seeds", 0, MAX_SEED)
         # What is asked for twice would be two jobs that write the same folder.
         named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": [m.name for m in self.methods]}
         for field in ("figures", "seeds", "weathers"):
@@ -262,7 +266,7 @@ def load_study(path: Path) -> Study:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise StudyError(f"cannot read {path}: {error.strerror or error}; check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise StudyError(f"{path} is not valid TOML ({error})") from None
     try:
         return _study(content, path.parent)
@@ -358,6 +362,6 @@ def _one_of(value: str, name: str, choices: Iterable[str]) -> None:
         raise StudyError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
-def _at_least(value: int, name: str, least: int) -> None:
-    if value < least:
-        raise StudyError(f"{name} is {value}, expected {least} or more")
+def _within(value: int, name: str, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise StudyError(f"{name} is {value}, expected {least} to {most}")
