@@ -17,7 +17,7 @@ PLAIN = (
     "7",
     "_own",
     "a b",
-    "map v1.2+x (new)",
+    "map v1.2+x (new) [2]",
     "x" * 100,
 )
 NOT_PLAIN = (

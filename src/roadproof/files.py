@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_MARKS = frozenset(" ._+-=,()")
+_MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
 _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
 
@@ -25,7 +25,7 @@ _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("c
 def is_plain_name(name: object) -> bool:
     """Whether a text can name a file or folder, and nothing else, on every system.
 
-    Letters, digits and " ._+-=,()", at most 100 of them; it begins with a letter, a digit or "_", does not end with "."
+    Letters, digits and " ._+-=,()[]", at most 100 of them; it begins with a letter, a digit or "_", does not end with "."
     or a blank, and is no device ("nul").
     """
     if not isinstance(name, str) or not 0 < len(name) <= _LONGEST_NAME:
@@ -48,7 +48,7 @@ def check_name(name: object, what: str, error: type[RoadproofError]) -> str:
     """
     if not is_plain_name(name):
         raise error(
-            f"{what} {name!r:.120} is not a plain name; expected letters, digits, blanks and ._+-=,() alone, beginning "
+            f"{what} {name!r:.120} is not a plain name; expected letters, digits, blanks and ._+-=,()[] alone, beginning "
             "with a letter or digit"
         )
     return str(name)
