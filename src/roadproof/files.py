@@ -25,8 +25,8 @@ _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("c
 def is_plain_name(name: object) -> bool:
     """Whether a text can name a file or folder, and nothing else, on every system.
 
-    Letters, digits and " ._+-=,()[]", at most 100 of them; it begins with a letter, a digit or "_", does not end with "."
-    or a blank, and is no device ("nul").
+    Letters, digits and " ._+-=,()[]", at most 100 of them; it begins with a letter, a digit or "_", does not end with
+    "." or a blank, and is no device ("nul").
     """
     if not isinstance(name, str) or not 0 < len(name) <= _LONGEST_NAME:
         return False
@@ -48,8 +48,8 @@ def check_name(name: object, what: str, error: type[RoadproofError]) -> str:
     """
     if not is_plain_name(name):
         raise error(
-            f"{what} {name!r:.120} is not a plain name; expected letters, digits, blanks and ._+-=,()[] alone, beginning "
-            "with a letter or digit"
+            f"{what} {name!r:.120} is not a plain name; expected letters, digits, blanks and ._+-=,()[] alone, "
+            "beginning with a letter or digit"
         )
     return str(name)
 
