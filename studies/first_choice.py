@@ -174,7 +174,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
         "rows": list(rows),
         "versions": versions,
     }
-    text = json.dumps(content | {"versions": versions}, indent=1) + "\n"
+    text = json.dumps(content, indent=1) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from roadproof.controllers import Controller
-from roadproof.datatypes import Control, Ending, Event, EventKind, Observation, VehicleState, Weather
+from roadproof.datatypes import Control, Ending, Event, Observation, VehicleState, Weather
 from roadproof.errors import ControllerError, EpisodeError, SimulatorError
 from roadproof.files import write_atomically
 from roadproof.patterns import Pattern, raster
@@ -163,10 +163,7 @@ class Episode:
                 ending=Ending(header["ending"]),
                 # Files that do not say it are older than the word, when the town alone was driven.
                 paint=PaintKind(header.get("paint", PaintKind.RENDERED)),
-                events=tuple(
-                    Event(EventKind(event["kind"]), float(event["time_s"]), str(event["detail"]))
-                    for event in header["events"]
-                ),
+                events=tuple(map(Event.of, header["events"])),
                 **arrays,
             )
         except (KeyError, TypeError, ValueError, SimulatorError) as error:

@@ -36,8 +36,6 @@ def select(
     from roadproof.files import check_writable
     from roadproof.patterns import save_pattern
 
-    if best < 1:
-        raise RoadproofError(f"--best is {best}, expected 1 or more")
     recorded = load_drives(run / "record").settings
     place = run / "attack"
     if not (place / "result.json").exists():

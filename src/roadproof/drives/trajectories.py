@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from itertools import islice
+from itertools import cycle, islice
 
 from roadproof.errors import RecordingError
 from roadproof.recordings import Push
@@ -116,14 +116,12 @@ class Trajectories:
     def plans(self) -> tuple[Plan, ...]:
         """The drives, the clean one first."""
         pushes = (Push.RANDOM,) if self.scheme is Scheme.RANDOM else (Push.RIGHT, Push.LEFT)
-        how = self.perturbation
-        sizes = [(size, False) for size in how.deviations_m] if isinstance(how, Swerve) else [(0.0, False)]
-        sizes += [(size, True) for size in how.weaves_m] if isinstance(how, Swerve) else []
-        rounds = -(-(self.count - 1) // len(pushes))
+        how, sizes = self.perturbation, [(0.0, False)]
+        if isinstance(how, Swerve):
+            sizes = [*((size, False) for size in how.deviations_m), *((size, True) for size in how.weaves_m)]
         perturbed = (
-            Plan(str(push) if k == 0 else f"{push}-{k + 1}", push, size, k + 1, weaves)
-            for k in range(rounds)
-            for size, weaves in sizes[k % len(sizes) :][:1]
+            Plan(str(push) if k == 1 else f"{push}-{k}", push, size, k, weaves)
+            for k, (size, weaves) in enumerate(cycle(sizes), 1)
             for push in pushes
         )
         return (Plan(str(Push.CLEAN), Push.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))

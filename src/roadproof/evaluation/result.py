@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from roadproof.datatypes import Ending, Event, EventKind, Weather
+from roadproof.datatypes import Ending, Event, Weather
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.files import check_name, read_json, write_atomically
 from roadproof.geometry import CanvasPlacement
@@ -354,11 +354,7 @@ def trial_from_json(stored: dict[str, Any]) -> Trial:
     for name in (stored["clean"], stored["painted"]):
         if not check_name(name, "episode", EpisodeError).endswith(".npz"):
             raise EpisodeError(f"episode {name!r} is not the name of an .npz file")
-    events = {
-        name: tuple(Event(EventKind(each["kind"]), float(each["time_s"]), str(each["detail"])) for each in stored[name])
-        for name in ("events", "clean_events")
-        if name in stored
-    }
+    events = {name: tuple(map(Event.of, stored[name])) for name in ("events", "clean_events") if name in stored}
     fields: dict[str, Any] = {**stored, **events, "weather": Weather(stored["weather"])}
     return Trial(**fields)
 

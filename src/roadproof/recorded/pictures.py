@@ -175,29 +175,30 @@ class FrameBank:
             poses: without a gradient.
             gap: from `nearest`.
         """
-        view_from_ground, source = self._sources(poses, gap)
+        input_from_ground, ground_from_input, source = self._sources(poses, gap)
         shown, beyond = self._sampled(gap, source)
         missed = (beyond.flatten(1).amax(1) > MISSED).nonzero()[:, 0]
         if len(missed):
             turned = poses.picked(missed)
             other = self.nearest(turned, LOOKING_THE_SAME_WAY)
-            second, further = self._sampled(other, self._sources(turned, other)[1])
+            second, further = self._sampled(other, self._sources(turned, other)[2])
             better = (beyond[missed] > 0) & (further < beyond[missed])
             shown = shown.index_copy(0, missed, torch.where(better[:, None], second, shown[missed]))
         frames = shown.round_().div_(255)
-        return Views(frames, self._canvas_views(frames, view_from_ground, source, gap))
+        return Views(frames, self._canvas_views(frames, input_from_ground, ground_from_input, source, gap))
 
-    def _sources(self, poses: Poses, gap: Gap) -> tuple[Float[Tensor, "r 3 3"], Float[Tensor, "r 2 n"]]:
-        """G' of each pose, and where in its frame every pixel comes from, px."""
+    def _sources(self, poses: Poses, gap: Gap) -> tuple[Tensor, Tensor, Float[Tensor, "r 2 n"]]:
+        """G' of each pose and its inverse, (R, 3, 3), and where in its frame every pixel comes from, px."""
         # The car has moved on the ground as a whole: the camera looks at it as it did from the recorded pose.
         recorded = self.input_from_ground[gap.frame]
-        wanted = recorded @ _ground_from_car(self.poses.picked(gap.frame)) @ _car_from_ground(poses)
-        below = recorded @ _inverse(wanted)
+        wanted = recorded @ _ground_from_car(self.poses.picked(gap.frame)) @ _inverse(_ground_from_car(poses))
+        ground_from_input = _inverse(wanted)
+        below = recorded @ ground_from_input
         c, s, o = torch.cos(gap.turned_rad), torch.sin(gap.turned_rad), torch.zeros_like(gap.turned_rad)
         turn = torch.stack([c, o, -s, o, o + 1, o, s, o, c], -1).view(-1, 3, 3)
         above = self._input_from_level @ turn @ self._level_from_input
         mapped = torch.cat([above.float() @ self._sky, below.float() @ self._ground], 2)
-        return wanted, mapped[:, :2] / mapped[:, 2:]
+        return wanted, ground_from_input, mapped[:, :2] / mapped[:, 2:]
 
     def _sampled(self, gap: Gap, source: Float[Tensor, "r 2 n"]) -> tuple[Float[Tensor, "r 3 h w"], Tensor]:
         """Frames looked up there, and how far each pixel lies beyond its frame, in halves of its size."""
@@ -208,14 +209,19 @@ class FrameBank:
         return shown, grid.abs().amax(-1) - 1
 
     def _canvas_views(
-        self, frames: Float[Tensor, "r 3 h w"], view_from_ground: Tensor, source: Float[Tensor, "r 2 n"], gap: Gap
+        self,
+        frames: Float[Tensor, "r 3 h w"],
+        input_from_ground: Float[Tensor, "r 3 3"],
+        ground_from_input: Float[Tensor, "r 3 3"],
+        source: Float[Tensor, "r 2 n"],
+        gap: Gap,
     ) -> OwnViews | None:
         """The canvas' pixels of each picture with the light on them; None where none shows the canvas."""
         width = self.view.width_px
-        rows = self._canvas_rows(view_from_ground)
+        rows = self._canvas_rows(input_from_ground)
         if rows is None:
             return None
-        canvas_from_input = (self._canvas_from_ground @ _inverse(view_from_ground)).float()
+        canvas_from_input = (self._canvas_from_ground @ ground_from_input).float()
         first = rows.start * width
         horizon = self.horizon_row * width
         mapped = canvas_from_input @ self._ground[:, first - horizon : rows.stop * width - horizon]
@@ -250,9 +256,9 @@ class FrameBank:
         clean = frames.flatten(2).gather(2, flat[:, None].expand(-1, 3, -1)).mT
         return OwnViews.of(flat, valid, footprints, clean, share * gain, share * (offset - clean), self.colour.response)
 
-    def _canvas_rows(self, view_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
+    def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
         """The rows between which every picture has its canvas; None where none has any."""
-        seen = view_from_ground @ self._corners
+        seen = input_from_ground @ self._corners
         ahead, row = seen[:, 2] > 0, seen[:, 1] / seen[:, 2]
         if not bool(ahead.any()):
             return None
@@ -284,13 +290,6 @@ def _ground_from_car(poses: Poses) -> Float[Tensor, "r 3 3"]:
     """The rigid motion from a car's own axes, ahead and left, to the ground."""
     c, s, o = torch.cos(poses.yaw_rad), torch.sin(poses.yaw_rad), torch.zeros_like(poses.yaw_rad)
     return torch.stack([c, -s, poses.x_m, s, c, poses.y_m, o, o, o + 1], -1).view(-1, 3, 3)
-
-
-def _car_from_ground(poses: Poses) -> Float[Tensor, "r 3 3"]:
-    """The same motion backwards."""
-    c, s, o = torch.cos(poses.yaw_rad), torch.sin(poses.yaw_rad), torch.zeros_like(poses.yaw_rad)
-    x, y = poses.x_m, poses.y_m
-    return torch.stack([c, s, -(c * x + s * y), -s, c, s * x - c * y, o, o, o + 1], -1).view(-1, 3, 3)
 
 
 def _ground_from_canvas(canvas: CanvasPlacement) -> Float[np.ndarray, "3 3"]:

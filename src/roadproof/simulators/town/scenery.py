@@ -39,11 +39,6 @@ class Solid:
     thing: str = ""
 
     @property
-    def middle(self) -> tuple[float, float]:
-        """World x, y."""
-        return self.pose.x_m, self.pose.y_m
-
-    @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
         """Its footprint, counter-clockwise."""
         a, b = self.half_m
@@ -88,7 +83,6 @@ class _Site:
     trees: list[Tree] = field(default_factory=list[Tree])
     solids: list[Solid] = field(default_factory=list[Solid])
     paved: list[np.ndarray] = field(default_factory=list[np.ndarray])
-    rails: list[Solid] = field(default_factory=list[Solid])
 
     def builder(self, texture: str) -> MeshBuilder:
         return self.builders.setdefault(texture, MeshBuilder())
@@ -186,11 +180,14 @@ def _rails(site: _Site, edge: _Edge) -> None:
             continue
         rail.box((-half, -0.05, 0.45), (half, 0.05, 0.80), pose, tile_m=(2.0, 0.35), faces="yYZ")
         post.box((-0.07, -0.14, 0.0), (0.07, -0.04, 0.76), pose, (0.42, 0.42, 0.41))
-        joined = (each for each in reversed(site.rails) if math.dist(each.middle, (pose.x_m, pose.y_m)) < _JOINED_M)
-        before = next(joined, None)
-        thing = before.thing if before else f"guard rail {len(site.solids)}"
+        # Nothing but rails stands there yet.
+        joined = (
+            each.thing
+            for each in reversed(site.solids)
+            if math.hypot(each.pose.x_m - pose.x_m, each.pose.y_m - pose.y_m) < _JOINED_M
+        )
+        thing = next(joined, f"guard rail {len(site.solids)}")
         site.solids.append(Solid("guard rail", pose, (half, 0.08), 0.80, thing=thing))
-        site.rails.append(site.solids[-1])
         reserved.append(edge_corners(pose.ahead(0.0, -3.0), half + 0.5, 3.4))
     for corners in reserved:
         site.take(corners)
