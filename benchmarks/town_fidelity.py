@@ -28,7 +28,7 @@ import roadproof
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Observation, Weather
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import (

@@ -36,7 +36,7 @@ from roadproof.compositing import composite, view_canvas
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives, Trajectories, Window, record
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.geometry import homography_from_pose
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import AffineResponse, ColourTransform

@@ -41,7 +41,7 @@ from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, evaluate, random_patterns
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.ledger import StageCost
 from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.metrics import mean_95

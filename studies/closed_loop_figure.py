@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.report.study.charts import COLOURS, MARKERS, MUTED, RULE
 
 WAYS = {

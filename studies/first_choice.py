@@ -33,7 +33,7 @@ from roadproof.attacks import Objective, PathDeviation, Schedule, SteeringShift,
 from roadproof.calibration import Calibrated, calibrate
 from roadproof.drives import Trajectories, record
 from roadproof.evaluation import evaluate, select_by_driving
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.loop import Budget
 from roadproof.memory import keep_freed_memory
 from roadproof.metrics import mean_95

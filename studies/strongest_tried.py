@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 
 
 def main() -> None:

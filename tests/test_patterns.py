@@ -184,6 +184,6 @@ def test_paint_is_read_from_a_pattern_or_from_a_picture(tmp_path):
 def test_what_cannot_be_painted_is_refused(tmp_path):
     Image.new("RGB", (400, 300)).save(tmp_path / "low.png")
     (tmp_path / "text.png").write_text("not a picture")
-    for name, message in (("low.png", "400×300 pixels"), ("text.png", "no picture"), ("none.png", "no pattern")):
+    for name, message in (("low.png", "400×300 pixels"), ("text.png", "cannot be read"), ("none.png", "is missing")):
         with pytest.raises(PatternError, match=message):
             read_paint(tmp_path / name)

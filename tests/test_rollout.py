@@ -190,12 +190,12 @@ def rewritten(path, change):
 
 
 DAMAGE = {
-    "has format 'other'": lambda header, _: header.update(format="other"),
-    "has version 9, this roadproof reads 1; update it": lambda header, _: header.update(version=9),
+    "is 'other' version 1, expected 'roadproof-episode' version 1": lambda header, _: header.update(format="other"),
+    "version 9, expected 'roadproof-episode' version 1": lambda header, _: header.update(version=9),
     "'ending' is missing": lambda header, _: header.pop("ending"),
     "'bored' is not a valid Ending": lambda header, _: header.update(ending="bored"),
     "weather 'dry' is unknown": lambda header, _: header.update(weather="dry"),
-    "brake is not a file": lambda _, content: content.pop("brake"),
+    "it has no brake": lambda _, content: content.pop("brake"),
     "x_m of the episode has NaN": lambda _, content: content.update(x_m=content["x_m"] * np.nan),
     "expected \\(40,\\) for 41 observations": lambda _, content: content.update(steer=content["steer"][1:]),
 }
@@ -211,16 +211,16 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, episode, message):
 
 
 def test_what_is_no_episode_is_refused(tmp_path, episode):
-    with pytest.raises(EpisodeError, match=r"no episode .*nowhere"):
+    with pytest.raises(EpisodeError, match="nowhere is missing; check the path"):
         Episode.load(tmp_path / "nowhere")
     path = tmp_path / "one.npz"
     episode.save(path)
     for content in (path.read_bytes()[:500], b"", b"text"):
         path.write_bytes(content)
-        with pytest.raises(EpisodeError, match="is damaged or no episode"):
+        with pytest.raises(EpisodeError, match="is damaged"):
             Episode.load(path)
     np.savez(path, x=np.zeros(3))
-    with pytest.raises(EpisodeError, match="is no episode: header"):
+    with pytest.raises(EpisodeError, match=r"is damaged \(it has no header\)"):
         Episode.load(path)
 
 

@@ -21,6 +21,7 @@ from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError
 
 CANVAS_SIZE_PX = 400
+_MOST_SCALE = 1e9
 
 Points = Float[np.ndarray, "*n 2"]
 Homography = Float[np.ndarray, "3 3"]
@@ -334,6 +335,9 @@ def check_image_from_canvas(image_from_canvas: Homography) -> None:
     """
     if not np.isfinite(image_from_canvas).all():
         raise GeometryError("homography has NaN or infinite entries")
+    largest = float(np.abs(image_from_canvas).max())
+    if not 1 / _MOST_SCALE < largest < _MOST_SCALE:
+        raise GeometryError(f"homography's largest entry is {largest:g}, no camera's; scale it to about 1")
     # Balanced first: pixels and the third row differ by orders of magnitude without any fault.
     scaled = image_from_canvas / np.maximum(np.abs(image_from_canvas).max(axis=1, keepdims=True), 1e-300)
     determinant = np.linalg.det(scaled / np.maximum(np.abs(scaled).max(axis=0, keepdims=True), 1e-300))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from roadproof.errors import RoadproofError
-from roadproof.files import read_json, write_atomically
+from roadproof.io.files import read_json, write_atomically
 
 FILE = "run.json"
 FORMAT = "roadproof-run"

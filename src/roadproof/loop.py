@@ -48,7 +48,7 @@ from roadproof.evaluation import (
     select_by_driving,
 )
 from roadproof.evaluation.episodes import load_episodes
-from roadproof.files import check_writable
+from roadproof.io.files import check_writable
 from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.patterns import Pattern, save_pattern

@@ -22,8 +22,9 @@ from torch import Tensor
 
 from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import PatternError
-from roadproof.files import read_json, write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.io.files import read_json, write_atomically
+from roadproof.io.pictures import read_picture
 from roadproof.limits import MAX_FIGURES
 
 FORMAT = "roadproof-pattern"
@@ -224,13 +225,8 @@ def read_paint(path: Path) -> UInt8[np.ndarray, "s s 4"]:
     """
     if path.suffix == ".json":
         return raster(load_pattern(path))
-    try:
-        with Image.open(path) as picture:
-            paint = np.array(picture.convert("RGBA"))
-    except FileNotFoundError:
-        raise PatternError(f"no pattern {path}; check the path") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise PatternError(f"{path} is no pattern (.json) and no picture ({error})") from None
+    remedy = "give a pattern (.json), or a picture (.png, .jpg)"
+    paint = read_picture(path, PatternError, remedy, mode="RGBA")
     if paint.shape[:2] != (CANVAS_SIZE_PX, CANVAS_SIZE_PX):
         raise PatternError(
             f"{path} has {paint.shape[1]}×{paint.shape[0]} pixels, expected the canvas' "

@@ -13,8 +13,6 @@ Nothing is pickled, and no path in a file leaves the folder.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
@@ -26,11 +24,14 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
+from roadproof.datatypes import Command
 from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
-from roadproof.files import check_name, inside, read_json, write_folder_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
+from roadproof.io.arrays import read_archive, read_array, write_archive
+from roadproof.io.files import check_name, inside, read_json, write_folder_atomically
+from roadproof.io.pictures import read_picture
 from roadproof.photometry import ColourTransform, PixelMaps, Response
-from roadproof.tracks import Track
+from roadproof.tracks import FASTEST_MPS, Track
 
 FORMAT = "roadproof-recordings"
 FORMAT_VERSION = 1
@@ -46,6 +47,7 @@ _UNITS = {
 }
 _PER_FRAME = ("frame_number", "image_from_canvas", "speed_mps", "command", "steer")
 _TRACK = tuple(field.name for field in fields(Track))
+_AGAIN = "record or copy it again"
 _MOST_TRACK_BYTES = 2**26
 """A day at 10 steps a second: a track.npz that unpacks to more was not written by roadproof."""
 
@@ -69,15 +71,15 @@ class Recording:
         frames: the controller's input without any paint, (F, H, W, 3).
         frame_number: of each frame in the drive, rising.
         image_from_canvas: one homography a frame, canvas px to camera px.
-        speed_mps: m/s.
+        speed_mps: m/s, from −1 (rolling back) to `FASTEST_MPS`.
         command: CARLA's codes (`datatypes.Command`).
-        steer: what the recorded controller answered to each frame; for information.
+        steer: what the recorded controller answered to each frame, in [−1, 1]; for information.
         maps: per-pixel gain and offset of the paint, where they were calibrated; to the response of the set's colour.
         track: poses and controls of the whole drive, where they are known; its steps are numbered as the frames are.
 
     Raises:
-        RecordingError: a frame has no pose in the track, lengths differ, a value is not finite, or a homography is not
-            a view of the canvas.
+        RecordingError: a frame has no pose in the track, lengths differ, a value is not finite or outside its range,
+            or a homography is not a view of the canvas.
     """
 
     name: str
@@ -107,6 +109,7 @@ class Recording:
             if bad.size:
                 number = self.frame_number[bad[0]]
                 raise RecordingError(f"drive {self.name}: {field} of frame {number} is NaN or infinite; drop the frame")
+        self._check_ranges()
         for number, homography in zip(self.frame_number, self.image_from_canvas, strict=True):
             try:
                 check_image_from_canvas(homography)
@@ -117,6 +120,21 @@ class Recording:
                 self.track.rows(self.frame_number)
             except RecordingError as error:
                 raise RecordingError(f"drive {self.name}: {error}") from None
+
+    def _check_ranges(self) -> None:
+        if self.frame_number[0] < 0 or (np.diff(self.frame_number.astype(np.int64)) < 1).any():
+            raise RecordingError(f"drive {self.name}: frame numbers do not rise from 0; order its frames, each once")
+        known = [int(command) for command in Command]
+        for field, fits, expected in (
+            ("command", np.isin(self.command, known), f"one of {', '.join(map(str, known))} ({_UNITS['command']})"),
+            ("speed_mps", (self.speed_mps >= -1) & (self.speed_mps <= FASTEST_MPS), f"−1 to {FASTEST_MPS:g} m/s"),
+            ("steer", np.abs(self.steer) <= 1, "−1 to 1"),
+        ):
+            for row in np.flatnonzero(~fits)[:1]:
+                value, number = getattr(self, field)[row], self.frame_number[row]
+                raise RecordingError(
+                    f"drive {self.name}: {field} of frame {number} is {value}, expected {expected}; drop the frame"
+                )
 
     def thinned(self, every: int) -> Recording:
         """Every n-th frame, counted back from the last one, which shows the canvas largest; the track stays whole."""
@@ -241,13 +259,14 @@ def _manifest(recordings: RecordingSet) -> dict[str, Any]:
 def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
     folder.mkdir()
     per_frame: dict[str, Any] = {field: getattr(recording, field) for field in _PER_FRAME}
-    np.savez_compressed(folder / "drive.npz", **per_frame)
+    write_archive(folder / "drive.npz", per_frame)
     if recording.track is not None:
-        np.savez_compressed(folder / "track.npz", **asdict(recording.track))
+        write_archive(folder / "track.npz", asdict(recording.track))
     if recording.maps is not None:
         maps = recording.maps
-        np.savez_compressed(
-            folder / "shading.npz", gain=maps.gain.numpy(), offset=maps.offset.numpy(), visible=maps.visible.numpy()
+        write_archive(
+            folder / "shading.npz",
+            {"gain": maps.gain.numpy(), "offset": maps.offset.numpy(), "visible": maps.visible.numpy()},
         )
     if compact:
         np.save(folder / "frames.npy", recording.frames, allow_pickle=False)
@@ -268,6 +287,11 @@ def load_recordings(folder: Path) -> RecordingSet:
     if not (folder / "recordings.json").is_file():
         raise RecordingError(f"{folder} has no recordings.json; expected a set of recordings made by roadproof")
     manifest = read_json(folder / "recordings.json", FORMAT, FORMAT_VERSION, RecordingError)
+    size = manifest.get("canvas_px", CANVAS_SIZE_PX)
+    if size != CANVAS_SIZE_PX:
+        raise RecordingError(
+            f"{folder / 'recordings.json'}: canvas_px is {size!r:.60}, expected {CANVAS_SIZE_PX}; scale homographies"
+        )
     try:
         colour = ColourTransform.from_dict(manifest["colour"])
         return RecordingSet(
@@ -307,7 +331,10 @@ def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Record
         push = Push(drive["push"])
     except ValueError:
         raise RecordingError(f"drive {name} has push {drive['push']!r}, expected one of {', '.join(Push)}") from None
-    stored = _read_arrays(folder / "drive.npz", _PER_FRAME)
+    stored = read_archive(folder / "drive.npz", _PER_FRAME, RecordingError, _AGAIN)
+    for field in ("frame_number", "command"):
+        if stored[field].dtype.kind not in "iu":
+            raise RecordingError(f"drive {name}: {field} is of type {stored[field].dtype}, expected whole numbers")
     return Recording(
         name=name,
         push=push,
@@ -325,7 +352,7 @@ def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Record
 def _read_track(path: Path, frame_number: np.ndarray) -> Track | None:
     if not path.exists():
         return None
-    stored = _read_arrays(path, _TRACK, most_bytes=_MOST_TRACK_BYTES)
+    stored = read_archive(path, _TRACK, RecordingError, _AGAIN, most_bytes=_MOST_TRACK_BYTES)
     dt_s, step = stored.pop("dt_s"), stored.pop("step")
     if dt_s.shape != () or step.dtype.kind not in "iu":
         raise RecordingError(
@@ -343,60 +370,24 @@ def _read_track(path: Path, frame_number: np.ndarray) -> Track | None:
 def _read_maps(path: Path, response: Response) -> PixelMaps | None:
     if not path.exists():
         return None
-    gain, offset, visible = _read_arrays(path, ("gain", "offset", "visible")).values()
+    gain, offset, visible = read_archive(path, ("gain", "offset", "visible"), RecordingError, _AGAIN).values()
     try:
         return PixelMaps(torch.tensor(gain), torch.tensor(offset), torch.tensor(visible), response)
     except ColourError as error:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _read_arrays(path: Path, names: tuple[str, ...], *, most_bytes: int | None = None) -> dict[str, np.ndarray]:
-    """Arrays of numbers by name; an archive that would unpack to more than `most_bytes` is not unpacked."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-        if most_bytes is not None and unpacked > most_bytes:
-            raise RecordingError(f"{path} unpacks to {unpacked} bytes, expected at most {most_bytes}; write it again")
-        # Opened here, since numpy leaves the file of a damaged archive open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays: dict[str, np.ndarray] = {name: stored[name] for name in names}
-    except FileNotFoundError:
-        raise RecordingError(f"{path} is missing") from None
-    except KeyError as error:
-        raise RecordingError(f"{path}: {error.args[0]}") from None
-    except RecordingError:
-        raise
-    except (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise RecordingError(f"{path} is damaged ({error}); record or copy it again") from None
-    for name, array in arrays.items():
-        if array.dtype.kind not in "biuf":
-            raise RecordingError(f"{path}: {name} is of type {array.dtype}, expected numbers")
-    return arrays
-
-
 def _read_frames(folder: Path, numbers: np.ndarray) -> UInt8[np.ndarray, "f h w 3"]:
     if (folder / "frames.npy").exists():
-        try:
-            frames = cast("np.ndarray", np.load(folder / "frames.npy", allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
-            raise RecordingError(f"{folder / 'frames.npy'} is damaged ({error}); record or copy it again") from None
+        frames = read_array(folder / "frames.npy", RecordingError, _AGAIN)
         if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[-1] != 3:
             raise RecordingError(
                 f"{folder / 'frames.npy'} is {frames.dtype} of shape {frames.shape}, expected uint8 (frames, h, w, 3)"
             )
         return frames
-    frames = [_read_frame(folder / "frames" / f"{number}.png") for number in numbers]
+    pictures = (folder / "frames" / f"{number}.png" for number in numbers)
+    frames = [read_picture(path, RecordingError, _AGAIN) for path in pictures]
     sizes = {frame.shape[1::-1] for frame in frames}
     if len(sizes) > 1:
         raise RecordingError(f"{folder / 'frames'} has pictures of different sizes: {sorted(sizes)}")
     return np.stack(frames)
-
-
-def _read_frame(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    try:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("RGB"))
-    except FileNotFoundError:
-        raise RecordingError(f"frame {path} is missing; every frame number of drive.npz needs its PNG") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise RecordingError(f"frame {path} cannot be read ({error}); record or copy it again") from None

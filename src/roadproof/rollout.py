@@ -8,8 +8,6 @@ An episode is one file that explains itself: a NumPy archive of named arrays and
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from itertools import chain
@@ -22,7 +20,7 @@ from jaxtyping import Float, Int
 from roadproof.controllers import Controller
 from roadproof.datatypes import Control, Ending, Event, Observation, VehicleState, Weather
 from roadproof.errors import ControllerError, EpisodeError, SimulatorError
-from roadproof.files import write_atomically
+from roadproof.io.arrays import read_record, write_archive
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PaintKind, PatternImage, Pictures, Simulator
@@ -128,14 +126,7 @@ class Episode:
         header: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION}
         header |= {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _SEEN + _GIVEN}
         header |= {"events": [asdict(event) for event in self.events], "units": _UNITS}
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in (*_SEEN, *_GIVEN)}
-
-        def write(part: Path) -> None:
-            # To an open file, since numpy would put an ending of its own after another name.
-            with part.open("wb") as file:
-                np.savez_compressed(file, header=np.array(json.dumps(header, ensure_ascii=False)), **arrays)
-
-        write_atomically(path, write)
+        write_archive(path, {name: getattr(self, name) for name in (*_SEEN, *_GIVEN)}, header)
 
     @classmethod
     def load(cls, path: Path) -> Episode:
@@ -144,13 +135,9 @@ class Episode:
         Raises:
             EpisodeError: the file is missing, damaged, no episode, or of a newer version.
         """
-        header, arrays = _read(path)
-        if header.get("format") != FORMAT:
-            raise EpisodeError(f"{path} has format {header.get('format')!r}, expected {FORMAT!r}")
-        if header.get("version") != FORMAT_VERSION:
-            raise EpisodeError(
-                f"{path} has version {header.get('version')!r}, this roadproof reads {FORMAT_VERSION}; update it"
-            )
+        remedy, known = "check the path, or drive it again", (FORMAT, FORMAT_VERSION)
+        header, stored = read_record(path, (*_SEEN, *_GIVEN), EpisodeError, remedy, format_version=known)
+        arrays = {name: values.astype(np.int64 if name == "command" else np.float64) for name, values in stored.items()}
         try:
             return cls(
                 scenario=str(header["scenario"]),
@@ -289,19 +276,3 @@ def _check_size(controller: Controller, simulator: Simulator) -> None:
 
 def _row(seen: Observation) -> tuple[float, ...]:
     return seen.time_s, *(float(getattr(seen.state, name)) for name in _SEEN[1:-1]), float(seen.command)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Header and arrays of an episode file."""
-    try:
-        # Opened here, since numpy leaves the file of a damaged archive open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            header = json.loads(str(stored["header"]))
-            numbers = {name: np.asarray(stored[name], np.float64) for name in (*_SEEN, *_GIVEN)}
-            return dict(header), numbers | {"command": np.asarray(stored["command"], np.int64)}
-    except FileNotFoundError:
-        raise EpisodeError(f"no episode {path}; check the path") from None
-    except KeyError as error:
-        raise EpisodeError(f"{path} is no episode: {error.args[0]}") from None
-    except (OSError, ValueError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        raise EpisodeError(f"{path} is damaged or no episode ({error}); drive it again") from None

@@ -20,8 +20,8 @@ from typing import Any, Literal, cast, get_args
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
-from roadproof.files import check_name, inside
 from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import check_name, inside
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -63,5 +63,5 @@ def test_perturbed_drives_show_how_fast_the_wheels_turn(run):
 
 def test_a_damaged_prediction_is_one_clear_line(tmp_path):
     (tmp_path / "prediction.npz").write_bytes(b"no archive")
-    with pytest.raises(EpisodeError, match="missing or damaged"):
+    with pytest.raises(EpisodeError, match="is damaged"):
         Prediction.load(tmp_path / "prediction.npz")

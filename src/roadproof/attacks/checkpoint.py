@@ -10,7 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from roadproof.files import write_tensors
+from roadproof.io.files import write_tensors
 
 
 def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None:

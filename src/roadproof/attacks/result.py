@@ -14,7 +14,7 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.gradopt import Heat, Schedule
 from roadproof.coverage import Shape
 from roadproof.errors import RoadproofError
-from roadproof.files import read_json, write_atomically
+from roadproof.io.files import read_json, write_atomically
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,8 @@ from jaxtyping import Float, UInt8
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
-from roadproof.files import write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.io.arrays import read_record, write_archive
 from roadproof.rollout import replay, rollout
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -88,9 +87,9 @@ class Replays:
         digest = _digest(self._drives, drive, paint)
         kept = None if path is None else _read(path, digest)
         if kept is None:
-            kept = self._drive_again(drive, paint, see, full_pictures) | {"of": np.array(digest)}
+            kept = self._drive_again(drive, paint, see, full_pictures)
             if path is not None:
-                _write(path, kept)
+                write_archive(path, kept, {"of": digest})
         self.calls += 1
         self.seconds += float(kept["seconds"])
         self._stated[drive.name] = kept["stated"]
@@ -158,19 +157,10 @@ def _digest(drives: Drives, drive: Drive, paint: PatternImage) -> str:
 
 def _read(path: Path, digest: str) -> dict[str, Any] | None:
     """What a replay saw; None where there is none that can be used."""
+    names = ("seen", "stated", "seconds")
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            if str(stored["of"]) != digest:
-                return None
-            return {name: np.asarray(stored[name]) for name in ("seen", "stated", "seconds")}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError):
+        of, arrays = read_record(path, names, CalibrationError, "drive it again")
+    except CalibrationError:
         # Driving it again costs seconds and mends whatever it was.
         return None
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    def write(part: Path) -> None:
-        with part.open("wb") as file:
-            np.savez_compressed(file, **content)
-
-    write_atomically(path, write)
+    return arrays if of == {"of": digest} else None

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
-from roadproof.files import read_json, write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
+from roadproof.io.files import read_json, write_atomically
 
 FORMAT = "roadproof-calibration"
 FORMAT_VERSION = 1

@@ -74,7 +74,7 @@ def attack(
     from roadproof.controllers import load_controller
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
-    from roadproof.files import check_writable
+    from roadproof.io.files import check_writable
     from roadproof.objectives import parse_groups
     from roadproof.recordings import Push, load_recordings
     from roadproof.search_space import FAMILIES, SearchSpace

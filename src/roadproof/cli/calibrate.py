@@ -36,7 +36,7 @@ def calibrate(
     from roadproof.cli.progress import progress
     from roadproof.drives import load_drives
     from roadproof.errors import CalibrationError, RecordingError
-    from roadproof.files import check_writable
+    from roadproof.io.files import check_writable
     from roadproof.simulators.loading import open_simulator
 
     how = choice(method, "method", METHODS)

@@ -62,7 +62,7 @@ def demo(
     from roadproof.attacks import OBJECTIVES
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
-    from roadproof.files import write_atomically
+    from roadproof.io.files import write_atomically
     from roadproof.loop import BUDGETS, stress_test
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace

@@ -63,7 +63,7 @@ def drive(
     """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.datatypes import Weather
-    from roadproof.files import check_writable
+    from roadproof.io.files import check_writable
     from roadproof.patterns import read_paint
     from roadproof.rollout import rollout
 

@@ -77,7 +77,7 @@ def evaluate(
     from roadproof.errors import PatternError
     from roadproof.evaluation import PAPER_WEATHERS, random_patterns
     from roadproof.evaluation import evaluate as run
-    from roadproof.files import check_writable
+    from roadproof.io.files import check_writable
     from roadproof.patterns import load_pattern, read_paint
     from roadproof.recordings import load_recordings
 

@@ -75,7 +75,7 @@ def record(
     from roadproof.drives import Scheme, Trajectories
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError, ScenarioError
-    from roadproof.files import check_writable, inside
+    from roadproof.io.files import check_writable, inside
     from roadproof.loop import PAPER, QUICK
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator

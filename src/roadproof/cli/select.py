@@ -33,7 +33,7 @@ def select(
     from roadproof.drives import load_drives
     from roadproof.errors import RoadproofError
     from roadproof.evaluation import select_by_driving
-    from roadproof.files import check_writable
+    from roadproof.io.files import check_writable
     from roadproof.patterns import save_pattern
 
     recorded = load_drives(run / "record").settings

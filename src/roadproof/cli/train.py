@@ -38,7 +38,7 @@ def train(
     from rich.console import Console
 
     from roadproof.cli.progress import stages
-    from roadproof.files import check_writable
+    from roadproof.io.files import check_writable
     from roadproof.training.recipe import Recipe, follow, gather
 
     recipe = Recipe(

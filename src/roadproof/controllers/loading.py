@@ -23,7 +23,7 @@ from roadproof.controllers.protocol import Controller
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.steering import CruiseControl, SteeringController
 from roadproof.errors import ControllerError, DeviceError
-from roadproof.files import write_tensors
+from roadproof.io.files import write_tensors
 
 ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}

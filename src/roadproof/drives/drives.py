@@ -10,7 +10,6 @@ A drive's folder is there when the drive is finished. Nothing is pickled.
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,9 @@ from jaxtyping import Float, Int, UInt8
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.errors import RecordingError, RoadproofError
-from roadproof.files import read_json, write_atomically, write_folder_atomically
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
+from roadproof.io.arrays import read_record, write_archive
+from roadproof.io.files import read_json, write_atomically, write_folder_atomically
 from roadproof.recordings import Push
 from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario
@@ -30,6 +30,7 @@ from roadproof.tracks import Track
 
 FORMAT = "roadproof-record"
 FORMAT_VERSION = 1
+_ABOUT = "about"
 _PER_FRAME = ("frame_number", "frames", "steer", "right_m")
 
 
@@ -173,7 +174,7 @@ def write_drive(drive: Drive, folder: Path) -> None:
         drive.episode.save(part / "episode.npz")
         about = {"push": str(drive.push), "calls": drive.calls, "note": drive.note}
         arrays: dict[str, Any] = {name: getattr(drive, name) for name in _PER_FRAME}
-        np.savez_compressed(part / "drive.npz", about=np.array(json.dumps(about)), **arrays)
+        write_archive(part / "drive.npz", arrays | {_ABOUT: np.array(json.dumps(about))})
 
     write_folder_atomically(folder / drive.name, write)
 
@@ -188,11 +189,10 @@ def read_drive(name: str, folder: Path) -> Drive | None:
     path = folder / name / "drive.npz"
     if not path.parent.is_dir():
         return None
+    remedy = f"remove {path.parent} and record it again"
+    about, stored = read_record(path, _PER_FRAME, RecordingError, remedy, header=_ABOUT)
+    arrays: dict[str, Any] = stored
     try:
-        # Opened here, since numpy leaves the file of a damaged archive open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays: dict[str, Any] = {name: np.asarray(stored[name]) for name in _PER_FRAME}
-            about = json.loads(str(stored["about"]))
         drive = Drive(
             name=name,
             push=Push(about["push"]),
@@ -201,10 +201,8 @@ def read_drive(name: str, folder: Path) -> Drive | None:
             note=str(about["note"]),
             **arrays,
         )
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        if isinstance(error, RoadproofError):
-            raise
-        raise RecordingError(f"{path} is damaged ({error}); remove {path.parent} and record it again") from None
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(f"{path} is damaged ({error}); {remedy}") from None
     steps = len(drive.episode)
     counts = {len(values) for values in (drive.frame_number, drive.frames, drive.steer, drive.right_m)}
     if counts != {len(drive.frames)} or not len(drive.frames) or int(drive.frame_number.max()) >= steps:

@@ -22,7 +22,7 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError
 from roadproof.evaluation.result import Trial, judge
-from roadproof.files import inside
+from roadproof.io.files import inside
 from roadproof.rollout import Driver, Episode, rollout
 from roadproof.scenarios import Scenario, identity
 from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +14,7 @@ from roadproof.compositing import composite, view_canvas
 from roadproof.controllers import Controller
 from roadproof.datatypes import Control, Observation
 from roadproof.errors import EpisodeError, RecordingError
-from roadproof.files import write_atomically
+from roadproof.io.arrays import read_record, write_archive
 from roadproof.metrics import Agreement, agreement
 from roadproof.objectives import Direction, Group
 from roadproof.patterns import Pattern
@@ -65,13 +62,7 @@ class Fidelity:
             OutputError: it cannot be written.
         """
         header = {"format": FORMAT, "version": FORMAT_VERSION, "drive": self.drive, "agreement": asdict(self.agreement)}
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
-
-        def write(part: Path) -> None:
-            with part.open("wb") as file:
-                np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
-
-        write_atomically(path, write)
+        write_archive(path, {name: getattr(self, name) for name in _ARRAYS}, header)
 
     @staticmethod
     def load(path: Path) -> Fidelity:
@@ -80,15 +71,13 @@ class Fidelity:
         Raises:
             EpisodeError: the file is missing, damaged or of another format.
         """
+        header, arrays = read_record(
+            path, _ARRAYS, EpisodeError, "evaluate again", format_version=(FORMAT, FORMAT_VERSION)
+        )
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                header = json.loads(str(stored["header"]))
-                arrays: dict[str, Any] = {name: np.asarray(stored[name]) for name in _ARRAYS}
-            if header["format"] != FORMAT or header["version"] != FORMAT_VERSION:
-                raise ValueError(f"format {header['format']!r}, version {header['version']!r}")
             return Fidelity(drive=str(header["drive"]), agreement=Agreement(**header["agreement"]), **arrays)
-        except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            raise EpisodeError(f"{path} is missing or damaged ({error}); evaluate again") from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise EpisodeError(f"{path} is incomplete ({error!r}); evaluate again") from None
 
 
 def compare_with_rendered(

@@ -24,8 +24,8 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Observation, Weather
 from roadproof.errors import RoadproofError
 from roadproof.evaluation.result import passage_deviation_m, path_of
-from roadproof.files import read_json, write_atomically
 from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import read_json, write_atomically
 from roadproof.metrics import passage
 from roadproof.patterns import Pattern, raster
 from roadproof.rollout import Driver, Episode, rollout

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +12,8 @@ from jaxtyping import Float
 
 from roadproof.controllers import Controller
 from roadproof.errors import EpisodeError
-from roadproof.evaluation.result import passage_deviation_m, path_of
-from roadproof.files import write_atomically
+from roadproof.evaluation.result import deviation_m, passage_deviation_m, path_of
+from roadproof.io.arrays import read_record, write_archive
 from roadproof.metrics import deviation_m, passage
 from roadproof.patterns import Pattern
 from roadproof.recorded.world import RecordedWorld
@@ -64,13 +62,7 @@ class Prediction:
         """
         header: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION}
         header |= {name: getattr(self, name) for name in self.__slots__ if name not in _PATHS}
-        paths: dict[str, Any] = {name: getattr(self, name) for name in _PATHS}
-
-        def write(part: Path) -> None:
-            with part.open("wb") as file:
-                np.savez_compressed(file, header=np.array(json.dumps(header)), **paths)
-
-        write_atomically(path, write)
+        write_archive(path, {name: getattr(self, name) for name in _PATHS}, header)
 
     @staticmethod
     def load(path: Path) -> Prediction:
@@ -79,15 +71,15 @@ class Prediction:
         Raises:
             EpisodeError: the file is missing, damaged or of another format.
         """
+        header, paths = read_record(
+            path, _PATHS, EpisodeError, "remove it to predict again", format_version=(FORMAT, FORMAT_VERSION)
+        )
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                header: dict[str, Any] = json.loads(str(stored["header"]))
-                paths: dict[str, Any] = {name: np.asarray(stored[name], np.float64) for name in _PATHS}
-            if (header.pop("format"), header.pop("version")) != (FORMAT, FORMAT_VERSION):
-                raise ValueError("another format or version")
-            return Prediction(**{name: float(value) for name, value in header.items()}, **paths)
-        except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            raise EpisodeError(f"{path} is missing or damaged ({error}); remove it to predict again") from None
+            told: dict[str, Any] = {name: float(header[name]) for name in Prediction.__slots__ if name not in _PATHS}
+            told |= {name: paths[name].astype(np.float64) for name in _PATHS}
+            return Prediction(**told)
+        except (KeyError, TypeError, ValueError) as error:
+            raise EpisodeError(f"{path} is incomplete ({error!r}); remove it to predict again") from None
 
 
 def predict(

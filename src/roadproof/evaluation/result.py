@@ -26,8 +26,8 @@ from PIL import Image
 
 from roadproof.datatypes import Ending, Event, Weather
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.files import check_name, read_json, write_atomically
 from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import check_name, read_json, write_atomically
 from roadproof.metrics import (
     HORIZON_M,
     Mean,

@@ -18,7 +18,7 @@ from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError
 from roadproof.evaluation.episodes import CLEAN, Conditions, Episodes
 from roadproof.evaluation.result import Trial, trial_from_json
-from roadproof.files import read_json, write_atomically
+from roadproof.io.files import read_json, write_atomically
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario

@@ -24,7 +24,7 @@ from torch import Tensor
 from roadproof.compositing.raster import composite_raster
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
-from roadproof.files import is_plain_name
+from roadproof.io.files import is_plain_name
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, Homography, homography_from_pose
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle

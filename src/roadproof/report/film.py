@@ -17,7 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from roadproof.datatypes import Control, Observation
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.result import Evaluation, path_of
-from roadproof.files import write_atomically
+from roadproof.io.arrays import write_archive
+from roadproof.io.files import write_atomically
 from roadproof.metrics import lateral_m, passage
 from roadproof.report.words import in_words
 from roadproof.rollout import Episode, replay, rollout
@@ -60,13 +61,7 @@ class Strip:
         Raises:
             OutputError: it cannot be written.
         """
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in self.__slots__}
-
-        def write(part: Path) -> None:
-            with part.open("wb") as file:
-                np.savez_compressed(file, **arrays)
-
-        write_atomically(path, write)
+        write_archive(path, {name: getattr(self, name) for name in self.__slots__})
 
 
 def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage, folder: Path) -> bool:

@@ -15,7 +15,7 @@ from PIL import Image
 
 import roadproof
 from roadproof.calibration.report import Spread
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.ledger import StageCost
 from roadproof.metrics import counted
 from roadproof.patterns import Pattern, raster

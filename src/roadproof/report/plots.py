@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 
 _SIDES = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
 _INK = "#222222"

@@ -14,12 +14,9 @@ RUN/commands.txt               optional: the commands that made it, one a line
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from itertools import chain, count, takewhile
 from pathlib import Path
-
-import numpy as np
 
 from roadproof.attacks import AttackResult
 from roadproof.calibration.report import CalibrationReport, load_report
@@ -29,6 +26,7 @@ from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Prediction, Selection, Trial
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.result import load_paint
+from roadproof.io.arrays import read_archive
 from roadproof.ledger import StageCost, read_cost
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.recordings import RecordingSet, load_recordings
@@ -174,8 +172,4 @@ def _bytes(path: Path) -> bytes | None:
 def _strip(path: Path) -> Strip | None:
     if not path.exists():
         return None
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            return Strip(**{name: np.asarray(stored[name]) for name in Strip.__slots__})
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise EpisodeError(f"{path} is damaged ({error}); evaluate again") from None
+    return Strip(**read_archive(path, Strip.__slots__, EpisodeError, "evaluate again"))

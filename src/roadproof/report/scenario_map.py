@@ -17,8 +17,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from roadproof.errors import OutputError, ScenarioError
-from roadproof.files import write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.io.files import write_atomically
 from roadproof.scenarios import Scenario
 from roadproof.simulators.town.maps import scenario_route
 from roadproof.simulators.town.roadmap import RoadMap

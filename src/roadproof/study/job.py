@@ -32,7 +32,6 @@ All numbers of a row but the costs are of driving. Files beside the rows:
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -54,6 +53,7 @@ from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.objective import Measure
 from roadproof.evaluation.result import Trial, path_of
 from roadproof.evaluation.selection import first_of_each_group
+from roadproof.io.arrays import packed
 from roadproof.loop import Budget, StressTest, stress_test
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.search_space import SearchSpace
@@ -346,9 +346,7 @@ def _evaluate(
 def _paths(evaluation: Evaluation, folder: Path) -> bytes:
     trial = evaluation.shown()
     clean, painted = load_episodes(folder, [trial.clean, trial.painted])
-    packed = io.BytesIO()
-    np.savez_compressed(packed, clean_xy=path_of(clean), painted_xy=path_of(painted))
-    return packed.getvalue()
+    return packed({"clean_xy": path_of(clean), "painted_xy": path_of(painted)})
 
 
 def _json(content: object) -> bytes:

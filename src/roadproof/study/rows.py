@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from roadproof.errors import StudyError
-from roadproof.files import read_json, write_atomically
+from roadproof.io.files import read_json, write_atomically
 from roadproof.study.plan import Job
 
 if TYPE_CHECKING:

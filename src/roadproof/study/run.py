@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from roadproof.errors import RoadproofError, StudyError
-from roadproof.files import check_writable
+from roadproof.io.files import check_writable
 from roadproof.memory import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server

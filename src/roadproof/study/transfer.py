@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from roadproof.controllers import Controller, load_controller
 from roadproof.errors import ScenarioError, StudyError
 from roadproof.evaluation import evaluate
-from roadproof.files import inside, write_atomically
+from roadproof.io.files import inside, write_atomically
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator

@@ -24,7 +24,7 @@ from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.controllers.precision import multiplies_bfloat16
 from roadproof.controllers.weights import seeded
 from roadproof.errors import TrainingError
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.training.augmentation import Augmentation
 from roadproof.training.dataset import Batch, Dataset
 from roadproof.training.pasting import PastedPaint

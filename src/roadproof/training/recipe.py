@@ -28,7 +28,7 @@ from roadproof.controllers import CIL, ConditionalPilotNet, save_controller
 from roadproof.controllers.loading import load_network
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.errors import TrainingError
-from roadproof.files import read_json, write_atomically
+from roadproof.io.files import read_json, write_atomically
 from roadproof.training.collection import CollectionPlan, collect
 from roadproof.training.dataset import Dataset
 from roadproof.training.imitation import Learner, TrainingPlan, imitate

@@ -5,8 +5,6 @@ A shard is a NumPy archive of named arrays and a JSON header, lightly compressed
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int8, UInt8
 
 from roadproof.errors import TrainingError
-from roadproof.files import write_atomically
+from roadproof.io.arrays import read_record, write_archive
 
 FORMAT = "roadproof-shard"
 FORMAT_VERSION = 1
@@ -70,17 +68,9 @@ class Shard:
         Raises:
             OutputError: the file cannot be written.
         """
-        header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "about": dict(self.about)})
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS} | {"header": np.array(header)}
-
-        def write(part: Path) -> None:
-            # numpy's own compression takes longer than the drive's pictures take to render.
-            with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-                for name, array in arrays.items():
-                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
-
-        write_atomically(path, write)
+        header = {"format": FORMAT, "version": FORMAT_VERSION, "about": dict(self.about)}
+        # Full compression takes longer than the drive's pictures take to render.
+        write_archive(path, {name: getattr(self, name) for name in _ARRAYS}, header, level=1)
 
     @classmethod
     def load(cls, path: Path) -> Shard:
@@ -89,17 +79,7 @@ class Shard:
         Raises:
             TrainingError: the file is missing, damaged, no shard, or of a newer version.
         """
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                header: dict[str, Any] = json.loads(str(stored["header"]))
-                arrays: dict[str, Any] = {name: stored[name] for name in _ARRAYS}
-        except FileNotFoundError:
-            raise TrainingError(f"no recorded drive {path}; collect first") from None
-        except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile, EOFError) as error:
-            raise TrainingError(f"{path} is damaged or no recorded drive ({error}); delete it, collect again") from None
-        if header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
-            raise TrainingError(
-                f"{path} is {header.get('format')!r} version {header.get('version')!r}, "
-                f"this roadproof reads {FORMAT!r} version {FORMAT_VERSION}"
-            )
-        return cls(**arrays, about=header["about"])
+        header, arrays = read_record(
+            path, _ARRAYS, TrainingError, "collect it again", format_version=(FORMAT, FORMAT_VERSION)
+        )
+        return cls(**arrays, about=header.get("about", {}))

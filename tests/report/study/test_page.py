@@ -101,7 +101,7 @@ def test_a_damaged_view_is_named(finished, tmp_path):
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
     job = next(each for each in read_found(tmp_path, records).values() if each.view("clear-noon") is not None)
     (job.folder / "view-clear-noon.jpg").write_bytes(b"no picture")
-    with pytest.raises(StudyError, match=r"view-clear-noon\.jpg is damaged"):
+    with pytest.raises(StudyError, match=r"view-clear-noon\.jpg cannot be read"):
         job.view("clear-noon")
 
 

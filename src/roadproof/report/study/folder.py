@@ -11,7 +11,6 @@ DIR/jobs/KEY/history.json       how the search went, against simulator calls and
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +18,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
 from roadproof.errors import StudyError
-from roadproof.files import read_json
 from roadproof.geometry import CanvasPlacement
+from roadproof.io.arrays import read_archive
+from roadproof.io.files import read_json
+from roadproof.io.pictures import read_picture
 from roadproof.metrics import Path2D
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.report.study.results import JobId, Method, Record
@@ -32,6 +32,8 @@ HISTORY_FORMAT, HISTORY_VERSION = "roadproof-study-history", 1
 CLOSED_LOOP = "closed loop"
 
 Series = Float[np.ndarray, " n"]
+
+_AGAIN = "remove its folder and run the study again"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,14 +91,11 @@ class Found:
         path = self.folder / "paths.npz"
         if not path.exists():
             return None
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                clean, painted = (np.asarray(stored[name], np.float64) for name in ("clean_xy", "painted_xy"))
-        except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            raise StudyError(f"{path} is damaged ({error}); remove its folder and run the study again") from None
+        stored = read_archive(path, ("clean_xy", "painted_xy"), StudyError, _AGAIN)
+        clean, painted = (stored[name].astype(np.float64) for name in ("clean_xy", "painted_xy"))
         for each in (clean, painted):
             if each.ndim != 2 or each.shape[1] != 2 or not len(each) or not np.isfinite(each).all():
-                raise StudyError(f"{path} holds {each.shape}, expected finite x, y; remove its folder and run again")
+                raise StudyError(f"{path} holds {each.shape}, expected finite x, y; {_AGAIN}")
         return clean, painted
 
     def view(self, weather: str) -> UInt8[np.ndarray, "h w 3"] | None:
@@ -108,11 +107,7 @@ class Found:
         path = self.folder / f"view-{weather}.jpg"
         if path.parent != self.folder or not path.exists():
             return None
-        try:
-            with Image.open(path) as picture:
-                return np.asarray(picture.convert("RGB"))
-        except OSError as error:
-            raise StudyError(f"{path} is damaged ({error}); remove its folder and run the study again") from None
+        return read_picture(path, StudyError, _AGAIN)
 
     def history(self) -> History | None:
         """The driven course of the search; None where the job kept none.
@@ -140,7 +135,7 @@ class Found:
                 raise ValueError("its lists are not equally long")
             return History(calls, seconds, deviation_m)
         except (ValueError, KeyError, TypeError) as error:
-            raise StudyError(f"{path} is damaged ({error}); remove its folder and run the study again") from None
+            raise StudyError(f"{path} is damaged ({error}); {_AGAIN}") from None
 
 
 def read_found(folder: Path, records: Iterable[Record]) -> dict[JobId, Found]:
@@ -190,7 +185,7 @@ def _read(path: Path) -> Found:
             folder=path.parent,
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StudyError(f"{path} is damaged ({error!r}); remove its folder and run the study again") from None
+        raise StudyError(f"{path} is damaged ({error!r}); {_AGAIN}") from None
 
 
 def _number(value: object) -> float | None:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import roadproof
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.report.html import data_url, environment
 from roadproof.report.plots import save
 from roadproof.report.study.blocks import DEVIATION, PENALTY

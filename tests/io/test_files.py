@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from roadproof.errors import RecordingError, ScenarioError
-from roadproof.files import inside, is_plain_name
+from roadproof.io.files import inside, is_plain_name
 from roadproof.scenarios import builtin_scenarios, load_scenarios, save_scenarios
 
 PLAIN = (

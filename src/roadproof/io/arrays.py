@@ -1,0 +1,209 @@
+"""Arrays in one file: NumPy archives (.npz) with a JSON header, and single arrays (.npy).
+
+A file may come from anyone. So what it claims is compared with what it holds before memory is taken: how much it
+unpacks to, how it is packed, each array's type and size.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from roadproof.errors import RoadproofError
+from roadproof.io.files import write_atomically
+
+MOST_BYTES = 4 * 2**30
+"""An archive, or an array, that would take more memory is not read."""
+
+HEADER = "header"
+_KINDS = "biuf"
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_DAMAGE = (
+    EOFError,
+    KeyError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RecursionError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What zipfile, zlib, NumPy and JSON raise over files that someone damaged or made up."""
+
+
+def write_archive(
+    path: Path, arrays: Mapping[str, Any], header: Mapping[str, Any] | None = None, *, level: int = 6
+) -> None:
+    """Write arrays to one file, all or nothing.
+
+    Args:
+        path: ends in ".npz".
+        arrays: numbers, by name.
+        header: what JSON can say about them; none for arrays alone.
+        level: of compression; 1 where there is much and time counts.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    content = packed(arrays, header, level=level)
+    write_atomically(path, lambda part: part.write_bytes(content))
+
+
+def packed(arrays: Mapping[str, Any], header: Mapping[str, Any] | None = None, *, level: int = 6) -> bytes:
+    """What `write_archive` writes; the same bytes for the same arrays, whenever."""
+    told = {} if header is None else {HEADER: np.array(json.dumps(header, ensure_ascii=False))}
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        for name, array in (told | dict(arrays)).items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getbuffer(), zipfile.ZIP_DEFLATED, level)
+    return whole.getvalue()
+
+
+def read_archive(
+    path: Path, names: Iterable[str], error: type[RoadproofError], remedy: str, *, most_bytes: int = MOST_BYTES
+) -> dict[str, np.ndarray]:
+    """Arrays of numbers by name.
+
+    Args:
+        path: of the archive.
+        names: of the arrays wanted; others are not looked at.
+        error: what to raise.
+        remedy: what the user can do where it is missing or damaged.
+        most_bytes: that the whole archive may unpack to.
+
+    Raises:
+        error: it is missing, lacks an array, is packed or filled in a way that roadproof never writes, or would unpack
+            to more.
+    """
+    return _read(path, tuple(names), None, error, remedy, most_bytes)[1]
+
+
+def read_record(
+    path: Path,
+    names: Iterable[str],
+    error: type[RoadproofError],
+    remedy: str,
+    *,
+    header: str = HEADER,
+    format_version: tuple[str, int] | None = None,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of an archive.
+
+    Args:
+        path: of the archive.
+        names: of the arrays wanted.
+        error: what to raise.
+        remedy: what the user can do where it is missing or damaged.
+        header: under which name the JSON object is.
+        format_version: what its "format" and "version" must be, where it has them.
+
+    Raises:
+        error: as `read_archive`, or the header is no JSON object, or of another format or version.
+    """
+    told, arrays = _read(path, tuple(names), header, error, remedy, MOST_BYTES)
+    found = (told.get("format"), told.get("version"))
+    if format_version is not None and (found != format_version or isinstance(found[1], bool)):
+        raise error(
+            f"{path} is {found[0]!r:.60} version {found[1]!r:.40}, expected {format_version[0]!r} version "
+            f"{format_version[1]}; {remedy}"
+        )
+    return told, arrays
+
+
+def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarray:
+    """The numbers of a .npy file.
+
+    Raises:
+        error: it is missing, holds anything else, or more or less than it claims.
+    """
+    try:
+        with path.open("rb") as file:
+            return _array(file, os.fstat(file.fileno()).st_size, _KINDS)
+    except FileNotFoundError:
+        raise error(f"{path} is missing; {remedy}") from None
+    except _DAMAGE as reason:
+        raise error(f"{path} is damaged ({_said(reason)}); {remedy}") from None
+
+
+def _read(
+    path: Path, names: tuple[str, ...], header: str | None, error: type[RoadproofError], remedy: str, most_bytes: int
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check(archive, most_bytes)
+            told = {} if header is None else _header(_member(archive, header, "U"))
+            return told, {name: _member(archive, name, _KINDS) for name in names}
+    except FileNotFoundError:
+        raise error(f"{path} is missing; {remedy}") from None
+    except _DAMAGE as reason:
+        raise error(f"{path} is damaged ({_said(reason)}); {remedy}") from None
+
+
+def _said(reason: BaseException) -> str:
+    words = " ".join(str(reason).split()).strip("'\"")
+    return f"{words or type(reason).__name__:.200}"
+
+
+def _check(archive: zipfile.ZipFile, most_bytes: int) -> None:
+    entries = archive.infolist()
+    unpacked = sum(entry.file_size for entry in entries)
+    if unpacked > most_bytes:
+        raise ValueError(f"it unpacks to {unpacked} bytes, expected at most {most_bytes}")
+    for entry in entries:
+        if entry.compress_type not in _PACKED or entry.flag_bits & 1:
+            raise ValueError(f"{entry.filename!r:.80} is encrypted or packed by a method that is not read")
+
+
+def _member(archive: zipfile.ZipFile, name: str, kinds: str) -> np.ndarray:
+    try:
+        entry = archive.getinfo(f"{name}.npy")
+    except KeyError:
+        raise ValueError(f"it has no {name}") from None
+    try:
+        with archive.open(entry) as file:
+            return _array(cast("io.BufferedIOBase", file), entry.file_size, kinds)
+    except _DAMAGE as reason:
+        raise ValueError(f"{name}: {_said(reason)}") from None
+
+
+def _array(file: io.BufferedIOBase, size: int, kinds: str) -> np.ndarray:
+    """The array at the beginning of a file of so many bytes."""
+    version = np.lib.format.read_magic(file)
+    if version == (1, 0):
+        shape, by_column, dtype = np.lib.format.read_array_header_1_0(file)
+    elif version == (2, 0):
+        shape, by_column, dtype = np.lib.format.read_array_header_2_0(file)
+    else:
+        raise ValueError(f"format {version} of NumPy is not read")
+    if dtype.kind not in kinds or dtype.subdtype is not None:
+        raise ValueError(f"it is of type {dtype}, expected {'text' if kinds == 'U' else 'numbers'}")
+    left = size - file.tell()
+    if math.prod(shape) * dtype.itemsize != left or min(shape, default=0) < 0:
+        raise ValueError(f"it claims {dtype} of shape {shape} and holds {left} bytes")
+    values = file.read(left)
+    # To the end, since only there zip compares the checksum.
+    if len(values) != left or file.read(1):
+        raise ValueError(f"it holds {len(values)} bytes of {left}")
+    return np.frombuffer(bytearray(values), dtype).reshape(shape, order="F" if by_column else "C")
+
+
+def _header(stored: np.ndarray) -> dict[str, Any]:
+    told: object = json.loads(str(stored))
+    if not isinstance(told, dict):
+        raise TypeError("its header is no JSON object")
+    return cast("dict[str, Any]", told)

@@ -1,0 +1,60 @@
+"""Pictures from anyone."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from roadproof.errors import RoadproofError
+from roadproof.io.pictures import read_picture
+
+
+def chunk(name: bytes, content: bytes) -> bytes:
+    """A part of a PNG file."""
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def png_claiming(width: int, height: int) -> bytes:
+    """A PNG that claims a size and holds nothing."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+
+
+def test_a_picture_comes_back(tmp_path: Path) -> None:
+    """Bit for bit, and writable."""
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    read = read_picture(tmp_path / "a.png", RoadproofError, "again")
+    np.testing.assert_array_equal(read, pixels)
+    assert read_picture(tmp_path / "a.png", RoadproofError, "again", mode="RGBA").shape == (5, 7, 4)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (png_claiming(7000, 7000), "expected at most"),
+        (png_claiming(60_000, 60_000), "cannot be read"),
+        (png_claiming(10, 10), "cannot be read"),
+        (b"words", "cannot be read"),
+        (b"", "cannot be read"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "cannot be read"),
+    ],
+)
+def test_bad_pictures_are_refused(tmp_path: Path, content: bytes, reason: str) -> None:
+    """Bombs, fragments, formats that run programs."""
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    with pytest.raises(RoadproofError, match=reason) as refused:
+        read_picture(path, RoadproofError, "copy it again")
+    assert str(refused.value).endswith("copy it again")
+
+
+def test_a_missing_picture_is_said(tmp_path: Path) -> None:
+    """With its path."""
+    with pytest.raises(RoadproofError, match="is missing"):
+        read_picture(tmp_path / "a.png", RoadproofError, "again")
