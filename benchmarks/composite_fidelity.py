@@ -28,8 +28,8 @@ import roadproof
 from roadproof.compositing import composite, view_canvas
 from roadproof.compositing.published import nearest_canvas_pixels
 from roadproof.coverage import Shape
-from roadproof.io.files import write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_INPUT, CropResize
+from roadproof.io.files import write_atomically
 from roadproof.patterns import Pattern
 from roadproof.photometry import (
     AffineResponse,

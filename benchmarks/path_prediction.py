@@ -1,11 +1,12 @@
 """Does the recorded world foretell where the car goes? Predicted against driven deviation, pattern by pattern.
 
     python benchmarks/path_prediction.py --json OUT [--scenarios left-03 …] [--controllers pilotnet cil] [--seed 0]
+        [--simulator town | carla://HOST:PORT]
 
-For each cell, a controller on a scenario of the town: five drives are recorded and calibrated as `roadproof demo` does
+For each cell, a controller on a scenario: five drives are recorded and calibrated as `roadproof demo` does
 (15 simulator calls), and patterns are taken from four sources: drawn at random, found by open-loop searches of 2, 12
 and 30 steps, and found by a search in the recorded world. Each is driven over once in the recorded world and once in
-the town, alone at clear noon, from the same start. Nothing of the town's drives over paint is known to the prediction.
+the simulator, alone at clear noon, from the same start. Nothing of its drives over paint is known to the prediction.
 
 The JSON has one record a cell and one with cell = "pooled": how many patterns, Spearman's rank correlation, R² to the
 identity line (not to a fitted one), mean absolute error in metres; and every pattern's source and both numbers. Cells
@@ -33,7 +34,7 @@ from roadproof.attacks.gradopt import gradopt
 from roadproof.calibration import calibrate
 from roadproof.drives import Trajectories, record
 from roadproof.evaluation import DrivenObjective
-from roadproof.files import write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.loop import Budget
 from roadproof.memory import keep_freed_memory
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
@@ -41,7 +42,7 @@ from roadproof.patterns import Pattern
 from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.simulators.loading import open_simulator
 
 SCENARIOS = ("left-03", "right-05", "straight-04", "left-07", "right-02", "straight-09")
 GROUPS = (RIGHT_GROUP, LEFT_GROUP)
@@ -68,26 +69,26 @@ def patterns(
     return names, space.pattern(torch.cat(points)), world
 
 
-def cell(controller_name: str, scenario: Scenario, seed: int) -> dict[str, Any]:
+def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict[str, Any]:
     """One controller on one scenario."""
     began = time.perf_counter()
     budget, space = Budget(), SearchSpace(figures=5)
     controller = roadproof.load_controller(controller_name)
-    with TownSimulator() as town:
+    with open_simulator(spec) as simulator:
         drives = record(
-            town,
+            simulator,
             controller,
             scenario,
             trajectories=Trajectories(count=budget.trajectories, perturbation=budget.perturbation),
             window=budget.window,
             seed=seed,
         )
-        calibrated = calibrate(town, drives, budget.calibration)
+        calibrated = calibrate(simulator, drives, budget.calibration)
         names, painted, world = patterns(calibrated.recordings, controller, space, seed)
         rolling = time.perf_counter()
-        predicted = world.world.deviations_m(controller, painted)
+        predicted = world.world.deviations_m(controller, painted)[:, 0]
         rolled_s = time.perf_counter() - rolling
-        objective = DrivenObjective(town, controller, scenario, space, measure="deviation")
+        objective = DrivenObjective(simulator, controller, scenario, space, measure="deviation")
         driven = [objective.effect(painted[k]).deviation for k in range(len(names))]
     return {
         "cell": f"{controller_name} {scenario.name}",
@@ -123,6 +124,7 @@ def main() -> None:
     parser.add_argument("--scenarios", nargs="+", default=SCENARIOS)
     parser.add_argument("--controllers", nargs="+", default=("pilotnet", "cil"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--simulator", default="town")
     args = parser.parse_args()
     keep_freed_memory()  # as the command line does
     stored = json.loads(args.json.read_text()) if args.json.exists() else {"records": []}
@@ -131,7 +133,7 @@ def main() -> None:
         for scenario in (find_scenario(each, builtin_scenarios()) for each in args.scenarios):
             if f"{name} {scenario.name}" in cells:
                 continue
-            found = cell(name, scenario, args.seed)
+            found = cell(name, scenario, args.seed, args.simulator)
             cells[found["cell"]] = summary(found["cell"], found["each"]) | found
             print({key: value for key, value in cells[found["cell"]].items() if key != "each"}, flush=True)
             every = [one for each in cells.values() for one in each["each"]]
@@ -140,6 +142,7 @@ def main() -> None:
                 "threads": torch.get_num_threads(),
                 "torch": torch.__version__,
                 "roadproof": roadproof.__version__,
+                "simulator": args.simulator.split(":")[0],
                 "records": [*cells.values(), summary("pooled", every)],
             }
             text = json.dumps(content, indent=1) + "\n"

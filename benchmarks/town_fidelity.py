@@ -28,8 +28,8 @@ import roadproof
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Observation, Weather
-from roadproof.io.files import write_atomically
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
+from roadproof.io.files import write_atomically
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import (
     AffineResponse,

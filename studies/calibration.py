@@ -36,8 +36,8 @@ from roadproof.compositing import composite, view_canvas
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives, Trajectories, Window, record
-from roadproof.io.files import write_atomically
 from roadproof.geometry import homography_from_pose
+from roadproof.io.files import write_atomically
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet

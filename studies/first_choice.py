@@ -5,7 +5,7 @@
 For every controller, scenario and seed, five drives are recorded and calibrated as `roadproof demo` does (15 calls of
 the simulator), and searched twice:
   steering    the steering shift on those recorded frames, heats and 30 steps
-  deviation   the path in the recorded world, heats and 40 steps
+  deviation   the path in the recorded world, heats and 24 steps
 Each search's six candidates, best first in its own order, are driven once at clear noon, alone. So every row holds what
 the search thought, what its first choice did when driven, what the best of its six did, and which it was; the first
 choice is driven in the paper's other weathers too. Nothing driven chose a pattern.
@@ -72,9 +72,9 @@ def rows_of(cell: Cell) -> list[Row]:
     """Both searches in one cell."""
     torch.set_num_threads(1)
     keep_freed_memory()  # as the command line does
-    path = cell.folder / "rows.json"
-    if path.exists():
-        return json.loads(path.read_text(encoding="utf-8"))
+    kept = {name: cell.folder / name / "row.json" for name in SEARCHES}
+    if all(path.exists() for path in kept.values()):
+        return [json.loads(path.read_text(encoding="utf-8")) for path in kept.values()]
     controller = roadproof.load_controller(cell.controller)
     scenario, space = find_scenario(cell.scenario, builtin_scenarios()), SearchSpace(figures=5)
     rows: list[Row] = []
@@ -94,6 +94,9 @@ def rows_of(cell: Cell) -> list[Row]:
             calibrated = calibrate(town, drives, BUDGET.calibration, folder=cell.folder / "calibration")
             calibrated.save(cell.folder)
         for name, (objective, schedule) in SEARCHES.items():
+            if kept[name].exists():
+                rows.append(json.loads(kept[name].read_text(encoding="utf-8")))
+                continue
             place, began = cell.folder / name, time.perf_counter()
             found = kept_attack(
                 place / "attack",
@@ -122,20 +125,20 @@ def rows_of(cell: Cell) -> list[Row]:
                 town, controller, scenario, found.pattern, folder=place / "evaluation", runs=0,
                 driver_name=cell.controller,
             )  # fmt: skip
-            rows.append(
-                {
-                    "controller": cell.controller,
-                    "scenario": cell.scenario,
-                    "seed": cell.seed,
-                    "search": name,
-                    "predicted_m": found.predicted_m,
-                    "driven_m": [each.trial.deviation_m for each in selection.driven],
-                    "by_weather_m": {trial.weather: trial.deviation_m for trial in judged.of(traffic=False)},
-                    "recording_calls": calibrated.report.calls,
-                    "search_seconds": seconds,
-                }
-            )
-    write_atomically(path, lambda part: part.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8"))
+            row = {
+                "controller": cell.controller,
+                "scenario": cell.scenario,
+                "seed": cell.seed,
+                "search": name,
+                "predicted_m": found.predicted_m,
+                "candidates_m": [each.predicted_m for each in found.candidates],
+                "driven_m": [each.trial.deviation_m for each in selection.driven],
+                "by_weather_m": {trial.weather: trial.deviation_m for trial in judged.of(traffic=False)},
+                "recording_calls": calibrated.report.calls,
+                "search_seconds": seconds,
+            }
+            rows.append(row)
+            write_json(kept[name], row)
     return rows
 
 
@@ -174,6 +177,11 @@ def write(path: Path, rows: Sequence[Row]) -> None:
         "rows": list(rows),
         "versions": versions,
     }
+    write_json(path, content)
+
+
+def write_json(path: Path, content: Row) -> None:
+    """Whole or not at all."""
     text = json.dumps(content, indent=1) + "\n"
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 

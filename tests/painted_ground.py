@@ -41,11 +41,15 @@ def picture(state):
     return np.clip(np.round(shown), 0, 255).astype(np.uint8).T.reshape(VIEW.height_px, VIEW.width_px, 3)
 
 
-def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None):
-    """A straight drive past the canvas, so far to the left, looking that way."""
-    ahead = np.arange(-32.0, 8.0, SPEED_MPS * DT_S)
+def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0):
+    """A straight drive past the canvas, so far to the left, looking that way; it may stand for some steps first."""
+    speed = np.full(67, SPEED_MPS)
+    if stands:
+        speed = np.concatenate([np.zeros(stands), np.minimum(0.3 * np.arange(1, 80), SPEED_MPS)])
+    begin_m, shown_m = (-24.0, -25.0) if stands else (-32.0, -29.0)
+    ahead = begin_m + np.concatenate([[0.0], np.cumsum(speed[1:] * DT_S)])
     steps = np.arange(len(ahead))
-    shown = steps[(ahead > -29.0) & (ahead < -1.5)][::every]
+    shown = steps[(ahead > shown_m) & (ahead < -1.5)][::every]
     count = len(ahead)
     states = [pose(ahead[step], left_m, yaw_rad) for step in shown]
     return Recording(
@@ -54,7 +58,7 @@ def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None):
         frames=np.stack([picture(state) for state in states]),
         frame_number=shown,
         image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, state, CANVAS) for state in states]),
-        speed_mps=np.full(len(shown), SPEED_MPS),
+        speed_mps=speed[shown],
         command=np.full(len(shown), 2),
         steer=np.zeros(len(shown)),
         track=Track(
@@ -63,7 +67,7 @@ def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None):
             x_m=CANVAS.x_m + ahead,
             y_m=np.full(count, CANVAS.y_m + left_m),
             yaw_rad=np.full(count, yaw_rad),
-            speed_mps=np.full(count, SPEED_MPS),
+            speed_mps=speed,
             steer=np.zeros(count),
             throttle=np.full(count, 0.1),
             brake=np.zeros(count),

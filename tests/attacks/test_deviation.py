@@ -8,10 +8,12 @@ import torch
 
 from painted_ground import RampFollower, recorded_road
 from roadproof.attacks import PathDeviation, Schedule, SteeringShift, attack
+from roadproof.attacks.gradopt import Heat, gradopt
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
 from roadproof.recorded import RecordedWorld, Start, Vehicle
+from roadproof.recorded.world import UNSURE
 from roadproof.search_space import SearchSpace
 
 SPACE = SearchSpace(figures=1)
@@ -48,12 +50,14 @@ def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp
     found = [candidate.predicted_m for candidate in result.candidates]
     assert found == sorted(found, reverse=True)
     assert result.predicted_m == found[0]
-    again = world.deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]))
-    assert again[0] == pytest.approx(found[0], abs=0.02)
+    again = world.deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)[0]
+    assert again.mean() == pytest.approx(found[0], abs=0.02)
+    assert result.predicted_range_m == pytest.approx((again.min(), again.max()), abs=0.02)
     result.save(tmp_path)
     loaded = AttackResult.load(tmp_path)
     assert (loaded.objective, loaded.predicted_m) == ("path deviation", result.predicted_m)
     assert [each.predicted_m for each in loaded.candidates] == found
+    assert [each.predicted_range_m for each in loaded.candidates] == [c.predicted_range_m for c in result.candidates]
 
 
 def test_a_search_doubts_a_controller_that_was_not_recorded(road):
@@ -103,6 +107,33 @@ def test_several_starts_are_valued_by_their_mean(road):
     assert float(both[0]) == pytest.approx(-float(both[1]))
     assert right == pytest.approx(float(both[0]), abs=1e-4)
     assert left != right
+
+
+def test_a_search_can_begin_with_the_steering_shift(road, tmp_path):
+    heats = (Heat(starts=4, iterations=6, every=2, open_loop=True), Heat(starts=4, iterations=2, every=6))
+    schedule = dataclasses.replace(SHORT, iterations=1, heats=heats)
+    measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    seen: list[float] = []
+    found = gradopt(measure, SPACE, schedule=schedule, restarts=2, seed=0, on_step=lambda _, best: seen.append(best))
+    alone = SteeringShift().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").thinned(2)
+    climbed = gradopt(alone, SPACE, schedule=dataclasses.replace(SHORT, iterations=6, drops=()), restarts=4, seed=0)
+    # The first heat is the open loop's own search, step by step.
+    best = [float(value) for value in climbed.history.amax((1, 2)).cummax(0).values]
+    assert seen[:6] == pytest.approx(best, abs=1e-6)
+    assert float(found.best.max()) > 0
+    # The same again after an interruption inside that heat.
+    stopped = tmp_path / "search.safetensors"
+
+    def interrupt(step, _):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    def once(**options):
+        return gradopt(measure, SPACE, schedule=schedule, restarts=2, seed=0, checkpoint=stopped, **options)
+
+    with pytest.raises(KeyboardInterrupt):
+        once(on_step=interrupt)
+    assert torch.equal(once().best_unit, found.best_unit)
 
 
 def test_objectives_that_make_no_sense_are_one_clear_line(road):

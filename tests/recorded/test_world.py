@@ -11,7 +11,7 @@ from roadproof.coverage import Shape
 from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
 from roadproof.recorded.vehicle import Vehicle
-from roadproof.recorded.world import RecordedWorld, Start
+from roadproof.recorded.world import UNSURE, RecordedWorld, Start
 from roadproof.recordings import Push
 
 VEHICLE = dataclasses.replace(
@@ -49,11 +49,40 @@ def test_a_car_that_starts_aside_is_brought_back(world):
     assert rolled.right_m[2, 5] < -0.02
 
 
+def test_a_car_whose_steering_is_off_goes_its_way_and_no_further(world):
+    right, left = world.roll(RampFollower(), starts=(Start(steer=0.02), Start(steer=-0.02))).right_m
+    # It drifts until the controller answers with as much the other way.
+    assert right[-1] > 0.03
+    assert left[-1] < -0.03
+    assert right.abs().max() < 0.5
+
+
+def test_a_prediction_has_a_value_for_every_start(world):
+    found = world.deviations_m(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)), UNSURE)
+    assert found.shape == (2, len(UNSURE))
+    alone = world.deviations_m(RampFollower(), painted((200, 300, 1.0)))
+    assert found[0, UNSURE.index(Start())] == pytest.approx(alone[0, 0], abs=1e-6)
+    # Against the bare road with the same error: thin grey paint does next to nothing.
+    assert found[1].max() < 0.1
+
+
+def test_a_controller_that_only_steers_drives_off_where_the_clean_drive_stood_first():
+    drives = (recorded(stands=12), recorded(Push.RIGHT, -1.5), recorded(Push.LEFT, 1.5))
+    world = RecordedWorld(dataclasses.replace(recorded_road(), recordings=drives), vehicle=VEHICLE)
+    world.fit(RampFollower())
+    rolled = world.roll(RampFollower())
+    assert float(rolled.speed_mps[0, 0]) == 0
+    clean = world.course.poses.x_m[world.course.seen.stop - 1] + CANVAS.x_m
+    # The same way in the same time, but for the stand, which a law of place cannot know.
+    assert float(rolled.speed_mps[0, -1]) == pytest.approx(6.0, abs=0.4)
+    assert float(rolled.x_m[0, -1]) > float(clean) - 1.0
+
+
 def test_bright_paint_pulls_to_the_right_and_dark_paint_to_the_left(world):
     bright, dark = world.roll(RampFollower(), painted((200, 300, 1.0), (200, 300, 0.0))).right_m
     assert bright.max() > 0.3
     assert dark.min() < -0.1
-    deviations = world.deviations_m(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)))
+    deviations = world.deviations_m(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)))[:, 0]
     assert deviations[0] > 5 * deviations[1]
 
 

@@ -86,6 +86,7 @@ def attack(
         objective=objective.name,
         surrogate_shift=candidates[0].surrogate_shift,
         predicted_m=candidates[0].predicted_m,
+        predicted_range_m=candidates[0].predicted_range_m,
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
         candidates=candidates,
         history=search.history.double().numpy(),
@@ -124,17 +125,22 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
 
 
 def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
-    """Every start's best, the strongest first: by what is predicted where that is known, else by its own value."""
+    """Every start's best, the strongest first: by what is predicted where that is known, else by its own value.
+
+    What is predicted is a mean over small errors of steering: where the way forks, a pattern that depends on a hair
+    does not come first.
+    """
     shifts, predicted = measure.readings(space, search.best_unit)
     restarts = search.best.shape[1]
-    rank = search.best.cpu() if predicted is None else predicted
+    rank = search.best.cpu() if predicted is None else predicted.mean(-1)
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
-    return tuple(
-        Candidate(
-            space.pattern(search.best_unit[group, restart].cpu()),
-            str(groups[group]),
-            float(search.best[group, restart] if predicted is None else shifts[group, restart]),
-            None if predicted is None else float(predicted[group, restart]),
-        )
-        for group, restart in (divmod(index, restarts) for index in order)
-    )
+    candidates: list[Candidate] = []
+    for group, restart in (divmod(index, restarts) for index in order):
+        pattern, name = space.pattern(search.best_unit[group, restart].cpu()), str(groups[group])
+        if predicted is None:
+            candidates.append(Candidate(pattern, name, float(search.best[group, restart])))
+            continue
+        shift, metres = float(shifts[group, restart]), predicted[group, restart]
+        spread = (float(metres.min()), float(metres.max()))
+        candidates.append(Candidate(pattern, name, shift, float(metres.mean()), spread))
+    return tuple(candidates)

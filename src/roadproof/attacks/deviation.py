@@ -21,7 +21,7 @@ from torch import Tensor
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.objectives import Direction, Group
-from roadproof.recorded.world import RecordedWorld, Start
+from roadproof.recorded.world import UNSURE, RecordedWorld, Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -73,6 +73,10 @@ class DeviationMeasure:
         thin.every, thin.frames_evaluated = every, 0
         return thin
 
+    def open_loop(self) -> Surrogate:
+        """The steering shift on the recorded frames."""
+        return self._open_loop
+
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         """Metres to each group's side at points of a search space, without gradients."""
         with torch.no_grad():
@@ -106,10 +110,10 @@ class DeviationMeasure:
 
     def readings(
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r"]]:
-        """Steering shift on the recorded frames, and the paper's deviation as predicted from the clean start."""
-        predicted = self.world.deviations_m(self.controller, space.pattern(unit.flatten(0, 1)))
-        return self._open_loop.values(space, unit), torch.tensor(predicted).view(unit.shape[:2])
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
+        """Steering shift on the recorded frames, and the paper's deviation as predicted, with small steering errors."""
+        predicted = self.world.deviations_m(self.controller, space.pattern(unit.flatten(0, 1)), UNSURE)
+        return self._open_loop.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
 
     def fingerprint(self) -> str:
         """Tells this measure from another: drives, calibration, controller, starts."""

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,14 +31,16 @@ class Heat:
     """A round before the search proper, of which the best starts go on.
 
     Args:
-        starts: of every group.
+        starts: of every group: the best of the round before, and random ones where those are fewer.
         iterations: steps of each, at the schedule's first learning rate.
         every: the share of the frames used: every n-th of each drive; in the recorded world, of the steps.
+        open_loop: climb the steering shift on recorded frames, whatever the search makes large.
     """
 
     starts: int
     iterations: int
     every: int
+    open_loop: bool = False
 
     def __post_init__(self) -> None:
         if min(self.starts, self.iterations, self.every) < 1:
@@ -94,14 +96,22 @@ class Schedule:
         )
 
     @staticmethod
-    def closed_loop(iterations: int = 40) -> Schedule:
-        """For a search where the car goes: heats with few pictures, then more; small steps, since a loop amplifies."""
+    def closed_loop(iterations: int = 24) -> Schedule:
+        """For a search where the car goes: heats with few pictures, then more.
+
+        It begins where the steering shift is large. A controller that holds its lane well brings the car back from
+        what a random pattern does, and the path has hardly a gradient there; what also turns the wheel where a car is
+        aside already takes it further (measured). Random patterns join them, for controllers that need no such help.
+        """
         return Schedule(
             iterations=iterations,
-            learning_rate=0.05,
             drops=(iterations // 2, iterations * 4 // 5),
             factor=0.3,
-            heats=(Heat(starts=16, iterations=12, every=6), Heat(starts=6, iterations=10, every=4)),
+            heats=(
+                Heat(starts=16, iterations=12, every=8, open_loop=True),
+                Heat(starts=24, iterations=4, every=6),
+                Heat(starts=6, iterations=10, every=4),
+            ),
         )
 
     @property
@@ -174,10 +184,10 @@ def gradopt(
         measure.frames_evaluated += int(state.pop("frames"))
     for number in range(rung, len(rungs)):
         steps, last = rungs[number].steps, number == len(rungs) - 1
-        shown = measure if last else measure.thinned(rungs[number].every)
+        shown = measure if last else rungs[number].cheaper(measure)
         done = sum(before.steps.iterations for before in rungs[:number])
         if number > rung:
-            state = _state_at(_strongest(state, rungs[number].starts))
+            state = _state_at(_gone_on(state, space, rungs[number].starts, seed, number))
         while len(state["history"]) < steps.iterations and not _stalled(state["history"], steps):
             state = _step(shown, space, steps, state)
             on_step(done + len(state["history"]), float(state["best"].max()))
@@ -200,16 +210,23 @@ class _Rung:
     starts: int
     every: int
     steps: Schedule
+    open_loop: bool = False
+
+    def cheaper(self, measure: Measure) -> Measure:
+        """What a heat climbs instead."""
+        return (measure.open_loop() if self.open_loop else measure).thinned(self.every)
 
 
 def _rungs(schedule: Schedule, restarts: int) -> list[_Rung]:
-    places = [*(heat.starts for heat in schedule.heats), restarts]
-    if any(after > before for before, after in pairwise(places)):
-        raise RoadproofError(f"heats of {places[:-1]} starts leave fewer than {restarts} restarts; ask for fewer")
+    if schedule.heats and schedule.heats[-1].starts < restarts:
+        places = [heat.starts for heat in schedule.heats]
+        raise RoadproofError(f"heats of {places} starts leave fewer than {restarts} restarts; ask for fewer")
     steps = (
         replace(schedule, iterations=heat.iterations, drops=(), patience=None, heats=()) for heat in schedule.heats
     )
-    heats = [_Rung(heat.starts, heat.every, each) for heat, each in zip(schedule.heats, steps, strict=True)]
+    heats = [
+        _Rung(heat.starts, heat.every, each, heat.open_loop) for heat, each in zip(schedule.heats, steps, strict=True)
+    ]
     return [*heats, _Rung(restarts, 1, schedule)]
 
 
@@ -227,10 +244,15 @@ def _starts(
     return unit.to(measure.device)
 
 
-def _strongest(state: dict[str, Tensor], count: int) -> Float[Tensor, "g r k n"]:
-    """Where the best of every group are."""
-    best = state["best"].topk(count, 1).indices
-    return state["best_unit"][torch.arange(len(best), device=best.device)[:, None], best]
+def _gone_on(
+    state: dict[str, Tensor], space: SearchSpace, count: int, seed: int, number: int
+) -> Float[Tensor, "g r k n"]:
+    """Where the best of every group are; random points make up what they lack."""
+    best = state["best"].topk(min(count, state["best"].shape[1]), 1).indices
+    kept = state["best_unit"][torch.arange(len(best), device=best.device)[:, None], best]
+    fresh = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
+    drawn = space.random((len(kept), count - kept.shape[1]), torch.Generator().manual_seed(fresh))
+    return torch.cat([kept, drawn.to(kept)], 1)
 
 
 def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:

@@ -28,8 +28,9 @@ from roadproof.search_space import SearchSpace
 Gradient = Literal["exact", "published"]
 GRADIENTS: tuple[Gradient, ...] = get_args(Gradient)
 
-Readings: TypeAlias = tuple[Float[Tensor, "g r"], Float[Tensor, "g r"] | None]
-"""Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is."""
+Readings: TypeAlias = tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"] | None]
+"""Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is: in
+each of some drives that differ by as little as a prediction may be wrong."""
 
 
 @runtime_checkable
@@ -46,6 +47,10 @@ class Measure(Protocol):
 
     def thinned(self, every: int) -> Measure:
         """A cheaper measure, on every n-th frame or step, whose order of starts is much the same."""
+        ...
+
+    def open_loop(self) -> Measure:
+        """The steering shift on the same recorded frames: where a search may begin."""
         ...
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:

@@ -45,13 +45,16 @@ class Candidate:
         pattern: its best.
         group: the drives it was found on.
         surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames.
-        predicted_m: the paper's deviation in the recorded world; None where nothing was driven there.
+        predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where nothing
+            was driven there.
+        predicted_range_m: least and most of it over those errors.
     """
 
     pattern: Pattern
     group: str
     surrogate_shift: float
     predicted_m: float | None = None
+    predicted_range_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -66,7 +69,9 @@ class AttackResult:
         group: the group it was found for, e.g. "clean+right".
         objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
         surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
-        predicted_m: the paper's deviation in the recorded world; None where the search did not drive there.
+        predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where the
+            search did not drive there.
+        predicted_range_m: least and most of it over those errors.
         by_group: the best value of every group, in the objective's unit: steer a frame, or metres.
         candidates: every start's best, the strongest first: by the predicted deviation where there is one. The
             steering shift ranks only coarsely, so that driving over its first few finds a stronger one than the first.
@@ -95,6 +100,7 @@ class AttackResult:
     seed: int
     objective: str = "steering shift"
     predicted_m: float | None = None
+    predicted_range_m: tuple[float, float] | None = None
 
     def save(self, folder: Path) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
@@ -110,7 +116,10 @@ class AttackResult:
             "version": FORMAT_VERSION,
             "kind": "surrogate and predicted: composited frames, not driving",
             **{name: getattr(self, name) for name in _PLAIN},
-            "candidates": [[each.group, each.surrogate_shift, each.predicted_m] for each in self.candidates],
+            "predicted_range_m": self.predicted_range_m,
+            "candidates": [
+                [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
+            ],
             "cost": asdict(self.cost),
             "checks": [asdict(check) for check in self.checks],
             "space": asdict(self.space),
@@ -140,15 +149,23 @@ class AttackResult:
                 schedule=_schedule(fields["schedule"]),
                 history=np.array(fields["history"], dtype=np.float64),
                 # Results that do not name their objective are older than the word.
+                predicted_range_m=_pair(fields.get("predicted_range_m")),
                 **{name: fields[name] for name in _PLAIN if name in fields or name not in _LATER},
             )
         except (KeyError, TypeError, ValueError) as error:
             raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None
 
 
-def _numbers(stored: list[Any]) -> tuple[float, float | None]:
-    shift, predicted = stored if len(stored) == 2 else (*stored, None)
-    return float(shift), None if predicted is None else float(predicted)
+def _numbers(stored: list[Any]) -> tuple[float, float | None, tuple[float, float] | None]:
+    predicted, spread = (*stored[1:], None, None)[:2]  # older results lack the last one or two
+    return float(stored[0]), None if predicted is None else float(predicted), _pair(spread)
+
+
+def _pair(stored: Any) -> tuple[float, float] | None:  # noqa: ANN401
+    if stored is None:
+        return None
+    low, high = stored
+    return float(low), float(high)
 
 
 def _schedule(stored: dict[str, Any]) -> Schedule:

@@ -85,6 +85,10 @@ class Surrogate:
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
         return type(self)(few, self.controller, self.groups, device=self.device)
 
+    def open_loop(self) -> Surrogate:
+        """Itself."""
+        return self
+
     def divergences(self, patterns: Sequence[Pattern]) -> Float[Tensor, "g r"]:
         """δ per frame of R patterns for each group, differentiable in the patterns.
 

@@ -129,10 +129,11 @@ def attack(
 def _schedule(kind: str, objective: str, iterations: int | None, patience: int | None) -> Schedule:
     from roadproof.attacks import Schedule
 
-    if kind == "heats" and objective == "deviation":
-        return replace(Schedule.closed_loop(iterations or 40), patience=patience)
-    make = Schedule.in_heats if kind == "heats" else Schedule.stretched
-    return make(patience=patience) if iterations is None else make(iterations, patience=patience)
+    if kind == "heats":
+        make = Schedule.closed_loop if objective == "deviation" else Schedule.in_heats
+    else:
+        make = Schedule.stretched
+    return replace(make() if iterations is None else make(iterations), patience=patience)
 
 
 def _draw(result: AttackResult, shown: tuple[ShownDrive, ...], out: Path) -> None:
@@ -158,7 +159,11 @@ def _summarise(result: AttackResult, space: SearchSpace, out: Path) -> None:
     sides = ", ".join(f"{name} {value:+.3f}" for name, value in result.by_group.items())
     shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
     if result.predicted_m is not None:
-        shift = f"{result.predicted_m:.2f} m of deviation predicted, nothing was driven for real; {shift}"
+        least, most = result.predicted_range_m or (result.predicted_m, result.predicted_m)
+        shift = (
+            f"{result.predicted_m:.2f} m of deviation predicted ({least:.2f} to {most:.2f} over small errors of "
+            f"steering), nothing was driven for real; {shift}"
+        )
     say(f"Strongest for {result.group}: {shift}")
     say(f"Best {result.objective} of each group: {sides}")
     say(

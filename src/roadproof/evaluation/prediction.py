@@ -12,16 +12,16 @@ from jaxtyping import Float
 
 from roadproof.controllers import Controller
 from roadproof.errors import EpisodeError
-from roadproof.evaluation.result import deviation_m, passage_deviation_m, path_of
+from roadproof.evaluation.result import passage_deviation_m, path_of
 from roadproof.io.arrays import read_record, write_archive
-from roadproof.metrics import deviation_m, passage
+from roadproof.metrics import passage
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import RecordedWorld
+from roadproof.recorded.world import UNSURE, RecordedWorld
 from roadproof.recordings import RecordingSet
 from roadproof.rollout import Episode
 
 FORMAT = "roadproof-prediction"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _PATHS = ("clean_xy", "predicted_xy", "driven_xy")
 
 
@@ -30,7 +30,10 @@ class Prediction:
     """One pattern, foretold and driven over.
 
     Args:
-        predicted_m: the paper's deviation in the recorded world, against its own bare road.
+        predicted_m: the paper's deviation in the recorded world, against its own bare road; mean over small errors of
+            steering.
+        least_m: of it over those errors.
+        most_m: of it over those errors.
         driven_m: the same in the simulator.
         path_error_m: mean distance between the predicted and the driven position at the same instants.
         gap_m: the most that the predicted path is aside of a recorded pose.
@@ -41,6 +44,8 @@ class Prediction:
     """
 
     predicted_m: float
+    least_m: float
+    most_m: float
     driven_m: float
     path_error_m: float
     gap_m: float
@@ -108,13 +113,16 @@ def predict(
     world.fit(controller)
     on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
     with torch.no_grad():
-        bare, rolled = world.roll(controller), world.roll(controller, on_device)
+        rolled = world.roll(controller, on_device)
+    deviations = world.deviations_m(controller, on_device, UNSURE)
     predicted, canvas = world.whole_path(rolled, 0), world.course.canvas
     seen = passage(path_of(clean), canvas)
     driven = path_of(painted)[seen]
     both = min(len(driven), len(predicted))
     return Prediction(
-        predicted_m=deviation_m(world.whole_path(bare, 0), predicted),
+        predicted_m=float(deviations.mean()),
+        least_m=float(deviations.min()),
+        most_m=float(deviations.max()),
         driven_m=passage_deviation_m(clean, painted, canvas),
         path_error_m=float(np.hypot(*(predicted[:both] - driven[:both]).T).mean()) if both else 0.0,
         gap_m=float(rolled.left_m.abs().max()),

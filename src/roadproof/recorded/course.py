@@ -102,14 +102,12 @@ class Course:
         turned = turned - 2 * math.pi * torch.round(turned.detach() / (2 * math.pi))
         return Place(index, self.arclength_m[index] + (c * dx + s * dy).detach(), s * dx - c * dy, turned)
 
-    def between(self, values: Float[Tensor, " n"], place: Place) -> Float[Tensor, " r"]:
-        """What has one value a point of the path, at places between them."""
-        last = len(values) - 2
-        behind = (place.s_m < self.arclength_m[place.nearest]).long()
-        low = (place.nearest - behind).clamp(0, last)
-        start, end = self.arclength_m[low], self.arclength_m[low + 1]
-        share = ((place.s_m - start) / (end - start).clamp_min(1e-6)).clamp(0.0, 1.0)
-        return torch.lerp(values[low], values[low + 1], share)
+    def at(self, values: Float[Tensor, " n"], s_m: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
+        """What has one value a point of the path, at arclengths between them; its ends' values beyond them."""
+        high = torch.searchsorted(self.arclength_m, s_m.contiguous(), right=True).clamp(1, len(values) - 1)
+        start, end = self.arclength_m[high - 1], self.arclength_m[high]
+        share = ((s_m - start) / (end - start).clamp_min(1e-6)).clamp(0.0, 1.0)
+        return torch.lerp(values[high - 1], values[high], share)
 
     def fit_law(self, poses: Poses, answers: Float[Tensor, " n"]) -> None:
         """Fit the bare road's law to a controller's answers to recorded frames."""
@@ -117,14 +115,14 @@ class Course:
         d, e = place.right_m, place.turned_rad
         terms = torch.stack([d, e, d * d.abs()], 1)
         weight = torch.eye(3, dtype=d.dtype, device=d.device) * 1e-3 * len(d)
-        left = answers.to(d) - self.between(self.steer, place)
+        left = answers.to(d) - self.at(self.steer, place.s_m)
         self._law = cast("Tensor", torch.linalg.solve(terms.mT @ terms + weight, terms.mT @ left))
 
     def law(self, place: Place) -> Float[Tensor, " r"]:
         """Steering on the bare road at some places."""
         d = place.right_m.clamp(-_FAR_M, _FAR_M)
         p, q, r = self._slopes()
-        return self.between(self.steer, place) + p * d + q * place.turned_rad + r * d * d.abs()
+        return self.at(self.steer, place.s_m) + p * d + q * place.turned_rad + r * d * d.abs()
 
     def _slopes(self) -> tuple[Tensor, Tensor, Tensor]:
         return self._law[0], self._law[1], self._law[2]

@@ -24,8 +24,8 @@ from torch import Tensor
 from roadproof.compositing.raster import composite_raster
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
-from roadproof.io.files import is_plain_name
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, Homography, homography_from_pose
+from roadproof.io.files import is_plain_name
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recorded.world import RecordedWorld

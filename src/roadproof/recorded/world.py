@@ -29,6 +29,8 @@ PAST_M = 1.0
 AT_ONCE = 32
 """Drives rolled side by side where there may be thousands: more make no CPU faster."""
 
+_LOOK_AHEAD_M, _LOOK_AHEAD_S = 1.5, 0.5
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Start:
@@ -38,11 +40,17 @@ class Start:
         right_m: offset to the right.
         turned_rad: heading, left positive.
         faster_mps: speed.
+        steer: added to whatever the controller answers, from there on: stands for what pictures get wrong.
     """
 
     right_m: float = 0.0
     turned_rad: float = 0.0
     faster_mps: float = 0.0
+    steer: float = 0.0
+
+
+UNSURE = tuple(Start(steer=steer) for steer in (-0.02, -0.01, 0.0, 0.01, 0.02))
+"""Drives that show whether a prediction hangs by a thread: pictures are wrong by about so much steering (measured)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,6 +150,8 @@ class RecordedWorld:
         course = self.course
         rows: list[tuple[Tensor, ...]] = []
         controls = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
+        off = torch.tensor([start.steer for start in starts], dtype=torch.float64, device=self.device)
+        off = off.repeat(count // len(starts))
         gap = self.bank.nearest(Poses(car.x_m, car.y_m, car.yaw_rad))
         for step in range(course.count):
             poses = Poses(car.x_m, car.y_m, car.yaw_rad)
@@ -150,7 +160,8 @@ class RecordedWorld:
                 gap = self.bank.nearest(poses.detached())
                 answer = self._answer(controller, pattern, poses, car, gap)
                 past = place.s_m > self._shown_m
-                steer = torch.where(past, course.law(place), answer[:, 0] + course.feedback(place)).clamp(-1.0, 1.0)
+                steer = torch.where(past, course.law(place), answer[:, 0] + off + course.feedback(place))
+                steer = steer.clamp(-1.0, 1.0)
                 pedals = answer[:, 1:] if answer.shape[1] == 3 else self._recorded_pedals(place, car)
                 controls = torch.cat([steer[:, None], pedals], 1)
             here = (car.x_m, car.y_m, car.yaw_rad, car.speed_mps, place.right_m)
@@ -171,16 +182,23 @@ class RecordedWorld:
         clean = np.stack([x + course.canvas.x_m, y + course.canvas.y_m], 1)
         return np.concatenate([clean, rolled.path(index)])
 
-    def deviations_m(self, controller: Controller, patterns: Pattern) -> list[float]:
-        """The paper's deviation that each pattern of a batch is predicted to cause: every picture, the clean start."""
+    def deviations_m(
+        self, controller: Controller, patterns: Pattern, starts: tuple[Start, ...] = (Start(),)
+    ) -> Float[np.ndarray, "r s"]:
+        """The paper's deviation that each pattern of a batch is predicted to cause, from each start."""
+        at_once = max(1, AT_ONCE // len(starts))
         with torch.no_grad():
-            bare = self.whole_path(self.roll(controller), 0)
+            rolled = self.roll(controller, starts=starts)
+            bare = [self.whole_path(rolled, k) for k in range(len(starts))]
             found: list[float] = []
-            for first in range(0, len(patterns.boxes), AT_ONCE):
-                part = slice(first, first + AT_ONCE)
-                rolled = self.roll(controller, Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part]))
-                found += [deviation_m(bare, self.whole_path(rolled, k)) for k in range(len(rolled.x_m))]
-        return found
+            for first in range(0, len(patterns.boxes), at_once):
+                part = slice(first, first + at_once)
+                some = Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part])
+                rolled = self.roll(controller, some, starts=starts)
+                found += [
+                    deviation_m(bare[k % len(starts)], self.whole_path(rolled, k)) for k in range(len(rolled.x_m))
+                ]
+        return np.array(found).reshape(-1, len(starts))
 
     def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:
         """Cars at the first recorded frame of the clean drive, one for each start, all of them so many times."""
@@ -215,10 +233,11 @@ class RecordedWorld:
         return controller.steer(frames, speed, command).double()[:, None]
 
     def _recorded_pedals(self, place: Place, car: Motion) -> Float[Tensor, "r 2"]:
-        """What holds the clean drive's speed at each place."""
-        wanted = self.course.between(self.course.speed_mps, place)
+        """What brings a car to the clean drive's speed a little way ahead; of its place alone, a stand has no end."""
+        ahead = _LOOK_AHEAD_M + _LOOK_AHEAD_S * car.speed_mps
+        wanted = self.course.at(self.course.speed_mps, place.s_m + ahead)
         e, f, g, h, _ = self.vehicle.pulling
-        pull = (wanted - car.speed_mps) / 0.5 - g - h * car.speed_mps
+        pull = (wanted.square() - car.speed_mps.square()) / (2 * ahead) - g - h * car.speed_mps
         return torch.stack([(pull / e).clamp(0.0, 1.0), (pull / f).clamp(0.0, 1.0)], 1)
 
 

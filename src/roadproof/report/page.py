@@ -33,7 +33,7 @@ from roadproof.simulators.protocol import PaintKind
 FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
 SHOWN_COMPOSITES = 3
-FORETOLD = ("predicted_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad")
+FORETOLD = ("predicted_m", "least_m", "most_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad")
 
 PAINTED = {
     PaintKind.RENDERED: "It is part of the simulator’s world, rendered with the road.",
@@ -284,6 +284,7 @@ def _foretold(run: Run) -> Fields | None:
     return {
         "chart": None if canvas is None else charts.foretold(prediction, canvas),
         "predicted": f"{prediction.predicted_m:.2f}",
+        "spread": f"{prediction.least_m:.2f} to {prediction.most_m:.2f}",
         "driven": f"{prediction.driven_m:.2f}",
         "error": f"{prediction.error_m:+.2f}",
         "path_error": f"{prediction.path_error_m:.2f}",
