@@ -73,7 +73,7 @@ def test_jobs_that_fail_are_a_line_each(study, plan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "blind_one.py").write_text(BLIND)
     plan.write_text(PLAN.replace('"pilotnet"', '"blind_one:Blind"'))
-    code, printed = study("run", plan, "--out", tmp_path / "out")
+    code, printed = study("run", plan, "--trust", "--out", tmp_path / "out")
     assert code == 1
     assert "FAILED short, K = 1-b, chance, seed 0: " in printed.out
     assert "sees nothing" in printed.out.split("FAILED")[1]
@@ -87,7 +87,8 @@ def test_mistakes_are_one_clear_line(study, plan, tmp_path):
     for arguments, message in (
         (["run", tmp_path / "none.toml"], "cannot read"),
         (["run", unknown], "did you mean 'calls'"),
-        (["run", nobody], "cannot import own:nobody"),
+        (["run", nobody], "'own:nobody' runs what its author wrote; look at it, then give --trust"),
+        (["run", nobody, "--trust"], "cannot import own:nobody"),
         (["run", plan, "--workers", 0], "workers is 0"),
         (["transfer", plan, "--controllers", "cil"], "no results of this study"),
         (["transfer", plan, "--controllers", ","], "no controller"),

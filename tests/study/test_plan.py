@@ -35,6 +35,24 @@ random_calls = 40
 """
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('controller = "cil"', 'controller = "evil:factory"', "'evil:factory' runs what its author wrote"),
+        ('controller = "cil"', 'controller = "a.pt2"', "'a.pt2' runs what its author wrote"),
+        ('controller = "cil"', 'controller = "cil"\nsimulator = "carla://example.org:2000"', "is another machine"),
+    ],
+)
+def test_a_plan_that_runs_code_or_calls_out_is_followed_on_request_alone(tmp_path, before, after, message):
+    path = written(tmp_path, TEXT.replace(before, after, 1))
+    with pytest.raises(StudyError, match=message) as refused:
+        load_study(path)
+    assert "--trust" in str(refused.value)
+    assert load_study(path, trust=True).jobs
+    for harmless in ('controller = "cil:w.safetensors"', 'controller = "cil"\nsimulator = "carla://localhost:2000"'):
+        assert load_study(written(tmp_path, TEXT.replace('controller = "cil"', harmless, 1)))
+
+
 def written(tmp_path, text):
     path = tmp_path / "study.toml"
     path.write_text(text)

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from roadproof.study.plan import Job
     from roadproof.study.rows import JobResult
 
+_TRUST = typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
+
 study = typer.Typer(no_args_is_help=True, add_completion=False, help="Compare methods over many scenarios.")
 
 
@@ -30,6 +32,7 @@ def run(
         str | None,
         typer.Option(help="Address of a Ray cluster, or local for one on this machine.", show_default=False),
     ] = None,
+    trust: Annotated[bool, _TRUST] = False,
 ) -> None:
     """Find and evaluate a pattern for every scenario, number of figures, method and seed of a plan."""
     # Torch takes seconds to import; `--help` should not.
@@ -43,7 +46,7 @@ def run(
     from roadproof.study.run import run_study
     from roadproof.study.summary import failures, summary
 
-    chosen = load_study(plan)
+    chosen = load_study(plan, trust=trust)
     begun = sum(is_done(job, out) for job in chosen.jobs)
     if begun < len(chosen.jobs):
         # One that is not there is refused at once, not job by job.
@@ -74,6 +77,7 @@ def transfer(
     plan: Annotated[Path, typer.Argument(help="The study's TOML file.", show_default=False)],
     controllers: Annotated[str, typer.Option(help="Whom to try, with commas: cil,pilotnet.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Folder with the study's results.")] = Path("out/study"),
+    trust: Annotated[bool, _TRUST] = False,
 ) -> None:
     """Drive other controllers over the patterns a study found."""
     from rich.console import Console
@@ -84,7 +88,7 @@ def transfer(
     from roadproof.study.summary import matrix
     from roadproof.study.transfer import transfer as run_transfer
 
-    chosen = load_study(plan)
+    chosen = load_study(plan, trust=trust)
     specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
     with stages() as show:
         rows = records(

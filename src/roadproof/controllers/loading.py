@@ -35,6 +35,12 @@ SPECS = (
 _METADATA_KEY = "roadproof"
 
 
+def runs_code(spec: str) -> bool:
+    """Whether loading a controller of this spec runs what its author wrote: an exported network, or Python."""
+    head, _, tail = spec.partition(":")
+    return spec.endswith(".pt2") or (bool(tail) and head not in ARCHITECTURES)
+
+
 def load_network(path: Path) -> CIL | ConditionalPilotNet:
     """A network as it was trained, to train on: nothing merged, gradients on, in float32.
 

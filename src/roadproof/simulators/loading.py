@@ -53,6 +53,15 @@ def is_server(spec: str) -> bool:
     return spec.startswith("carla://")
 
 
+def is_elsewhere(spec: str) -> bool:
+    """Whether it is on another machine.
+
+    Raises:
+        SimulatorError: it is no address.
+    """
+    return is_server(spec) and _address(spec)[0] not in ("localhost", "127.0.0.1", "::1")
+
+
 @contextmanager
 def open_simulator(spec: str) -> Generator[MappedSimulator]:
     """Open the simulator of a spec for a with-block; leaving frees everything it holds.

@@ -51,15 +51,16 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
+from roadproof.controllers.loading import runs_code
 from roadproof.datatypes import Weather
 from roadproof.errors import StudyError
 from roadproof.limits import MANY, MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
-from roadproof.simulators.loading import SPECS, is_server
+from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 1
-JOB_VERSION = 1
+JOB_VERSION = 2
 """Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
 
 Scheme = Literal["group", "group-all", "random"]
@@ -256,11 +257,16 @@ class Study:
         )
 
 
-def load_study(path: Path) -> Study:
+def load_study(path: Path, *, trust: bool = False) -> Study:
     """Read a study; see the head of this module.
 
+    Args:
+        path: of the TOML file.
+        trust: follow it also where it runs code or calls another machine: a plan may come from anyone.
+
     Raises:
-        StudyError: the file is missing or damaged, a key is unknown, or a value makes no sense; says which.
+        StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or it is not trusted with
+            what it asks for; says which.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -269,9 +275,21 @@ def load_study(path: Path) -> Study:
     except (ValueError, RecursionError) as error:
         raise StudyError(f"{path} is not valid TOML ({error})") from None
     try:
-        return _study(content, path.parent)
+        study = _study(content, path.parent)
+        if not trust:
+            _check_harmless(study)
     except StudyError as error:
         raise StudyError(f"{path}: {error}") from None
+    return study
+
+
+def _check_harmless(study: Study) -> None:
+    if runs_code(study.controller):
+        raise StudyError(
+            f"controller {study.controller!r} runs what its author wrote; look at it, then give --trust (trust=True)"
+        )
+    if is_elsewhere(study.simulator):
+        raise StudyError(f"simulator {study.simulator!r} is another machine; give --trust (trust=True) to call it")
 
 
 def _study(content: dict[str, Any], folder: Path) -> Study:
