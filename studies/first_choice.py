@@ -5,7 +5,7 @@
 For every controller, scenario and seed, five drives are recorded and calibrated as `roadproof demo` does (15 calls of
 the simulator), and searched twice:
   steering    the steering shift on those recorded frames, heats and 30 steps
-  deviation   the path in the recorded world, heats and 24 steps
+  deviation   the path in the recorded world, heats and 32 steps
 Each search's six candidates, best first in its own order, are driven once at clear noon, alone. So every row holds what
 the search thought, what its first choice did when driven, what the best of its six did, and which it was; the first
 choice is driven in the paper's other weathers too. Nothing driven chose a pattern.

@@ -205,10 +205,10 @@ def test_a_pattern_that_paints_nothing_is_refused(town, tmp_path):
 
 DAMAGE = {
     "is not valid JSON": lambda text: text[:100],
-    "'trials'": lambda text: text.replace('"trials"', '"trails"'),
+    "required field `trials`": lambda text: text.replace('"trials"', '"trails"'),
     "is not a plain name": lambda text: text.replace('"clean": "', '"clean": "../'),
     "has version 9": lambda text: text.replace('"version": 1', '"version": 9'),
-    "weather 'dry' is unknown": lambda text: text.replace('"clear-noon"', '"dry"'),
+    "Invalid enum value 'dry'": lambda text: text.replace('"clear-noon"', '"dry"'),
 }
 
 

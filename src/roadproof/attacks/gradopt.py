@@ -32,14 +32,16 @@ class Heat:
 
     Args:
         starts: of every group: the best of the round before, and random ones where those are fewer.
-        iterations: steps of each, at the schedule's first learning rate.
+        iterations: steps of each.
         every: the share of the frames used: every n-th of each drive; in the recorded world, of the steps.
+        learning_rate: of these steps.
         open_loop: climb the steering shift on recorded frames, whatever the search makes large.
     """
 
     starts: int
     iterations: int
     every: int
+    learning_rate: float = 0.1
     open_loop: bool = False
 
     def __post_init__(self) -> None:
@@ -96,8 +98,8 @@ class Schedule:
         )
 
     @staticmethod
-    def closed_loop(iterations: int = 24) -> Schedule:
-        """For a search where the car goes: heats with few pictures, then more.
+    def closed_loop(iterations: int = 32) -> Schedule:
+        """For a search where the car goes: heats with few pictures, then smaller steps with more: a loop amplifies.
 
         It begins where the steering shift is large. A controller that holds its lane well brings the car back from
         what a random pattern does, and the path has hardly a gradient there; what also turns the wheel where a car is
@@ -105,6 +107,7 @@ class Schedule:
         """
         return Schedule(
             iterations=iterations,
+            learning_rate=0.05,
             drops=(iterations // 2, iterations * 4 // 5),
             factor=0.3,
             heats=(
@@ -222,7 +225,15 @@ def _rungs(schedule: Schedule, restarts: int) -> list[_Rung]:
         places = [heat.starts for heat in schedule.heats]
         raise RoadproofError(f"heats of {places} starts leave fewer than {restarts} restarts; ask for fewer")
     steps = (
-        replace(schedule, iterations=heat.iterations, drops=(), patience=None, heats=()) for heat in schedule.heats
+        replace(
+            schedule,
+            iterations=heat.iterations,
+            learning_rate=heat.learning_rate,
+            drops=(),
+            patience=None,
+            heats=(),
+        )
+        for heat in schedule.heats
     )
     heats = [
         _Rung(heat.starts, heat.every, each, heat.open_loop) for heat, each in zip(schedule.heats, steps, strict=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.attacks.checks import Check
-from roadproof.attacks.gradopt import Heat, Schedule
-from roadproof.coverage import Shape
+from roadproof.attacks.gradopt import Schedule
 from roadproof.errors import RoadproofError
 from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import record
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
 
 FORMAT = "roadproof-attack"
 FORMAT_VERSION = 1
-_LATER = ("objective", "predicted_m")
-_PLAIN = ("group", "surrogate_shift", "by_group", "stopped", "restarts", "seed", *_LATER)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -111,21 +109,16 @@ class AttackResult:
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
-        content = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "kind": "surrogate and predicted: composited frames, not driving",
-            **{name: getattr(self, name) for name in _PLAIN},
-            "predicted_range_m": self.predicted_range_m,
+        told: dict[str, Any] = asdict(self)
+        del told["pattern"]
+        told |= {
             "candidates": [
                 [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
             ],
-            "cost": asdict(self.cost),
-            "checks": [asdict(check) for check in self.checks],
-            "space": asdict(self.space),
-            "schedule": asdict(self.schedule),
             "history": np.round(self.history.astype(float), 6).tolist(),
         }
+        kind = "surrogate and predicted: composited frames, not driving"
+        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, **told}
         write_atomically(folder / "result.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
 
     @staticmethod
@@ -135,46 +128,51 @@ class AttackResult:
         Raises:
             RoadproofError: a file is missing, damaged or of another format.
         """
-        fields = read_json(folder / "result.json", FORMAT, FORMAT_VERSION, RoadproofError)
+        path, remedy = folder / "result.json", "search again"
+        content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
+        told = record(content, _Stored, path, RoadproofError, remedy)
         try:
-            return AttackResult(
-                pattern=load_pattern(folder / "pattern.json"),
-                candidates=tuple(
-                    Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), str(each[0]), *_numbers(each[1:]))
-                    for rank, each in enumerate(fields["candidates"], 1)
-                ),
-                cost=Cost(**fields["cost"]),
-                checks=tuple(Check(**check) for check in fields["checks"]),
-                space=_space(fields["space"]),
-                schedule=_schedule(fields["schedule"]),
-                history=np.array(fields["history"], dtype=np.float64),
-                # Results that do not name their objective are older than the word.
-                predicted_range_m=_pair(fields.get("predicted_range_m")),
-                **{name: fields[name] for name in _PLAIN if name in fields or name not in _LATER},
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise RoadproofError(f"{folder / 'result.json'} is incomplete or damaged: {error}") from None
+            history = np.array(told.history, dtype=np.float64)
+        except ValueError as error:
+            raise RoadproofError(f"{path} is incomplete or damaged ({error}); {remedy}") from None
+        candidates: list[Candidate] = []
+        for rank, each in enumerate(told.candidates, 1):
+            ranked = record(dict(zip(_Ranked.__slots__, each, strict=False)), _Ranked, path, RoadproofError, remedy)
+            candidates.append(Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), *astuple(ranked)))
+        return AttackResult(
+            pattern=load_pattern(folder / "pattern.json"),
+            candidates=tuple(candidates),
+            history=history,
+            **{name: getattr(told, name) for name in _Stored.__slots__ if name not in ("candidates", "history")},
+        )
 
 
-def _numbers(stored: list[Any]) -> tuple[float, float | None, tuple[float, float] | None]:
-    predicted, spread = (*stored[1:], None, None)[:2]  # older results lack the last one or two
-    return float(stored[0]), None if predicted is None else float(predicted), _pair(spread)
+@dataclass(frozen=True, slots=True)
+class _Ranked:
+    """A candidate but for its pattern; older results lack the last one or two."""
+
+    group: str
+    surrogate_shift: float
+    predicted_m: float | None = None
+    predicted_range_m: tuple[float, float] | None = None
 
 
-def _pair(stored: Any) -> tuple[float, float] | None:  # noqa: ANN401
-    if stored is None:
-        return None
-    low, high = stored
-    return float(low), float(high)
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Stored:
+    """result.json; results that do not name their objective are older than the word."""
 
-
-def _schedule(stored: dict[str, Any]) -> Schedule:
-    heats = tuple(Heat(**heat) for heat in stored.get("heats", ()))
-    fields: dict[str, Any] = {**stored, "drops": tuple(stored["drops"]), "heats": heats}
-    return Schedule(**fields)
-
-
-def _space(stored: dict[str, Any]) -> SearchSpace:
-    darkest, brightest = stored["albedo"]
-    fields: dict[str, Any] = {**stored, "albedo": (darkest, brightest), "shape": Shape(stored["shape"])}
-    return SearchSpace(**fields)
+    group: str
+    surrogate_shift: float
+    by_group: dict[str, float]
+    stopped: str
+    restarts: int
+    seed: int
+    candidates: list[list[Any]]
+    history: list[list[list[float]]]
+    cost: Cost
+    checks: tuple[Check, ...]
+    space: SearchSpace
+    schedule: Schedule
+    objective: str = "steering shift"
+    predicted_m: float | None = None
+    predicted_range_m: tuple[float, float] | None = None

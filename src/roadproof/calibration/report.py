@@ -12,6 +12,7 @@ from jaxtyping import Float
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
 from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import record
 
 FORMAT = "roadproof-calibration"
 FORMAT_VERSION = 1
@@ -88,29 +89,7 @@ def load_report(path: Path) -> CalibrationReport:
         CalibrationError: the file is missing or damaged.
     """
     content = read_json(path, FORMAT, FORMAT_VERSION, CalibrationError)
-
-    def spread(values: dict[str, float] | None) -> Spread | None:
-        return None if values is None else Spread(**values)
-
-    try:
-        return CalibrationReport(
-            method=str(content["method"]),
-            drives=tuple(
-                DriveReport(
-                    name=drive["name"],
-                    frames=drive["frames"],
-                    dropped=tuple((int(number), str(reason)) for number, reason in drive["dropped"]),
-                    residual_px=spread(drive["residual_px"]),
-                    stated_px=spread(drive["stated_px"]),
-                )
-                for drive in content["drives"]
-            ),
-            colour_residual=content["colour_residual"],
-            calls=content["calls"],
-            seconds=content["seconds"],
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise CalibrationError(f"{path} is incomplete or damaged ({error}); calibrate again") from None
+    return record(content, CalibrationReport, path, CalibrationError, "calibrate again")
 
 
 def stated_errors_px(

@@ -77,7 +77,7 @@ def main() -> None:
     try:
         app()
     except RoadproofError as error:
-        complain(f"roadproof: {error}")
+        complain(f"roadproof: {error!s:.1000}")  # what a message quotes may be long
         sys.exit(2)
     except KeyboardInterrupt:
         complain("roadproof: interrupted; give the same command again to go on")

@@ -28,6 +28,7 @@ from roadproof.datatypes import Ending, Event, Weather
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import check_name, read_json, write_atomically
+from roadproof.io.records import record
 from roadproof.metrics import (
     HORIZON_M,
     Mean,
@@ -80,6 +81,9 @@ class Trial:
         ending: why the painted drive ended.
         events: of the painted drive, those that count (`metrics.counted`), so that anyone can count again.
         clean_events: of the clean one.
+
+    Raises:
+        EpisodeError: the name of an episode's file is not a plain one.
     """
 
     pattern: str
@@ -99,6 +103,11 @@ class Trial:
     ending: str
     events: tuple[Event, ...] = ()
     clean_events: tuple[Event, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in (self.clean, self.painted):
+            if not check_name(name, "episode", EpisodeError).endswith(".npz"):
+                raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -147,7 +156,8 @@ class Evaluation:
         trials: every drive over paint.
         simulator_calls: drives that all this takes, clean ones included; 0 where they are predicted.
         seconds: wall time of the drives made now; those found in the folder cost nothing.
-        paint: how the simulator puts a pattern on the road.
+        paint: how the simulator puts a pattern on the road; files that do not say it are older than the word, when the
+            town alone was driven.
     """
 
     scenario: Scenario
@@ -231,20 +241,10 @@ class Evaluation:
         path = folder / "evaluation.json"
         content = read_json(path, FORMAT, FORMAT_VERSION, EpisodeError)
         try:
-            return Evaluation(
-                scenario=load_scenarios(folder / "scenario.toml")[0],
-                weathers=tuple(Weather(name) for name in content["weathers"]),
-                trials=tuple(trial_from_json(each) for each in content["trials"]),
-                seconds=float(content["seconds"]),
-                # Files that do not say it are older than the word, when the town alone was driven.
-                paint=PaintKind(content.get("paint", PaintKind.RENDERED)),
-                **{
-                    name: content[name]
-                    for name in ("controller", "runs", "cars", "pedestrians", "seed", "simulator_calls")
-                },
-            )
-        except (KeyError, TypeError, ValueError, RoadproofError) as error:
+            scenario = load_scenarios(folder / "scenario.toml")[0]
+        except RoadproofError as error:
             raise EpisodeError(f"{path} is incomplete or damaged ({error}); evaluate again") from None
+        return record(content | {"scenario": asdict(scenario)}, Evaluation, path, EpisodeError, "evaluate again")
 
 
 def kind_of(paint: PaintKind) -> str:
@@ -342,21 +342,6 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
         failed=None if points is None else len(first) / len(trials),
         first_event_s=mean_95(first) if first else None,
     )
-
-
-def trial_from_json(stored: dict[str, Any]) -> Trial:
-    """A trial as `dataclasses.asdict` and JSON leave it.
-
-    Raises:
-        EpisodeError: the name of an episode is not a plain one.
-        KeyError, TypeError, ValueError: something is missing or wrong.
-    """
-    for name in (stored["clean"], stored["painted"]):
-        if not check_name(name, "episode", EpisodeError).endswith(".npz"):
-            raise EpisodeError(f"episode {name!r} is not the name of an .npz file")
-    events = {name: tuple(map(Event.of, stored[name])) for name in ("events", "clean_events") if name in stored}
-    fields: dict[str, Any] = {**stored, **events, "weather": Weather(stored["weather"])}
-    return Trial(**fields)
 
 
 def _save_scenario(scenario: Scenario, folder: Path) -> None:

@@ -17,8 +17,9 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError
 from roadproof.evaluation.episodes import CLEAN, Conditions, Episodes
-from roadproof.evaluation.result import Trial, trial_from_json
+from roadproof.evaluation.result import Trial
 from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import record
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario
@@ -92,24 +93,26 @@ class Selection:
         """
         path = folder / "selection.json"
         content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
-        try:
-            driven = tuple(
-                Driven(group=each["group"], rank=each["rank"], trial=trial_from_json(each["trial"]))
-                for each in content["driven"]
-            )
-            chosen = int(content["chosen"])
-            calls = int(content["simulator_calls"])
-            if not 0 <= chosen < len(driven):
-                raise ValueError(f"chosen is {chosen} of {len(driven)}")
-        except (KeyError, TypeError, ValueError) as error:
-            raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove {folder}") from None
+        told = record(content, _Stored, path, RoadproofError, f"remove {folder}")
+        if not 0 <= told.chosen < len(told.driven):
+            raise RoadproofError(f"{path} has chosen {told.chosen} of {len(told.driven)}; remove {folder}")
         return Selection(
             pattern=load_pattern(folder / "pattern.json"),
-            driven=driven,
-            chosen=chosen,
-            simulator_calls=calls,
-            predicted=content.get("kind") == "predicted",
+            driven=told.driven,
+            chosen=told.chosen,
+            simulator_calls=told.simulator_calls,
+            predicted=told.kind == "predicted",
         )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Stored:
+    """selection.json."""
+
+    driven: tuple[Driven, ...]
+    chosen: int
+    simulator_calls: int
+    kind: str = "closed loop"
 
 
 def select_by_driving(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import tempfile
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
+_MOST_DIGITS = 20
 _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
 
 
@@ -148,6 +150,19 @@ def check_writable(folder: Path) -> None:
     probe.unlink(missing_ok=True)
 
 
+def _whole(text: str) -> int:
+    if len(text) > _MOST_DIGITS:
+        raise ValueError(f"a number has {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text:.20} is no finite number")
+    return value
+
+
 def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:
     """Read a JSON file that names its format and version.
 
@@ -158,10 +173,13 @@ def read_json(path: Path, file_format: str, version: int, error: type[RoadproofE
         error: what to raise.
 
     Raises:
-        error: the file is missing, is not JSON, or is of another format or a newer version.
+        error: the file is missing, is not JSON, has a number that is none (NaN, infinity, hundreds of digits), or is of
+            another format or a newer version.
     """
     try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
+        content: Any = json.loads(
+            path.read_text(encoding="utf-8"), parse_int=_whole, parse_float=_finite, parse_constant=_finite
+        )
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}") from None
     except (ValueError, RecursionError) as reason:

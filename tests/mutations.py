@@ -1,0 +1,62 @@
+"""Files as someone may have changed them, by accident or to do harm."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+ODD: tuple[Any, ...] = (
+    None, True, -1, 0, 1e39, 1e308, float("nan"), float("inf"), 10**400, -(10**25), "", "x" * 5000, "../../x", "/etc",
+    "a\x00b", "<script>", [], {}, [[]], [None], {"a": {}}, "NaN", "1e999", "\ud800",
+)  # fmt: skip
+"""Values that no file of ours has where they are put."""
+
+
+def mutated(content: bytes, suffix: str, rng: random.Random) -> bytes:
+    """One change: a value of JSON for an odd one, or bytes flipped, cut, doubled, filled with zeros."""
+    if suffix == ".json" and rng.random() < 0.7:
+        return _with_odd_value(content, rng)
+    changed = bytearray(content)
+    first = rng.randrange(len(changed))
+    length = min(rng.choice((1, 1, 1, 2, 8, 100)), len(changed) - first)
+    match rng.randrange(5):
+        case 0:
+            for place in range(first, first + length):
+                changed[place] ^= rng.randrange(1, 256)
+        case 1:
+            del changed[first:]
+        case 2:
+            del changed[first : first + length]
+        case 3:
+            changed[first:first] = changed[first : first + length]
+        case _:
+            changed[first : first + length] = bytes(length)
+    return bytes(changed)
+
+
+def _with_odd_value(content: bytes, rng: random.Random) -> bytes:
+    whole: Any = json.loads(content)
+    places = list(_places(whole))
+    if not places:
+        return b"[" * 100_000
+    box, key = rng.choice(places)
+    if rng.random() < 0.15:
+        del box[key]
+    else:
+        box[key] = rng.choice(ODD)
+    return json.dumps(whole).encode("utf-8", "surrogatepass")
+
+
+def _places(value: Any) -> Any:
+    """Every key of every object and every index of every list."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, each in list(inner):
+        yield value, key
+        yield from _places(each)
+
+
+def files_of(folder: Path, *suffixes: str) -> list[Path]:
+    """Every file of some kinds, in one order."""
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix in suffixes)
