@@ -48,7 +48,7 @@ from roadproof.evaluation import (
     select_by_driving,
 )
 from roadproof.evaluation.episodes import load_episodes
-from roadproof.io.files import check_writable
+from roadproof.io.locks import working_in
 from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.patterns import Pattern, save_pattern
@@ -231,69 +231,70 @@ def stress_test(
         on_progress: told of every step of every stage.
 
     Raises:
-        RoadproofError: the folder holds a run of something else, or a stage refuses; the message says why.
+        RoadproofError: the folder holds a run of something else, another process works in it, or a stage refuses; the
+            message says why.
     """
     if processes < 1 or (processes > 1 and another is None):
         raise RoadproofError(
             f"{processes} processes; expected 1, or more with a function that opens another simulator for each"
         )
-    check_writable(folder)
-    space = space or SearchSpace(figures=5)
-    # What tells this run from another.
-    told = (asdict(scenario), asdict(budget), asdict(space), seed, controller_name)
-    ledger = Ledger(folder, json.dumps(told, default=str), STAGES, paint=simulator.paint)
+    with working_in(folder):
+        space = space or SearchSpace(figures=5)
+        # What tells this run from another.
+        told = (asdict(scenario), asdict(budget), asdict(space), seed, controller_name)
+        ledger = Ledger(folder, json.dumps(told, default=str), STAGES, paint=simulator.paint)
 
-    def tell(stage: str, done: int, total: int, word: str) -> None:
-        ledger.step()
-        on_progress(stage, done, total, word)
+        def tell(stage: str, done: int, total: int, word: str) -> None:
+            ledger.step()
+            on_progress(stage, done, total, word)
 
-    run = _Run(
-        simulator=simulator,
-        controller=controller,
-        scenario=scenario,
-        folder=folder,
-        budget=budget,
-        space=space,
-        seed=seed,
-        controller_name=controller_name,
-        device=device,
-        on_progress=tell,
-    )
-    with ledger.stage("record"):
-        drives = [_record(run, number) for number in range(len(budget.recorded_in))]
-        ledger.calls("record", sum(each.calls for each in drives))
-    with ledger.stage("calibrate"):
-        calibrated = [_calibrate(run, number, each) for number, each in enumerate(drives)]
-        ledger.calls("calibrate", sum(replays_needed(each, budget.calibration) for each in drives))
-        recordings = pooled(
-            {str(each.settings.weather): c.recordings for each, c in zip(drives, calibrated, strict=True)}
+        run = _Run(
+            simulator=simulator,
+            controller=controller,
+            scenario=scenario,
+            folder=folder,
+            budget=budget,
+            space=space,
+            seed=seed,
+            controller_name=controller_name,
+            device=device,
+            on_progress=tell,
         )
-    groups = parse_groups("all", recordings) if budget.pooled else groups_of(recordings)
-    with ledger.stage("attack"):
-        found = _attack(run, recordings, groups)
-    selection, rounds = None, None
-    if budget.select:
-        with ledger.stage("select"):
-            selection = _select(run, found, drives[0])
-            ledger.calls("select", selection.simulator_calls)
-    if selection is not None and budget.rounds:
-        with ledger.stage("rounds"):
-            rounds = _search_on(run, drives[0], recordings, groups, found, selection)
-            ledger.calls("rounds", rounds.simulator_calls)
-    pattern = _chosen(found, selection, rounds)
-    save_pattern(pattern, folder / "pattern.json")
-    prediction = _predict(run, recordings, pattern, selection, rounds)
-    with ledger.stage("evaluate"):
-        evaluation = _evaluate(run, pattern, another if another and processes > 1 else simulator, processes)
-        ledger.calls("evaluate", evaluation.simulator_calls)
-    return StressTest(
-        attack=found,
-        selection=selection,
-        rounds=rounds,
-        prediction=prediction,
-        evaluation=evaluation,
-        cost=ledger.cost,
-    )
+        with ledger.stage("record"):
+            drives = [_record(run, number) for number in range(len(budget.recorded_in))]
+            ledger.calls("record", sum(each.calls for each in drives))
+        with ledger.stage("calibrate"):
+            calibrated = [_calibrate(run, number, each) for number, each in enumerate(drives)]
+            ledger.calls("calibrate", sum(replays_needed(each, budget.calibration) for each in drives))
+            recordings = pooled(
+                {str(each.settings.weather): c.recordings for each, c in zip(drives, calibrated, strict=True)}
+            )
+        groups = parse_groups("all", recordings) if budget.pooled else groups_of(recordings)
+        with ledger.stage("attack"):
+            found = _attack(run, recordings, groups)
+        selection, rounds = None, None
+        if budget.select:
+            with ledger.stage("select"):
+                selection = _select(run, found, drives[0])
+                ledger.calls("select", selection.simulator_calls)
+        if selection is not None and budget.rounds:
+            with ledger.stage("rounds"):
+                rounds = _search_on(run, drives[0], recordings, groups, found, selection)
+                ledger.calls("rounds", rounds.simulator_calls)
+        pattern = _chosen(found, selection, rounds)
+        save_pattern(pattern, folder / "pattern.json")
+        prediction = _predict(run, recordings, pattern, selection, rounds)
+        with ledger.stage("evaluate"):
+            evaluation = _evaluate(run, pattern, another if another and processes > 1 else simulator, processes)
+            ledger.calls("evaluate", evaluation.simulator_calls)
+        return StressTest(
+            attack=found,
+            selection=selection,
+            rounds=rounds,
+            prediction=prediction,
+            evaluation=evaluation,
+            cost=ledger.cost,
+        )
 
 
 def _chosen(found: AttackResult, selection: Selection | None, rounds: Rounds | None) -> Pattern:

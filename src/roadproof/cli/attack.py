@@ -74,7 +74,7 @@ def attack(
     from roadproof.controllers import load_controller
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
-    from roadproof.io.files import check_writable
+    from roadproof.io.locks import hold
     from roadproof.objectives import parse_groups
     from roadproof.recordings import Push, load_recordings
     from roadproof.search_space import FAMILIES, SearchSpace
@@ -87,7 +87,7 @@ def attack(
         albedo=albedo,
         max_painted_share=max_painted_share,
     )
-    check_writable(out)
+    hold(out)
     drives = load_recordings(recordings)
     pushed = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in drives.recordings}
     driven_in = gradient == "exact" and drives.is_placed and pushed

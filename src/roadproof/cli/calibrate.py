@@ -36,7 +36,7 @@ def calibrate(
     from roadproof.cli.progress import progress
     from roadproof.drives import load_drives
     from roadproof.errors import CalibrationError, RecordingError
-    from roadproof.io.files import check_writable
+    from roadproof.io.locks import hold
     from roadproof.simulators.loading import open_simulator
 
     how = choice(method, "method", METHODS)
@@ -44,7 +44,7 @@ def calibrate(
     if not runs:
         raise RecordingError(f"{folder} holds no run with a folder named record; make one with `roadproof record`")
     recorded = {path: load_drives(path / "record") for path in runs}
-    check_writable(folder)
+    hold(folder)
 
     for path, drives in recorded.items():
         done = Calibrated.load(path)

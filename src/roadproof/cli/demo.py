@@ -63,6 +63,7 @@ def demo(
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.io.files import write_atomically
+    from roadproof.io.locks import hold
     from roadproof.loop import BUDGETS, stress_test
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
@@ -75,6 +76,7 @@ def demo(
         spent = replace(spent, objective=OBJECTIVES[choice(objective, "objective", tuple(OBJECTIVES))])
     spent = replace(spent, rounds=rounds, attack_weathers=weathers_of(attack_weathers, "attack-weathers"))
     space = SearchSpace(figures=figures)
+    hold(out)
     who = load_controller(controller, device=device)
     with open_simulator(simulator) as world:
         with stages() as show:

@@ -63,7 +63,7 @@ def drive(
     """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.datatypes import Weather
-    from roadproof.io.files import check_writable
+    from roadproof.io.locks import hold
     from roadproof.patterns import read_paint
     from roadproof.rollout import rollout
 
@@ -75,7 +75,7 @@ def drive(
     if inside is not None:
         check_driver(driver)
     paint = None if pattern is None else read_paint(pattern)
-    check_writable(out)
+    hold(out)
     who: AnyDriver = driver_of(driver, device)
 
     # PyAV is an extra.

@@ -77,7 +77,7 @@ def evaluate(
     from roadproof.errors import PatternError
     from roadproof.evaluation import PAPER_WEATHERS, random_patterns
     from roadproof.evaluation import evaluate as run
-    from roadproof.io.files import check_writable
+    from roadproof.io.locks import hold
     from roadproof.patterns import load_pattern, read_paint
     from roadproof.recordings import load_recordings
 
@@ -96,7 +96,7 @@ def evaluate(
     if figures is None and (random or recordings):
         raise PatternError(f"{pattern} is a picture; --random and --recordings need the pattern.json of an attack")
     recorded = None if recordings is None else load_recordings(recordings)
-    check_writable(out)
+    hold(out)
     who = driver_of(controller, device)
     with open_world(simulator, device) as world:
         driven = stretch_of(world, asked)

@@ -75,7 +75,8 @@ def record(
     from roadproof.drives import Scheme, Trajectories
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError, ScenarioError
-    from roadproof.io.files import check_writable, inside
+    from roadproof.io.files import inside
+    from roadproof.io.locks import hold
     from roadproof.loop import PAPER, QUICK
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator
@@ -98,8 +99,9 @@ def record(
         perturbation=budget.perturbation,
     )
     window = replace(budget.window, horizon_m=horizon_m)
-    check_writable(out)
     places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
+    for place in places.values():
+        hold(place)
     who = driver_of(driver, device)
 
     with open_simulator(simulator) as world:

@@ -33,7 +33,7 @@ def select(
     from roadproof.drives import load_drives
     from roadproof.errors import RoadproofError
     from roadproof.evaluation import select_by_driving
-    from roadproof.io.files import check_writable
+    from roadproof.io.locks import hold
     from roadproof.patterns import save_pattern
 
     recorded = load_drives(run / "record").settings
@@ -44,7 +44,7 @@ def select(
             f"--out {place}"
         )
     found = AttackResult.load(place)
-    check_writable(run)
+    hold(run)
     inside = recorded_in(simulator)
     who = load_controller(controller, device=device)
     total = 1 + min(best, len(found.candidates))

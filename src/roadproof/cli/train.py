@@ -38,7 +38,7 @@ def train(
     from rich.console import Console
 
     from roadproof.cli.progress import stages
-    from roadproof.io.files import check_writable
+    from roadproof.io.locks import hold
     from roadproof.training.recipe import Recipe, follow, gather
 
     recipe = Recipe(
@@ -55,7 +55,7 @@ def train(
         round_drives=round_drives,
         round_samples=round_samples,
     )
-    check_writable(out)
+    hold(out)
     at_once = processes or os.cpu_count() or 1
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     with stages() as on_stage:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from roadproof.errors import RoadproofError, StudyError
-from roadproof.io.files import check_writable
+from roadproof.io.locks import working_in
 from roadproof.memory import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
@@ -53,21 +53,21 @@ def run_study(
 
     Raises:
         StudyError: an argument makes no sense, or an extra is missing.
-        OutputError: the folder cannot be written.
+        OutputError: the folder cannot be written, or another process works in it.
     """
     if workers < 1:
         raise StudyError(f"workers is {workers}, expected 1 or more")
     if is_server(study.simulator) and (workers > 1 or cluster is not None):
         raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
-    check_writable(folder)
-    left = [job for job in study.jobs if not is_done(job, folder)]
-    done = len(study.jobs) - len(left)
-    results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)
-    for job, result in results:
-        write_result(job, result, folder)
-        done += 1
-        on_job(done, job, result)
-    return write_table(study.jobs, folder)
+    with working_in(folder):
+        left = [job for job in study.jobs if not is_done(job, folder)]
+        done = len(study.jobs) - len(left)
+        results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)
+        for job, result in results:
+            write_result(job, result, folder)
+            done += 1
+            on_job(done, job, result)
+        return write_table(study.jobs, folder)
 
 
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:

@@ -1,0 +1,72 @@
+"""One worker a folder: a second one is told who is there."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+from datetime import datetime
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from roadproof.errors import OutputError
+from roadproof.io.files import check_writable, write_atomically
+
+LOCK, WORKER = ".lock", ".worker"
+_held = ExitStack()
+atexit.register(_held.close)
+
+
+@contextmanager
+def working_in(folder: Path) -> Generator[None]:
+    """Keep other processes from writing to a folder meanwhile; in this one it can be asked for again.
+
+    The lock is the system's own and ends with its process, however that ends.
+
+    Args:
+        folder: made where it is not there.
+
+    Raises:
+        OutputError: it cannot be written, or another process works in it.
+    """
+    check_writable(folder)
+    lock = FileLock(folder.resolve() / LOCK, is_singleton=True)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise OutputError(f"{_worker(folder)} works in {folder}; wait for its end, or choose another folder") from None
+    except (NotImplementedError, OSError):
+        # A disk that knows no locks: better unguarded than not at all.
+        yield
+        return
+    try:
+        first = lock.lock_counter == 1
+        if first:
+            since = datetime.now().astimezone().isoformat(" ", "seconds")
+            doing = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) or "roadproof"
+            told = f"{doing} (process {os.getpid()}, since {since})\n"
+            write_atomically(folder / WORKER, lambda part: part.write_text(told, encoding="utf-8"))
+        yield
+        if first:
+            (folder / WORKER).unlink(missing_ok=True)
+    finally:
+        lock.release()
+
+
+def hold(folder: Path) -> None:
+    """Work in a folder until this process ends (`working_in`): for a command, which does nothing else.
+
+    Raises:
+        OutputError: it cannot be written, or another process works in it.
+    """
+    _held.enter_context(working_in(folder))
+
+
+def _worker(folder: Path) -> str:
+    try:
+        return (folder / WORKER).read_text(encoding="utf-8").strip()[:200] or "another process"
+    except (OSError, UnicodeError):
+        return "another process"

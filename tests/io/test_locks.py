@@ -1,0 +1,76 @@
+"""Two workers in one folder: the second is told who is there; a killed one leaves nothing locked."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadproof.errors import OutputError
+from roadproof.io.locks import hold, working_in
+
+CHILD = """
+import sys, time
+from pathlib import Path
+from roadproof.io.locks import working_in
+with working_in(Path(sys.argv[1])):
+    print("in", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.fixture
+def child(tmp_path):
+    """Another process that works in a folder until it is told to end."""
+    place = tmp_path / "run"
+    command = [sys.executable, "-c", CHILD, str(place)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "in\n"
+        yield process, place
+        process.kill()
+
+
+def test_the_second_is_told_who_works_there(child):
+    process, place = child
+    told = rf"-c .*\(process {process.pid}, since 20.*\) works in .*run; wait"
+    with pytest.raises(OutputError, match=told), working_in(place):
+        pass
+    with pytest.raises(OutputError, match="works in"):
+        hold(place)
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.close()
+    process.wait()
+    with working_in(place):
+        pass
+    assert {path.name for path in place.iterdir()} <= {".lock"}
+
+
+def test_a_killed_worker_leaves_the_folder_free(child):
+    process, place = child
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    with working_in(place):
+        assert str(os.getpid()) in (place / ".worker").read_text()
+
+
+def test_one_process_can_ask_again(tmp_path: Path):
+    with working_in(tmp_path), working_in(tmp_path / "." / "x" / ".."):
+        assert (tmp_path / ".worker").exists()
+    assert not (tmp_path / ".worker").exists()
+
+
+def test_another_folder_is_another_matter(child, tmp_path):
+    with working_in(tmp_path / "other"):
+        pass
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"), working_in(tmp_path / "file" / "run"):
+        pass
