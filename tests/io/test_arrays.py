@@ -120,6 +120,7 @@ BAD: dict[str, tuple[Callable[[], bytes], str]] = {
     "a header of another kind": (lambda: archive({"x.npy": claiming((2,), "O")}), "expected numbers"),
     "a nested header": (lambda: archive({"x.npy": claiming(("(" * 3000 + ")" * 3000,))}), "x: "),  # type: ignore[arg-type]
     "a giant number": (lambda: archive({"x.npy": claiming((10**400,))}), "x: "),
+    "a header without end": (lambda: archive({"x.npy": claiming((2,)).replace(b"}", b"(")}), "x: "),
     "no array": (lambda: archive({"x.npy": b"words"}), "x: "),
     "encrypted": (encrypted, "encrypted or packed by a method"),
     "another method": (unknown_method, "encrypted or packed by a method"),
