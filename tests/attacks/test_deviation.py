@@ -48,7 +48,9 @@ def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp
     assert result.predicted_m > 1.2 * np.mean(world.deviations_m(RampFollower(), by_chance))
     assert (result.history[-1] >= result.history[0] - 1e-3).all()
     found = [candidate.predicted_m for candidate in result.candidates]
-    assert found == sorted(found, reverse=True)
+    least = [candidate.predicted_range_m[0] for candidate in result.candidates]
+    assert least == sorted(least, reverse=True)
+    assert all(each.predicted_range_m[0] <= each.predicted_m <= each.predicted_range_m[1] for each in result.candidates)
     assert result.predicted_m == found[0]
     again = world.deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)[0]
     assert again.mean() == pytest.approx(found[0], abs=0.02)
@@ -116,7 +118,9 @@ def test_a_search_can_begin_with_the_steering_shift(road, tmp_path):
     seen: list[float] = []
     found = gradopt(measure, SPACE, schedule=schedule, restarts=2, seed=0, on_step=lambda _, best: seen.append(best))
     alone = SteeringShift().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").thinned(2)
-    climbed = gradopt(alone, SPACE, schedule=dataclasses.replace(SHORT, iterations=6, drops=()), restarts=4, seed=0)
+    climbed = gradopt(
+        alone, SPACE, schedule=dataclasses.replace(SHORT, iterations=6, learning_rate=0.1, drops=()), restarts=4, seed=0
+    )
     # The first heat is the open loop's own search, step by step.
     best = [float(value) for value in climbed.history.amax((1, 2)).cummax(0).values]
     assert seen[:6] == pytest.approx(best, abs=1e-6)

@@ -127,12 +127,12 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
 def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
     """Every start's best, the strongest first: by what is predicted where that is known, else by its own value.
 
-    What is predicted is a mean over small errors of steering: where the way forks, a pattern that depends on a hair
-    does not come first.
+    Of what is predicted with small errors of steering the least counts: where the way forks, a pattern that depends on
+    a hair does not come first.
     """
     shifts, predicted = measure.readings(space, search.best_unit)
     restarts = search.best.shape[1]
-    rank = search.best.cpu() if predicted is None else predicted.mean(-1)
+    rank = search.best.cpu() if predicted is None else predicted.amin(-1)
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
     candidates: list[Candidate] = []
     for group, restart in (divmod(index, restarts) for index in order):

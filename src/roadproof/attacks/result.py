@@ -71,7 +71,7 @@ class AttackResult:
             search did not drive there.
         predicted_range_m: least and most of it over those errors.
         by_group: the best value of every group, in the objective's unit: steer a frame, or metres.
-        candidates: every start's best, the strongest first: by the predicted deviation where there is one. The
+        candidates: every start's best, the strongest first: by the least predicted deviation where there is one. The
             steering shift ranks only coarsely, so that driving over its first few finds a stronger one than the first.
         history: value at every iteration after the heats, (iterations, groups, restarts).
         stopped: why the search ended.
