@@ -97,7 +97,7 @@ def rows_of(cell: Cell) -> list[Row]:
             if kept[name].exists():
                 rows.append(json.loads(kept[name].read_text(encoding="utf-8")))
                 continue
-            place, began = cell.folder / name, time.perf_counter()
+            place = cell.folder / name
             found = kept_attack(
                 place / "attack",
                 lambda checkpoint, objective=objective, schedule=schedule: attack(
@@ -111,7 +111,6 @@ def rows_of(cell: Cell) -> list[Row]:
                     checkpoint=checkpoint,
                 ),
             )
-            seconds = time.perf_counter() - began
             selection = select_by_driving(
                 town,
                 controller,
@@ -135,7 +134,7 @@ def rows_of(cell: Cell) -> list[Row]:
                 "driven_m": [each.trial.deviation_m for each in selection.driven],
                 "by_weather_m": {trial.weather: trial.deviation_m for trial in judged.of(traffic=False)},
                 "recording_calls": calibrated.report.calls,
-                "search_seconds": seconds,
+                "search_seconds": found.cost.seconds,
             }
             rows.append(row)
             write_json(kept[name], row)
