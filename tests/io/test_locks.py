@@ -48,7 +48,7 @@ def test_the_second_is_told_who_works_there(child):
     process.wait()
     with working_in(place):
         pass
-    assert {path.name for path in place.iterdir()} <= {".lock"}
+    assert list(place.iterdir()) == []
 
 
 def test_a_killed_worker_leaves_the_folder_free(child):
@@ -56,13 +56,14 @@ def test_a_killed_worker_leaves_the_folder_free(child):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     with working_in(place):
-        assert str(os.getpid()) in (place / ".worker").read_text()
+        pass
 
 
 def test_one_process_can_ask_again(tmp_path: Path):
     with working_in(tmp_path), working_in(tmp_path / "." / "x" / ".."):
-        assert (tmp_path / ".worker").exists()
-    assert not (tmp_path / ".worker").exists()
+        pass
+    with working_in(tmp_path):
+        pass
 
 
 def test_another_folder_is_another_matter(child, tmp_path):

@@ -105,7 +105,7 @@ class Trial:
     clean_events: tuple[Event, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in (self.clean, self.painted):
+        for name in filter(None, (self.clean, self.painted)):  # drives that were not kept have none
             if not check_name(name, "episode", EpisodeError).endswith(".npz"):
                 raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import atexit
+import getpass
+import hashlib
 import os
 import sys
+import tempfile
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
@@ -15,7 +18,6 @@ from filelock import FileLock, Timeout
 from roadproof.errors import OutputError
 from roadproof.io.files import check_writable, write_atomically
 
-LOCK, WORKER = ".lock", ".worker"
 _held = ExitStack()
 atexit.register(_held.close)
 
@@ -24,7 +26,7 @@ atexit.register(_held.close)
 def working_in(folder: Path) -> Generator[None]:
     """Keep other processes from writing to a folder meanwhile; in this one it can be asked for again.
 
-    The lock is the system's own and ends with its process, however that ends.
+    The lock is the system's own and ends with its process, however that ends; it holds on one machine, for one user.
 
     Args:
         folder: made where it is not there.
@@ -33,11 +35,12 @@ def working_in(folder: Path) -> Generator[None]:
         OutputError: it cannot be written, or another process works in it.
     """
     check_writable(folder)
-    lock = FileLock(folder.resolve() / LOCK, is_singleton=True)
+    place = _place(folder)
+    lock = FileLock(place.with_suffix(".lock"), is_singleton=True)
     try:
         lock.acquire(blocking=False)
     except Timeout:
-        raise OutputError(f"{_worker(folder)} works in {folder}; wait for its end, or choose another folder") from None
+        raise OutputError(f"{_worker(place)} works in {folder}; wait for its end, or choose another folder") from None
     except (NotImplementedError, OSError):
         # A disk that knows no locks: better unguarded than not at all.
         yield
@@ -48,10 +51,10 @@ def working_in(folder: Path) -> Generator[None]:
             since = datetime.now().astimezone().isoformat(" ", "seconds")
             doing = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) or "roadproof"
             told = f"{doing} (process {os.getpid()}, since {since})\n"
-            write_atomically(folder / WORKER, lambda part: part.write_text(told, encoding="utf-8"))
+            write_atomically(place, lambda part: part.write_text(told, encoding="utf-8"))
         yield
         if first:
-            (folder / WORKER).unlink(missing_ok=True)
+            place.unlink(missing_ok=True)
     finally:
         lock.release()
 
@@ -65,8 +68,15 @@ def hold(folder: Path) -> None:
     _held.enter_context(working_in(folder))
 
 
-def _worker(folder: Path) -> str:
+def _place(folder: Path) -> Path:
+    """Where it is written who works in a folder: not in the folder, which holds results alone."""
+    locks = Path(tempfile.gettempdir()) / f"roadproof-locks-{getpass.getuser()}"
+    locks.mkdir(mode=0o700, exist_ok=True)
+    return locks / hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
+
+
+def _worker(place: Path) -> str:
     try:
-        return (folder / WORKER).read_text(encoding="utf-8").strip()[:200] or "another process"
+        return place.read_text(encoding="utf-8").strip()[:200] or "another process"
     except (OSError, UnicodeError):
         return "another process"
