@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -238,63 +238,69 @@ def stress_test(
         raise RoadproofError(
             f"{processes} processes; expected 1, or more with a function that opens another simulator for each"
         )
+    run = _Run(
+        simulator=simulator,
+        controller=controller,
+        scenario=scenario,
+        folder=folder,
+        budget=budget,
+        space=space or SearchSpace(figures=5),
+        seed=seed,
+        controller_name=controller_name,
+        device=device,
+        on_progress=on_progress,
+    )
     with working_in(folder):
-        space = space or SearchSpace(figures=5)
-        # What tells this run from another.
-        told = (asdict(scenario), asdict(budget), asdict(space), seed, controller_name)
-        ledger = Ledger(folder, json.dumps(told, default=str), STAGES, paint=simulator.paint)
+        return _stages(run, another if another and processes > 1 else simulator, processes)
 
-        def tell(stage: str, done: int, total: int, word: str) -> None:
-            ledger.step()
-            on_progress(stage, done, total, word)
 
-        run = _Run(
-            simulator=simulator,
-            controller=controller,
-            scenario=scenario,
-            folder=folder,
-            budget=budget,
-            space=space,
-            seed=seed,
-            controller_name=controller_name,
-            device=device,
-            on_progress=tell,
+def _stages(run: _Run, simulator: Opening | Simulator, processes: int) -> StressTest:
+    """All of them, one after another; the simulator, or what opens one for each process, is the evaluation's."""
+    # What tells this run from another.
+    told = (asdict(run.scenario), asdict(run.budget), asdict(run.space), run.seed, run.controller_name)
+    ledger = Ledger(run.folder, json.dumps(told, default=str), STAGES, paint=run.simulator.paint)
+    on_progress = run.on_progress
+
+    def tell(stage: str, done: int, total: int, word: str) -> None:
+        ledger.step()
+        on_progress(stage, done, total, word)
+
+    run = replace(run, on_progress=tell)
+    with ledger.stage("record"):
+        drives = [_record(run, number) for number in range(len(run.budget.recorded_in))]
+        ledger.calls("record", sum(each.calls for each in drives))
+    with ledger.stage("calibrate"):
+        calibrated = [_calibrate(run, number, each) for number, each in enumerate(drives)]
+        ledger.calls("calibrate", sum(replays_needed(each, run.budget.calibration) for each in drives))
+        recordings = pooled(
+            {str(each.settings.weather): c.recordings for each, c in zip(drives, calibrated, strict=True)}
         )
-        with ledger.stage("record"):
-            drives = [_record(run, number) for number in range(len(budget.recorded_in))]
-            ledger.calls("record", sum(each.calls for each in drives))
-        with ledger.stage("calibrate"):
-            calibrated = [_calibrate(run, number, each) for number, each in enumerate(drives)]
-            ledger.calls("calibrate", sum(replays_needed(each, budget.calibration) for each in drives))
-            recordings = pooled(
-                {str(each.settings.weather): c.recordings for each, c in zip(drives, calibrated, strict=True)}
-            )
-        groups = parse_groups("all", recordings) if budget.pooled else groups_of(recordings)
-        with ledger.stage("attack"):
-            found = _attack(run, recordings, groups)
-        selection, rounds = None, None
-        if budget.select:
-            with ledger.stage("select"):
-                selection = _select(run, found, drives[0])
-                ledger.calls("select", selection.simulator_calls)
-        if selection is not None and budget.rounds:
-            with ledger.stage("rounds"):
-                rounds = _search_on(run, drives[0], recordings, groups, found, selection)
-                ledger.calls("rounds", rounds.simulator_calls)
-        pattern = _chosen(found, selection, rounds)
-        save_pattern(pattern, folder / "pattern.json")
-        prediction = _predict(run, recordings, pattern, selection, rounds)
-        with ledger.stage("evaluate"):
-            evaluation = _evaluate(run, pattern, another if another and processes > 1 else simulator, processes)
-            ledger.calls("evaluate", evaluation.simulator_calls)
-        return StressTest(
-            attack=found,
-            selection=selection,
-            rounds=rounds,
-            prediction=prediction,
-            evaluation=evaluation,
-            cost=ledger.cost,
-        )
+    groups = parse_groups("all", recordings) if run.budget.pooled else groups_of(recordings)
+    with ledger.stage("attack"):
+        found = _attack(run, recordings, groups)
+    selection, rounds = None, None
+    if run.budget.select:
+        with ledger.stage("select"):
+            selection = _select(run, found, drives[0])
+            ledger.calls("select", selection.simulator_calls)
+    if selection is not None and run.budget.rounds:
+        with ledger.stage("rounds"):
+            rounds = _search_on(run, drives[0], recordings, groups, found, selection)
+            ledger.calls("rounds", rounds.simulator_calls)
+    pattern = _chosen(found, selection, rounds)
+    save_pattern(pattern, run.folder / "pattern.json")
+    prediction = _predict(run, recordings, pattern, selection, rounds)
+    with ledger.stage("evaluate"):
+        evaluation = _evaluate(run, pattern, simulator, processes)
+        ledger.calls("evaluate", evaluation.simulator_calls)
+    return StressTest(
+        attack=found,
+        selection=selection,
+        rounds=rounds,
+        prediction=prediction,
+        evaluation=evaluation,
+        cost=ledger.cost,
+    )
 
 
 def _chosen(found: AttackResult, selection: Selection | None, rounds: Rounds | None) -> Pattern:

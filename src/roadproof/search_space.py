@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -176,3 +177,8 @@ def _shrunk(pattern: Pattern, max_painted_share: float) -> Pattern:
     x, y, width, length, rotation_deg = pattern.boxes.unbind(-1)
     boxes = torch.stack([x, y, width / excess[..., None], length, rotation_deg], -1)
     return Pattern(pattern.shapes, boxes, pattern.colours)
+
+
+def derived_seed(seed: int, number: int) -> int:
+    """A seed for the n-th of several draws of one search, as unlike the others as seeds are."""
+    return int(np.random.SeedSequence((seed, number)).generate_state(1)[0])

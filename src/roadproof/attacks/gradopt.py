@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,7 +22,7 @@ from torch import Tensor
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
 from roadproof.attacks.objective import Measure
 from roadproof.errors import RoadproofError
-from roadproof.search_space import SearchSpace
+from roadproof.search_space import SearchSpace, derived_seed
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +46,15 @@ class Heat:
     def __post_init__(self) -> None:
         if min(self.starts, self.iterations, self.every) < 1:
             raise RoadproofError(f"{self} has a number below 1")
+
+    def cheaper(self, measure: Measure) -> Measure:
+        """What it climbs instead of a measure."""
+        return (measure.open_loop() if self.open_loop else measure).thinned(self.every)
+
+    def steps(self, schedule: Schedule) -> Schedule:
+        """Its own steps, before those of a schedule."""
+        own = {"iterations": self.iterations, "learning_rate": self.learning_rate}
+        return replace(schedule, **own, drops=(), patience=None, heats=())
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -186,8 +194,8 @@ def gradopt(
         rung = int(state.pop("rung"))
         measure.frames_evaluated += int(state.pop("frames"))
     for number in range(rung, len(rungs)):
-        steps, last = rungs[number].steps, number == len(rungs) - 1
-        shown = measure if last else rungs[number].cheaper(measure)
+        steps, heat = rungs[number].steps, rungs[number].heat
+        shown = measure if heat is None else heat.cheaper(measure)
         done = sum(before.steps.iterations for before in rungs[:number])
         if number > rung:
             state = _state_at(_gone_on(state, space, rungs[number].starts, seed, number))
@@ -195,10 +203,10 @@ def gradopt(
             state = _step(shown, space, steps, state)
             on_step(done + len(state["history"]), float(state["best"].max()))
             if checkpoint:
-                frames = measure.frames_evaluated + (0 if last else shown.frames_evaluated)
+                frames = measure.frames_evaluated + (0 if heat is None else shown.frames_evaluated)
                 whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames)}
                 save_checkpoint(checkpoint, identity, whole)
-        if not last:
+        if heat is not None:
             measure.frames_evaluated += shown.frames_evaluated
     stopped = "all iterations done"
     if len(state["history"]) < schedule.iterations:
@@ -208,37 +216,18 @@ def gradopt(
 
 @dataclass(frozen=True, slots=True)
 class _Rung:
-    """A heat, or the search proper: so many starts of every group, on every n-th frame."""
+    """A heat, or the search proper without one: so many starts of every group."""
 
     starts: int
-    every: int
     steps: Schedule
-    open_loop: bool = False
-
-    def cheaper(self, measure: Measure) -> Measure:
-        """What a heat climbs instead."""
-        return (measure.open_loop() if self.open_loop else measure).thinned(self.every)
+    heat: Heat | None = None
 
 
 def _rungs(schedule: Schedule, restarts: int) -> list[_Rung]:
     if schedule.heats and schedule.heats[-1].starts < restarts:
         places = [heat.starts for heat in schedule.heats]
         raise RoadproofError(f"heats of {places} starts leave fewer than {restarts} restarts; ask for fewer")
-    steps = (
-        replace(
-            schedule,
-            iterations=heat.iterations,
-            learning_rate=heat.learning_rate,
-            drops=(),
-            patience=None,
-            heats=(),
-        )
-        for heat in schedule.heats
-    )
-    heats = [
-        _Rung(heat.starts, heat.every, each, heat.open_loop) for heat, each in zip(schedule.heats, steps, strict=True)
-    ]
-    return [*heats, _Rung(restarts, 1, schedule)]
+    return [*(_Rung(heat.starts, heat.steps(schedule), heat) for heat in schedule.heats), _Rung(restarts, schedule)]
 
 
 def _starts(
@@ -261,8 +250,8 @@ def _gone_on(
     """Where the best of every group are; random points make up what they lack."""
     best = state["best"].topk(min(count, state["best"].shape[1]), 1).indices
     kept = state["best_unit"][torch.arange(len(best), device=best.device)[:, None], best]
-    fresh = int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
-    drawn = space.random((len(kept), count - kept.shape[1]), torch.Generator().manual_seed(fresh))
+    fresh = torch.Generator().manual_seed(derived_seed(seed, number))
+    drawn = space.random((len(kept), count - kept.shape[1]), fresh)
     return torch.cat([kept, drawn.to(kept)], 1)
 
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 
 from roadproof.errors import RoadproofError
-from roadproof.search_space import SearchSpace
+from roadproof.search_space import SearchSpace, derived_seed
 
 Propose: TypeAlias = Callable[
     [Float[np.ndarray, "t d"], Float[np.ndarray, " t"], int],
@@ -36,7 +36,9 @@ def random(space: SearchSpace, seed: int) -> Propose:
     def propose(tried: Float[np.ndarray, "t d"], _: Float[np.ndarray, " t"], count: int) -> Float[np.ndarray, "b d"]:
         return np.concatenate(
             [
-                space.random((1,), torch.Generator().manual_seed(_derived(seed, len(tried) + i))).flatten(1).double()
+                space.random((1,), torch.Generator().manual_seed(derived_seed(seed, len(tried) + i)))
+                .flatten(1)
+                .double()
                 for i in range(count)
             ]
         )
@@ -77,7 +79,7 @@ def published_bo(ranges: Float[np.ndarray, " d"], random_calls: int, seed: int) 
         if len(tried) < random_calls:
             drawn = np.random.RandomState(seed).uniform(size=(random_calls, len(ranges)))
             return drawn[len(tried) : len(tried) + count]
-        state = np.random.RandomState(_derived(seed, len(tried)))  # the library takes no other
+        state = np.random.RandomState(derived_seed(seed, len(tried)))  # the library takes no other
         space = TargetSpace(None, bounds, random_state=state, allow_duplicate_points=True)
         for point, found in zip(tried * ranges, value, strict=True):
             space.register(point, float(found))
@@ -106,7 +108,7 @@ def optuna(sampler: Literal["gp", "tpe"], dimensions: int, seed: int) -> Propose
     def propose(
         tried: Float[np.ndarray, "t d"], value: Float[np.ndarray, " t"], count: int
     ) -> Float[np.ndarray, "b d"]:
-        fresh = _derived(seed, len(tried))
+        fresh = derived_seed(seed, len(tried))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # some options of the samplers are marked experimental
             chosen: Any = (
@@ -165,10 +167,6 @@ def cma_es(dimensions: int, seed: int, given: int = 0) -> Propose:
         return np.array([search.ask() for _ in range(count)])
 
     return propose
-
-
-def _derived(seed: int, trials: int) -> int:
-    return int(np.random.SeedSequence((seed, trials)).generate_state(1)[0])
 
 
 def _missing(error: ImportError) -> RoadproofError:

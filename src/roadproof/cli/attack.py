@@ -47,7 +47,7 @@ def attack(
     iterations: Annotated[
         int | None,
         number(
-            "Steps of every restart; after heats 100, for a deviation 40; 250 as published.",
+            "Steps of every restart; after heats 100, for a deviation 32; 250 as published.",
             1,
             MANY,
             show_default=False,

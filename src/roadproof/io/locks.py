@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import getpass
 import hashlib
 import os
 import sys
@@ -70,7 +69,9 @@ def hold(folder: Path) -> None:
 
 def _place(folder: Path) -> Path:
     """Where it is written who works in a folder: not in the folder, which holds results alone."""
-    locks = Path(tempfile.gettempdir()) / f"roadproof-locks-{getpass.getuser()}"
+    locks = (
+        Path(tempfile.gettempdir()) / f"roadproof-locks-{getattr(os, 'getuid', int)()}"
+    )  # a user may have no name, or no number
     locks.mkdir(mode=0o700, exist_ok=True)
     return locks / hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
 
