@@ -18,8 +18,8 @@ from typing import Any
 import torch
 
 import roadproof
-from roadproof.attacks import Schedule, Surrogate
-from roadproof.attacks.gradopt import gradopt, random_search
+from roadproof.attacks import GradOpt, SteeringShift, Surrogate
+from roadproof.attacks.gradopt import dropping, gradopt, random_search
 from roadproof.controllers import load_controller
 from roadproof.memory import keep_freed_memory
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
@@ -27,7 +27,11 @@ from roadproof.recordings import load_recordings
 from roadproof.search_space import SearchSpace
 
 GROUPS = (RIGHT_GROUP, LEFT_GROUP)
-SCHEDULES = {"heats": Schedule.in_heats, "published": Schedule.stretched}
+LADDERS = {
+    "halving": lambda restarts: GradOpt(restarts=restarts).ladder(SteeringShift()),
+    "published": lambda restarts: dropping(restarts, 250, 0.1, after=(0.4, 0.8), factor=0.1),
+}
+"""Starts that compete first, or the paper's steps from random ones."""
 
 
 def timed(function: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
@@ -50,7 +54,7 @@ def main() -> None:
     parser.add_argument("--controller", required=True)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--figures", type=int, default=5)
-    parser.add_argument("--schedule", choices=list(SCHEDULES), default="heats")
+    parser.add_argument("--steps", choices=list(LADDERS), default="halving")
     parser.add_argument("--restarts", type=int, default=4)
     parser.add_argument("--dtype", default="float32", help="of the controller while searching")
     parser.add_argument("--seeds", default="0,1,2")
@@ -60,11 +64,11 @@ def main() -> None:
     recordings = load_recordings(args.recordings)
     judge = Surrogate(recordings, load_controller(args.controller), GROUPS)
     searched = Surrogate(recordings, load_controller(args.controller, dtype=args.dtype), GROUPS)
-    space, schedule = SearchSpace(figures=args.figures), SCHEDULES[args.schedule]()
+    space, rungs = SearchSpace(figures=args.figures), LADDERS[args.steps](args.restarts)
     names = [str(group) for group in GROUPS]
     runs = []
     for seed in (int(word) for word in args.seeds.split(",")):
-        search = lambda s=seed: gradopt(searched, space, schedule=schedule, restarts=args.restarts, seed=s)  # noqa: E731
+        search = lambda s=seed: gradopt(searched, space, rungs, seed=s)  # noqa: E731
         found, cost = timed(search)
         restarts = judge.values(space, found.best_unit)
         run = {
@@ -89,7 +93,7 @@ def main() -> None:
         "processor": platform.processor() or platform.machine(),
         "figures": args.figures,
         "dtype": args.dtype,
-        "schedule": asdict(schedule),
+        "rungs": [asdict(rung) for rung in rungs],
         "restarts": args.restarts,
         "random_patterns": args.random_patterns,
         "runs": runs,

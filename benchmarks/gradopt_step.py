@@ -23,7 +23,7 @@ import torch
 
 import roadproof
 from roadproof.attacks import Surrogate
-from roadproof.attacks.published import PublishedSurrogate
+from roadproof.attacks.published import PublishedMeasure
 from roadproof.controllers import CIL, pilotnet_controller
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
@@ -96,8 +96,8 @@ def measure(
 
     runs = {"step": step, "bare": bare}
     if published:
-        authors = PublishedSurrogate(recordings, controller, groups, device=device)
-        runs["published"] = lambda: authors.values_and_gradients(space, unit, coarse=True)
+        authors = PublishedMeasure(recordings, controller, groups, device=device).on_grid(10.0)
+        runs["published"] = lambda: authors.values_and_gradients(space, unit)
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
     times: dict[str, list[float]] = {key: [] for key in runs}

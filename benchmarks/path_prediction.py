@@ -28,14 +28,14 @@ import torch
 from scipy.stats import spearmanr
 
 import roadproof
-from roadproof.attacks import PathDeviation, Schedule, Surrogate
+from roadproof.attacks import GradOpt, PathDeviation, Surrogate
 from roadproof.attacks.deviation import DeviationMeasure
-from roadproof.attacks.gradopt import gradopt
+from roadproof.attacks.gradopt import Rung, gradopt
+from roadproof.budget import QUICK
 from roadproof.calibration import calibrate
-from roadproof.drives import Trajectories, record
+from roadproof.drives import record
 from roadproof.evaluation import DrivenObjective
 from roadproof.io.files import write_atomically
-from roadproof.loop import Budget
 from roadproof.memory import keep_freed_memory
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
 from roadproof.patterns import Pattern
@@ -48,7 +48,7 @@ SCENARIOS = ("left-03", "right-05", "straight-04", "left-07", "right-02", "strai
 GROUPS = (RIGHT_GROUP, LEFT_GROUP)
 OPEN_LOOP_STEPS = (2, 12, 30)
 RANDOM = 4
-CLOSED_LOOP = Schedule.closed_loop(10)
+CLOSED_LOOP = GradOpt(iterations=10, restarts=3)
 
 
 def patterns(
@@ -59,11 +59,12 @@ def patterns(
     three = replace(recordings, recordings=recordings.recordings[:3])
     frames = Surrogate(three, controller, GROUPS).thinned(5)
     for steps in OPEN_LOOP_STEPS:
-        found = gradopt(frames, space, schedule=Schedule(iterations=steps, drops=()), restarts=4, seed=seed + 1)
+        found = gradopt(frames, space, (Rung(4, steps),), seed=seed + 1)
         points.append(found.best_unit.flatten(0, 1))
         names += [f"open loop, {steps} steps"] * len(points[-1])
-    world = PathDeviation().measure(recordings, controller, GROUPS, device="cpu")
-    found = gradopt(world, space, schedule=CLOSED_LOOP, restarts=3, seed=seed)
+    objective = PathDeviation()
+    world = objective.measure(recordings, controller, GROUPS, device="cpu")
+    found = gradopt(world, space, CLOSED_LOOP.ladder(objective), seed=seed)
     points.append(found.best_unit.flatten(0, 1))
     names += ["recorded world"] * len(points[-1])
     return names, space.pattern(torch.cat(points)), world
@@ -72,18 +73,18 @@ def patterns(
 def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict[str, Any]:
     """One controller on one scenario."""
     began = time.perf_counter()
-    budget, space = Budget(), SearchSpace(figures=5)
+    space = SearchSpace(figures=5)
     controller = roadproof.load_controller(controller_name)
     with open_simulator(spec) as simulator:
         drives = record(
             simulator,
             controller,
             scenario,
-            trajectories=Trajectories(count=budget.trajectories, perturbation=budget.perturbation),
-            window=budget.window,
+            trajectories=QUICK.trajectories,
+            window=QUICK.window,
             seed=seed,
         )
-        calibrated = calibrate(simulator, drives, budget.calibration)
+        calibrated = calibrate(simulator, drives, QUICK.calibration)
         names, painted, world = patterns(calibrated.recordings, controller, space, seed)
         rolling = time.perf_counter()
         predicted = world.world.deviations_m(controller, painted)[:, 0]

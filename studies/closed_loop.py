@@ -11,7 +11,7 @@ For every controller, scenario and seed, closed loop, alone on the road, in the 
   + driven       of its candidates the one that deviates most when driven at noon
   + rounds       searched on along the way the attacked car took, the best driven of all (`roadproof.rounds`)
   + weathers     as "+ driven", searched in expectation over a dry and a rainy noon instead, half the frames of each
-All searches have the same schedule and two-paint calibration, so that rows differ in what they are named after. All
+All searches have the same steps and two-paint calibration, so that rows differ in what they are named after. All
 enlarge the steering shift; `first_choice.py` compares that with the search in the recorded world.
 
 Numbers are means over weathers, then over scenarios and seeds, with 95 % intervals over the latter. Simulator calls
@@ -35,15 +35,16 @@ import numpy as np
 import torch
 
 import roadproof
-from roadproof.attacks import Heat, Schedule, SteeringShift
+from roadproof.attacks import GradOpt
+from roadproof.budget import STEERING, Budget
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
-from roadproof.drives import load_drives
+from roadproof.drives import SteeringNoise, Trajectories, Window, load_drives
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, evaluate, random_patterns
 from roadproof.io.files import write_atomically
 from roadproof.ledger import StageCost
-from roadproof.loop import Budget, StressTest, stress_test
+from roadproof.loop import StressTest, stress_test
 from roadproof.metrics import mean_95
 from roadproof.patterns import Pattern
 from roadproof.processes import processes_beside
@@ -64,13 +65,7 @@ METHODS = (
 )
 OTHERS = ("T=1", "T=3 published", "+ weathers")
 FOUND_BY = ("record", "calibrate", "attack")
-SCHEDULE = replace(
-    Schedule.in_heats(24),
-    heats=(Heat(starts=16, iterations=20, every=4), Heat(starts=6, iterations=20, every=2)),
-)
-BASE = Budget(
-    objective=SteeringShift(), deviations_m=(1.5,), frames=14, schedule=SCHEDULE, restarts=4, select=4, runs=0
-)
+BASE = replace(STEERING, method=GradOpt(iterations=24), window=Window(frames=14))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,11 +183,12 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
     if metres.rounds is not None:
         told = {"stopped": metres.rounds.stopped, "noon_deviation_m": _noon(metres)}
         rows.append(row(cell, "+ rounds", metres.evaluation, **cost(metres, *FOUND_BY, "select", "rounds"), **told))
+    noisy = Trajectories(perturbation=SteeringNoise(*cell.noise_deg))
     others = {
-        "T=1": replace(BASE, deviations_m=(), select=0),
-        "T=3 published": replace(BASE, noise_deg=cell.noise_deg, select=0),
+        "T=1": replace(BASE, trajectories=Trajectories(count=1), select=0),
+        "T=3 published": replace(BASE, trajectories=noisy, select=0),
         "+ weathers": replace(
-            BASE, frames=BASE.frames // 2, attack_weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON)
+            BASE, window=Window(frames=7), attack_weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON)
         ),
     }  # fmt: skip
     for method, budget in others.items():
@@ -254,7 +250,7 @@ def write(arguments: argparse.Namespace, rows: Sequence[Row], seconds: float) ->
         "study": "closed loop",
         "version": 1,
         "settings": {k: v for k, v in vars(arguments).items() if k not in ("json", "keep")},
-        "schedule": asdict(SCHEDULE),
+        "method": repr(BASE.method),
         "summary": summary(rows),
         "rows": list(rows),
         "seconds": seconds,

@@ -4,8 +4,8 @@
 
 For every controller, scenario and seed, five drives are recorded and calibrated as `roadproof demo` does (15 calls of
 the simulator), and searched twice:
-  steering    the steering shift on those recorded frames, heats and 30 steps
-  deviation   the path in the recorded world, heats and 32 steps
+  steering    the steering shift on those recorded frames, competing starts and 30 steps
+  deviation   the path in the recorded world, competing starts and 32 steps
 Each search's six candidates, best first in its own order, are driven once at clear noon, alone. So every row holds what
 the search thought, what its first choice did when driven, what the best of its six did, and which it was; the first
 choice is driven in the paper's other weathers too. Nothing driven chose a pattern.
@@ -29,12 +29,12 @@ import numpy as np
 import torch
 
 import roadproof
-from roadproof.attacks import Objective, PathDeviation, Schedule, SteeringShift, attack, kept_attack
+from roadproof.attacks import GradOpt, Objective, PathDeviation, SteeringShift, attack, kept_attack
+from roadproof.budget import QUICK
 from roadproof.calibration import Calibrated, calibrate
-from roadproof.drives import Trajectories, record
+from roadproof.drives import record
 from roadproof.evaluation import evaluate, select_by_driving
 from roadproof.io.files import write_atomically
-from roadproof.loop import Budget
 from roadproof.memory import keep_freed_memory
 from roadproof.metrics import mean_95
 from roadproof.processes import processes_beside
@@ -43,12 +43,12 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
 
 SCENARIOS = ("left-03", "right-05", "straight-04", "left-07", "right-02", "straight-09")
-SEARCHES: dict[str, tuple[Objective, Schedule]] = {
-    "steering": (SteeringShift(), Schedule.in_heats(30)),
-    "deviation": (PathDeviation(), Schedule.closed_loop()),
+PLACES = 3
+SEARCHES: dict[str, tuple[Objective, GradOpt]] = {
+    "steering": (SteeringShift(), GradOpt(iterations=30, restarts=PLACES)),
+    "deviation": (PathDeviation(), GradOpt(restarts=PLACES)),
 }
-BUDGET = Budget(runs=0)
-SIX = 2 * BUDGET.restarts
+SIX = 2 * PLACES
 
 Row = dict[str, Any]
 
@@ -83,30 +83,29 @@ def rows_of(cell: Cell) -> list[Row]:
             town,
             controller,
             scenario,
-            trajectories=Trajectories(count=BUDGET.trajectories, perturbation=BUDGET.perturbation),
-            window=BUDGET.window,
+            trajectories=QUICK.trajectories,
+            window=QUICK.window,
             seed=cell.seed,
             driver_name=cell.controller,
             folder=cell.folder / "record",
         )
         calibrated = Calibrated.load(cell.folder)
         if calibrated is None:
-            calibrated = calibrate(town, drives, BUDGET.calibration, folder=cell.folder / "calibration")
+            calibrated = calibrate(town, drives, QUICK.calibration, folder=cell.folder / "calibration")
             calibrated.save(cell.folder)
-        for name, (objective, schedule) in SEARCHES.items():
+        for name, (objective, method) in SEARCHES.items():
             if kept[name].exists():
                 rows.append(json.loads(kept[name].read_text(encoding="utf-8")))
                 continue
             place = cell.folder / name
             found = kept_attack(
                 place / "attack",
-                lambda checkpoint, objective=objective, schedule=schedule: attack(
+                lambda checkpoint, objective=objective, method=method: attack(
                     calibrated.recordings,
                     controller,
                     space,
                     objective=objective,
-                    schedule=schedule,
-                    restarts=BUDGET.restarts,
+                    method=method,
                     seed=cell.seed,
                     checkpoint=checkpoint,
                 ),

@@ -5,20 +5,22 @@ import os
 import sys
 
 from paint_shy import along_a_street
-from roadproof.attacks import Heat, Schedule, SteeringShift
+from roadproof.attacks import GradOpt, SteeringShift, methods
+from roadproof.attacks.gradopt import Rung
+from roadproof.budget import BUDGETS, Budget
 from roadproof.cli import main
 from roadproof.datatypes import Weather
-from roadproof.loop import BUDGETS, Budget
+from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.scenarios import save_scenarios
 
 TINY = Budget(
     objective=SteeringShift(),
-    deviations_m=(0.5,),
-    frames=4,
-    schedule=Schedule(iterations=12, drops=(), heats=(Heat(starts=3, iterations=12, every=2),)),
-    restarts=2,
+    method=GradOpt(iterations=12, restarts=2),
+    trajectories=Trajectories(perturbation=Swerve((0.5,))),
+    window=Window(frames=4),
     select=2,
     weathers=(Weather.CLEAR_NOON,),
+    starts=0,
     runs=0,
 )
 
@@ -29,6 +31,7 @@ def demo(folder, log):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     BUDGETS["quick"] = TINY
+    methods.SHIFT_RUNGS = (Rung(3, 12, every=2),)
     given = folder.with_suffix(".given")
     given.mkdir(exist_ok=True)
     save_scenarios([along_a_street(given, 3.2)], given / "scenarios.toml")

@@ -18,6 +18,7 @@ def row(scenario="left-01", figures="1", method="GradOpt", seed=0, **changed):
         "traffic": False,
         "traffic_seed": 0,
         "deviation_m": 1.0,
+        "left_lane": True,
         "points": 2.0,
         "clean_points": 0.5,
         "search_calls": 61 if method == "GradOpt" else 1000,

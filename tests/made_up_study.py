@@ -11,15 +11,16 @@ from roadproof.datatypes import Weather
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.scenarios import builtin_scenarios
 from roadproof.simulators.town.maps import load_map, scenario_route
-from roadproof.study.plan import MethodPlan, Study, TrafficPlan
+from roadproof.study.methods import BlackBoxPlan, GradOptPlan
+from roadproof.study.plan import Study, TrafficPlan
 from roadproof.study.rows import JobResult, failed, job_columns, write_result, write_table
 
 METHODS = (
-    MethodPlan(name="GradOpt", search="gradopt"),
-    MethodPlan(name="GradOpt T=1", search="gradopt", trajectories=1),
-    MethodPlan(name="All", search="gradopt", scheme="group-all"),
-    MethodPlan(name="BO", search="published-bo", calls=1000),
-    MethodPlan(name="TPE", search="tpe", calls=200),
+    GradOptPlan(name="GradOpt", objective="steering", trajectories=3),
+    GradOptPlan(name="GradOpt T=1", objective="steering", trajectories=1),
+    GradOptPlan(name="All", objective="steering", trajectories=3, scheme="group-all"),
+    BlackBoxPlan(name="BO", search="published-bo", calls=1000),
+    BlackBoxPlan(name="TPE", search="tpe", calls=200),
 )
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON)
 CALLS = {"gradopt": 61, "published-bo": 1000, "tpe": 200, "random": 20}
@@ -72,6 +73,7 @@ def rows_of(job, pushed_m, generator):
                     "leaderboard": 0.65 if hit else 1.0,
                     "clean_leaderboard": 1.0,
                     "first_event_s": 4.2 if hit else None,
+                    "left_lane": hit,
                     "ending": "collision" if hit else "goal reached",
                     "search_calls": CALLS[job.method.search],
                     "search_seconds": CALLS[job.method.search] * float(generator.uniform(0.8, 1.3)),

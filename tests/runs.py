@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from roadproof.attacks import AttackResult, Candidate, Schedule
+from roadproof.attacks import AttackResult, Candidate, GradOpt
 from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
@@ -112,13 +112,11 @@ def write_attack(folder):
         by_group={"clean+right": 0.21, "clean+left": 0.31},
         candidates=(Candidate(PATTERN, "clean+left", 0.31),),
         history=np.stack([np.stack([steps, 0.8 * steps], -1), np.stack([1.1 * steps, steps], -1)], 1),
-        stopped="all iterations done",
         cost=Cost(controller_frames=4800, seconds=31.0),
         checks=(Check("non-zero gradients", True, "0% of the parameters have no gradient"),
                 Check("better than random search", False, "random found more", "use more restarts")),
         space=SearchSpace(figures=2),
-        schedule=Schedule.stretched(20),
-        restarts=2,
+        method=GradOpt(iterations=20, restarts=2),
         seed=0,
     ).save(folder)  # fmt: skip
 

@@ -4,25 +4,27 @@ import dataclasses
 
 import pytest
 
-from roadproof.attacks import Schedule, SteeringShift
+from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
+from roadproof.budget import BUDGETS, Budget
+from roadproof.calibration import Method
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
-from roadproof.drives import load_drives
+from roadproof.drives import Swerve, Trajectories, Window, load_drives
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, Selection
-from roadproof.loop import BUDGETS, STAGES, Budget, stress_test
+from roadproof.loop import STAGES, stress_test
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 
 TINY = Budget(
     objective=SteeringShift(),
-    deviations_m=(1.5,),
-    frames=4,
-    schedule=Schedule.stretched(3),
-    restarts=2,
+    method=GradOpt(iterations=3, restarts=2, halving=False),
+    trajectories=Trajectories(perturbation=Swerve((1.5,))),
+    window=Window(frames=4),
     select=2,
     weathers=(Weather.CLEAR_NOON,),
+    starts=0,
     runs=0,
 )
 
@@ -67,7 +69,24 @@ def test_processes_that_have_no_simulator_are_refused_before_anything_is_driven(
 
 
 def test_budgets_say_what_they_spend():
-    assert BUDGETS["paper"].trajectories == 3
-    assert BUDGETS["paper"].restarts * BUDGETS["paper"].schedule.iterations == 1000
-    assert dataclasses.replace(TINY, deviations_m=(0.7, 1.5)).trajectories == 5
-    assert dataclasses.replace(TINY, deviations_m=()).trajectories == 1
+    published = BUDGETS["published"]
+    assert published.trajectories.count == 3
+    assert published.method.restarts * published.method.steps(published.objective) == 1000
+    assert published.select == 0
+    assert BUDGETS["quick"].is_predicted
+    assert not BUDGETS["steering"].is_predicted
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"select": 2}, "select 2: as published it is 0"),
+        ({"objective": PathDeviation()}, "objective path deviation: as published it is steering shift"),
+        ({"calibration": Method.TWO_PAINT}, "calibration two-paint: as published it is published"),
+        ({"trajectories": Trajectories()}, "perturbation Swerve: as published it is SteeringNoise"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
+)
+def test_a_published_search_with_an_improvement_is_refused(change, message):
+    with pytest.raises(RoadproofError, match=message):
+        dataclasses.replace(BUDGETS["published"], **change)

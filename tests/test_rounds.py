@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from paint_shy import PaintShy, along_a_street
-from roadproof.attacks import Heat, Schedule, SteeringShift
+from roadproof.attacks import GradOpt, SteeringShift, methods
+from roadproof.attacks.gradopt import Rung
+from roadproof.budget import Budget
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
+from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.drives.drives import read_drive
 from roadproof.errors import CalibrationError, RoadproofError
 from roadproof.evaluation.episodes import load_episodes
-from roadproof.loop import Budget, stress_test
+from roadproof.loop import stress_test
 from roadproof.recordings import Push
 from roadproof.search_space import SearchSpace
 
@@ -22,15 +25,22 @@ pytestmark = pytest.mark.slow
 NOON, RAIN = Weather.CLEAR_NOON, Weather.RAINY_NOON
 BUDGET = Budget(
     objective=SteeringShift(),
-    deviations_m=(0.8,),
-    frames=6,
-    schedule=Schedule(iterations=6, drops=(), heats=(Heat(starts=16, iterations=3, every=3),)),
-    restarts=2,
+    method=GradOpt(iterations=6, restarts=2),
+    trajectories=Trajectories(perturbation=Swerve((0.8,))),
+    window=Window(frames=6),
     select=2,
     weathers=(NOON,),
+    starts=0,
     runs=0,
     rounds=2,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_starts():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(methods, "SHIFT_RUNGS", (Rung(16, 3, every=3),))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +92,7 @@ def test_the_best_driven_of_all_rounds_is_kept_and_every_drive_is_counted(done):
 def test_a_round_begins_where_the_search_before_it_came_to(done):
     _, result, _ = done
     again = result.rounds.done[0].attack
-    assert again.schedule == dataclasses.replace(BUDGET.schedule, heats=())
+    assert again.method == dataclasses.replace(BUDGET.method, halving=False)
     assert again.history.shape == (6, 2, 2)
     # The left group has the same drives as before, so it begins with what was found on them.
     assert list(again.by_group) == ["clean+right", "clean+left"]
@@ -122,7 +132,7 @@ def test_a_round_that_cannot_be_calibrated_ends_them(done, town, street, tmp_pat
 
 
 def test_one_search_may_be_for_several_weathers(town, street, tmp_path):
-    budget = dataclasses.replace(BUDGET, rounds=1, attack_weathers=(NOON, RAIN), deviations_m=())
+    budget = dataclasses.replace(BUDGET, rounds=1, attack_weathers=(NOON, RAIN), trajectories=Trajectories(count=1))
     result = run(town, street, tmp_path, budget)
     assert result.cost["record"].simulator_calls == 2
     assert result.cost["calibrate"].simulator_calls == 4

@@ -9,12 +9,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from roadproof.attacks import CMAES as CMAES
+    from roadproof.attacks import TPE as TPE
     from roadproof.attacks import AttackResult as AttackResult
+    from roadproof.attacks import BayesianOptimisation as BayesianOptimisation
+    from roadproof.attacks import GradOpt as GradOpt
     from roadproof.attacks import PathDeviation as PathDeviation
-    from roadproof.attacks import Schedule as Schedule
+    from roadproof.attacks import Published as Published
     from roadproof.attacks import SteeringShift as SteeringShift
     from roadproof.attacks import attack as attack
     from roadproof.attacks import show_pattern as show_pattern
+    from roadproof.budget import PUBLISHED as PUBLISHED
+    from roadproof.budget import QUICK as QUICK
+    from roadproof.budget import STEERING as STEERING
+    from roadproof.budget import Budget as Budget
     from roadproof.compositing import CanvasView as CanvasView
     from roadproof.compositing import composite as composite
     from roadproof.compositing import view_canvas as view_canvas
@@ -33,9 +41,6 @@ if TYPE_CHECKING:
     from roadproof.geometry import CropResize as CropResize
     from roadproof.geometry import homography_from_points as homography_from_points
     from roadproof.geometry import homography_from_pose as homography_from_pose
-    from roadproof.loop import PAPER as PAPER
-    from roadproof.loop import QUICK as QUICK
-    from roadproof.loop import Budget as Budget
     from roadproof.loop import StressTest as StressTest
     from roadproof.loop import stress_test as stress_test
     from roadproof.objectives import Group as Group
@@ -65,7 +70,18 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ROOMS = {
-    "attacks": ("AttackResult", "PathDeviation", "Schedule", "SteeringShift", "attack", "show_pattern"),
+    "attacks": (
+        "AttackResult",
+        "BayesianOptimisation",
+        "CMAES",
+        "GradOpt",
+        "PathDeviation",
+        "Published",
+        "SteeringShift",
+        "TPE",
+        "attack",
+        "show_pattern",
+    ),
     "compositing": ("CanvasView", "composite", "view_canvas"),
     "controllers": ("Controller", "CruiseControl", "check_controller", "load_controller"),
     "coverage": ("Shape",),
@@ -73,7 +89,8 @@ _ROOMS = {
     "errors": ("RoadproofError",),
     "evaluation": ("Evaluation", "evaluate"),
     "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
-    "loop": ("Budget", "PAPER", "QUICK", "StressTest", "stress_test"),
+    "budget": ("Budget", "PUBLISHED", "QUICK", "STEERING"),
+    "loop": ("StressTest", "stress_test"),
     "objectives": ("Group", "parse_groups"),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
     "photometry": ("AffineResponse", "ColourTransform", "fit_colour"),

@@ -19,26 +19,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import (
-    AttackResult,
-    Objective,
-    PathDeviation,
-    Schedule,
-    SteeringShift,
-    attack,
-    kept_attack,
-)
-from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
+from roadproof.attacks import AttackResult, attack, kept_attack
+from roadproof.budget import QUICK, Budget
+from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
-from roadproof.datatypes import Weather
-from roadproof.drives import Drives, Scheme, SteeringNoise, Swerve, Trajectories, Window, record
+from roadproof.drives import Drives, record
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import (
-    PAPER_WEATHERS,
     Evaluation,
     Opening,
     Prediction,
@@ -50,7 +41,7 @@ from roadproof.evaluation import (
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.io.locks import working_in
 from roadproof.ledger import Ledger, StageCost
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
+from roadproof.objectives import Group, parse_groups
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recordings import Push, RecordingSet, pooled
 from roadproof.rounds import Rounds, search_on
@@ -62,114 +53,6 @@ STAGES = ("record", "calibrate", "attack", "select", "rounds", "evaluate")
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
 """Told of a stage's name, how much of it is done, of how much, and a word on it."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Budget:
-    """How much is spent on one scenario.
-
-    Args:
-        objective: what the search makes large: a path deviation in the recorded world, or a steering shift as
-            published.
-        deviations_m: how far recorded drives are pushed aside; a pair, right and left, for each; T = 1 without. Where
-            the search drives in the recorded world, the last of several weaves from side to side instead.
-        scheme: whether those pairs are pushed right and left, or each drive to both sides at random.
-        pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
-        noise_deg: as many pairs, pushed as published instead: least and most degrees added to the steering.
-        frames: kept of every recorded drive.
-        calibration: how the drives are calibrated.
-        schedule: steps of the search.
-        restarts: starts of it, for each side; of those that came through the heats, where there are some.
-        select: candidates driven once each, of which the strongest is kept; 1 verifies the first choice, 0 believes it.
-        weathers: of the evaluation.
-        runs: drives with traffic in each weather.
-        rounds: of searching on along the way that the attacked car took (`rounds`).
-        attack_weathers: of the recordings; the search is for what is strongest on average, and candidates are driven
-            in the first. By default the first of `weathers` alone.
-
-    Raises:
-        RoadproofError: rounds without candidates to drive, a number of them below 0, or several weathers with colours
-            that hold in one alone.
-    """
-
-    objective: Objective = field(default_factory=PathDeviation)
-    deviations_m: tuple[float, ...] = (1.5, 0.5)
-    scheme: Scheme = Scheme.GROUP
-    pooled: bool = False
-    frames: int = 40
-    calibration: Method = Method.TWO_PAINT
-    schedule: Schedule = field(default_factory=Schedule.closed_loop)
-    restarts: int = 3
-    select: int = 1
-    weathers: tuple[Weather, ...] = PAPER_WEATHERS
-    runs: int = 10
-    rounds: int = 0
-    attack_weathers: tuple[Weather, ...] = ()
-    noise_deg: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        if min(self.rounds, self.select, self.runs) < 0:
-            raise RoadproofError(
-                f"{self.rounds} rounds, {self.select} candidates driven, {self.runs} runs in traffic; expected ≥ 0"
-            )
-        if self.rounds and not self.select:
-            raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
-        if len(self.recorded_in) > 1 and self.calibration is Method.PUBLISHED:
-            raise RoadproofError(
-                f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "
-                f"choose {Method.TWO_PAINT}"
-            )
-        if self.is_predicted and (len(self.recorded_in) > 1 or self.pooled or self.scheme is Scheme.RANDOM):
-            raise RoadproofError(
-                "a path deviation is searched in one weather for each side apart; attack several weathers, or drives "
-                "pooled or pushed at random, by their steering shift: objective=SteeringShift()"
-            )
-
-    @property
-    def is_predicted(self) -> bool:
-        """Whether the search drives in the recorded world."""
-        return isinstance(self.objective, PathDeviation)
-
-    @property
-    def recorded_in(self) -> tuple[Weather, ...]:
-        """The weathers of the recordings."""
-        return self.attack_weathers or self.weathers[:1]
-
-    @property
-    def trajectories(self) -> int:
-        """T: a clean drive, and a pair for each deviation."""
-        return 1 + 2 * len(self.deviations_m)
-
-    @property
-    def window(self) -> Window:
-        """Which frames are kept; a recorded world begins where deviation is measured from, however small the canvas."""
-        return Window(frames=self.frames, least_px=8) if self.is_predicted else Window(frames=self.frames)
-
-    @property
-    def perturbation(self) -> Swerve | SteeringNoise:
-        """How the pairs are pushed."""
-        if self.noise_deg is not None:
-            return SteeringNoise(*self.noise_deg)
-        if self.is_predicted and len(self.deviations_m) > 1:
-            return Swerve(self.deviations_m[:-1], weaves_m=self.deviations_m[-1:])
-        return Swerve(self.deviations_m) if self.deviations_m else Swerve()
-
-
-QUICK = Budget(runs=0)
-"""Minutes on a laptop: driven alone."""
-
-PAPER = Budget(
-    objective=SteeringShift(),
-    deviations_m=(1.5,),
-    frames=24,
-    calibration=Method.PUBLISHED,
-    schedule=Schedule(),
-    restarts=4,
-    select=6,
-)
-"""As much as the paper spends: 61 calls to calibrate, 4 × 250 iterations, ten runs in traffic a weather."""
-
-BUDGETS = {"quick": QUICK, "paper": PAPER}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -275,7 +158,7 @@ def _stages(run: _Run, simulator: Opening | Simulator, processes: int) -> Stress
         recordings = pooled(
             {str(each.settings.weather): c.recordings for each, c in zip(drives, calibrated, strict=True)}
         )
-    groups = parse_groups("all", recordings) if run.budget.pooled else groups_of(recordings)
+    groups = groups_of(recordings, run.budget)
     with ledger.stage("attack"):
         found = _attack(run, recordings, groups)
     selection, rounds = None, None
@@ -329,8 +212,7 @@ class _Run:
 
 
 def _record(run: _Run, number: int) -> Drives:
-    budget = run.budget
-    wanted = Trajectories(count=budget.trajectories, scheme=budget.scheme, perturbation=budget.perturbation)
+    budget, wanted = run.budget, run.budget.trajectories
     total = wanted.count * len(budget.recorded_in)
     return record(
         run.simulator,
@@ -365,17 +247,17 @@ def _calibrate(run: _Run, number: int, drives: Drives) -> Calibrated:
 
 
 def _attack(run: _Run, recordings: RecordingSet, groups: tuple[Group, ...]) -> AttackResult:
-    steps = run.budget.schedule.steps
+    budget = run.budget
+    steps = budget.method.steps(budget.objective)
     return kept_attack(
         run.folder / "attack",
         lambda checkpoint: attack(
             recordings,
             run.controller,
             run.space,
-            objective=run.budget.objective,
+            objective=budget.objective,
+            method=budget.method,
             groups=groups,
-            schedule=run.budget.schedule,
-            restarts=run.budget.restarts,
             seed=run.seed,
             device=run.device,
             checkpoint=checkpoint,
@@ -454,6 +336,8 @@ def _evaluate(run: _Run, pattern: Pattern, simulator: Opening | Simulator, proce
         folder=run.folder / "evaluation",
         driver_name=run.controller_name,
         weathers=run.budget.weathers,
+        starts=run.budget.starts,
+        start_range=run.budget.start_range,
         runs=run.budget.runs,
         seed=run.seed,
         processes=processes,
@@ -461,8 +345,7 @@ def _evaluate(run: _Run, pattern: Pattern, simulator: Opening | Simulator, proce
     )
 
 
-def groups_of(recordings: RecordingSet) -> tuple[Group, ...]:
-    """The paper's two groups where drives were pushed to both sides, else all drives pooled."""
-    if {Push.LEFT, Push.RIGHT} <= {recording.push for recording in recordings.recordings}:
-        return (RIGHT_GROUP, LEFT_GROUP)
-    return parse_groups("all", recordings)
+def groups_of(recordings: RecordingSet, budget: Budget) -> tuple[Group, ...]:
+    """The method's own groups where drives were pushed to both sides, else all drives pooled."""
+    sides = {Push.LEFT, Push.RIGHT} <= {recording.push for recording in recordings.recordings}
+    return budget.method.groups(recordings) if sides and not budget.pooled else parse_groups("all", recordings)

@@ -23,6 +23,10 @@ Path2D = Float[np.ndarray, "n 2"]
 HORIZON_M = 25.0
 """So far before the canvas a driver begins to see what is painted on it."""
 
+LEAVES_LANE_M = 0.8
+"""So far from where the clean drive was, part of a car is over its lane's edge: half a lane of 3.5 m less half a car of
+1.9 m."""
+
 RECOUNT_S = 2.0
 """The same fault again within this time is still the same fault: the 20 frames at 10 Hz of CARLA's first benchmark."""
 

@@ -19,8 +19,9 @@ from pathlib import Path
 
 import torch
 
-from roadproof.attacks import AttackResult, Candidate, Objective, attack, kept_attack
-from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
+from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, attack, kept_attack
+from roadproof.calibration import Calibrated, calibrate, replays_needed
+from roadproof.calibration import Method as Calibration
 from roadproof.controllers import Controller
 from roadproof.drives import Drives, record_along
 from roadproof.errors import CalibrationError, RecordingError
@@ -84,15 +85,15 @@ def search_on(
     objective: Objective,
     rounds: int,
     best: int,
-    method: Method,
+    method: Calibration,
     folder: Path,
     device: torch.device | str = "cpu",
     on_step: Callable[[int, int, str], object] = lambda _done, _total, _word: None,
 ) -> Rounds:
     """Search on for some rounds, each with one drive more.
 
-    A round is the search before, without its heats: every start is a pattern that was found before. It ends the rounds
-    when the drive cannot be calibrated, because it shows too little of the canvas.
+    A round is the search before, but no starts compete: every start is a pattern that was found before. It ends the
+    rounds when the drive cannot be calibrated, because it shows too little of the canvas.
 
     Args:
         simulator: an open simulator.
@@ -114,7 +115,8 @@ def search_on(
         RoadproofError: as the stages do.
     """
     clean = Drives(settings=drives.settings, drives=drives.drives[:1])
-    per_round = found.schedule.iterations + best
+    steps = _gone_on(found.method).steps(objective)
+    per_round = steps + best
     known, last, done = _ranked(found, selection), _Driven(selection, folder / "selection"), list[Round]()
     for number in range(1, rounds + 1):
         place, before = folder / f"round-{number}", per_round * (number - 1)
@@ -141,7 +143,7 @@ def search_on(
             weather=drives.settings.weather,
             folder=place / "selection",
             clean=last.bare(),
-            on_drive=lambda n, far, tell=tell: tell(found.schedule.iterations + n - 1, f"{far:.2f} m"),
+            on_drive=lambda n, far, tell=tell: tell(steps + n - 1, f"{far:.2f} m"),
         )
         done.append(Round(attack=again, selection=chosen, simulator_calls=calls + chosen.simulator_calls))
         known = sorted([*_ranked(again, chosen), *known], key=lambda each: -each[0])
@@ -173,7 +175,7 @@ def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Cand
 
 
 def _recorded(
-    simulator: Simulator, controller: Controller, clean: Drives, last: _Driven, method: Method, place: Path
+    simulator: Simulator, controller: Controller, clean: Drives, last: _Driven, method: Calibration, place: Path
 ) -> tuple[Recording, int]:
     """The way that the last pattern took the car, without the paint and calibrated, and the drives that took."""
     drive = record_along(simulator, controller, clean, last.over_chosen(), name=place.name, folder=place)
@@ -207,8 +209,7 @@ def _searched(
             found.space,
             objective=objective,
             groups=groups,
-            schedule=replace(found.schedule, heats=()),
-            restarts=found.restarts,
+            method=_gone_on(found.method),
             seed=found.seed,
             starts=starts,
             device=device,
@@ -216,3 +217,8 @@ def _searched(
             on_step=lambda step, best: tell(step, f"{best:.2f}"),
         ),
     )
+
+
+def _gone_on(method: Method) -> Method:
+    """The method with as many starts as it ended with, none of which compete."""
+    return replace(method, halving=False) if isinstance(method, GradOpt) else method

@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from roadproof.attacks import proposals
-from roadproof.attacks.blackbox import METHODS, blackbox_search
+from roadproof.attacks.blackbox import BlackBox, blackbox_search
+from roadproof.attacks.methods import METHODS as EVERY
+from roadproof.attacks.methods import method_of
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace
 
@@ -23,9 +25,12 @@ def bowl(unit):
     return -(unit - TARGET).square().sum((-1, -2))
 
 
-def search(method, *, calls=40, **options):
-    options = {"random_calls": 12, "space": BO} | options
-    return blackbox_search(bowl, options.pop("space"), method=method, calls=calls, **options)
+METHODS = [word for word, kind in EVERY.items() if issubclass(kind, BlackBox)]
+
+
+def search(word, *, calls=40, random_calls=12, value=bowl, **options):
+    more = {"random_calls": random_calls} if word == "published-bo" else {}
+    return blackbox_search(value, BO, method_of(word, calls=calls, **more), **options)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -131,7 +136,7 @@ def test_batches_are_measured_together():
 
     for method in ("random", "tpe", "cma-es"):
         sizes.clear()
-        trials = blackbox_search(objective, BO, method=method, calls=11, at_once=4)
+        trials = search(method, value=objective, calls=11, at_once=4)
         assert sizes == [4, 4, 3]
         assert len(trials.unit.unique(dim=0)) == 11
 
@@ -158,4 +163,4 @@ def test_arguments_that_make_no_sense_are_named(options, message):
 
 def test_a_value_that_is_not_a_number_is_an_error():
     with pytest.raises(RoadproofError, match="NaN or infinite at call 1"):
-        blackbox_search(lambda unit: torch.full((len(unit),), torch.nan), BO, method="random", calls=3)
+        search("random", value=lambda unit: torch.full((len(unit),), torch.nan), calls=3)

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from roadproof.attacks import Schedule, attack
+from roadproof.attacks import GradOpt, attack
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
 
-QUICK = Schedule.stretched(8)
+QUICK = GradOpt(iterations=8, restarts=2, halving=False)
 
 
 def linear():
@@ -27,9 +27,7 @@ class Rounded(LinearController):
 
 
 def checks(controller, random_patterns=0):
-    result = attack(
-        recording_set(), controller, SearchSpace(figures=1), schedule=QUICK, restarts=2, random_patterns=random_patterns
-    )
+    result = attack(recording_set(), controller, SearchSpace(figures=1), method=QUICK, random_patterns=random_patterns)
     return {check.name: check for check in result.checks}
 
 

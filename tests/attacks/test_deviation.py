@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from painted_ground import RampFollower, recorded_road
-from roadproof.attacks import PathDeviation, Schedule, SteeringShift, attack
-from roadproof.attacks.gradopt import Heat, gradopt
+from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack
+from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
@@ -17,7 +17,7 @@ from roadproof.recorded.world import UNSURE
 from roadproof.search_space import SearchSpace
 
 SPACE = SearchSpace(figures=1)
-SHORT = dataclasses.replace(Schedule.closed_loop(8), heats=())
+SHORT = GradOpt(iterations=8, restarts=2, halving=False)
 VEHICLE = dataclasses.replace(
     Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
 )
@@ -35,9 +35,7 @@ def road():
 
 
 def search(road, **options):
-    return attack(
-        road, RampFollower(), SPACE, **{"objective": PathDeviation(), "schedule": SHORT, "restarts": 2, **options}
-    )
+    return attack(road, RampFollower(), SPACE, **{"objective": PathDeviation(), "method": SHORT, **options})
 
 
 def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp_path):
@@ -67,11 +65,12 @@ def test_a_search_doubts_a_controller_that_was_not_recorded(road):
         def steer(self, frames, speed_mps, command):
             return super().steer(frames, speed_mps, command) + 0.15
 
-    found = {check.name: check for check in search(road, schedule=dataclasses.replace(SHORT, iterations=1)).checks}
+    found = {
+        check.name: check for check in search(road, method=GradOpt(iterations=1, restarts=1, halving=False)).checks
+    }
     assert found["keeps to the recorded road without paint"].passed
-    stray = attack(
-        road, Stray(), SPACE, objective=PathDeviation(), schedule=dataclasses.replace(SHORT, iterations=1), restarts=1
-    )
+    method = GradOpt(iterations=1, restarts=1, halving=False)
+    stray = attack(road, Stray(), SPACE, objective=PathDeviation(), method=method)
     (doubt,) = (check for check in stray.checks if check.name == "keeps to the recorded road without paint")
     assert not doubt.passed
     assert "record with it" in doubt.advice
@@ -112,20 +111,17 @@ def test_several_starts_are_valued_by_their_mean(road):
 
 
 def test_a_search_can_begin_with_the_steering_shift(road, tmp_path):
-    heats = (Heat(starts=4, iterations=6, every=2, open_loop=True), Heat(starts=4, iterations=2, every=6))
-    schedule = dataclasses.replace(SHORT, iterations=1, heats=heats)
+    rungs = (Rung(4, 6, every=2, open_loop=True), Rung(4, 2, every=6), Rung(2, 1))
     measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     seen: list[float] = []
-    found = gradopt(measure, SPACE, schedule=schedule, restarts=2, seed=0, on_step=lambda _, best: seen.append(best))
+    found = gradopt(measure, SPACE, rungs, seed=0, on_step=lambda _, best: seen.append(best))
     alone = SteeringShift().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").thinned(2)
-    climbed = gradopt(
-        alone, SPACE, schedule=dataclasses.replace(SHORT, iterations=6, learning_rate=0.1, drops=()), restarts=4, seed=0
-    )
-    # The first heat is the open loop's own search, step by step.
+    climbed = gradopt(alone, SPACE, (Rung(4, 6),), seed=0)
+    # The first rung is the open loop's own search, step by step.
     best = [float(value) for value in climbed.history.amax((1, 2)).cummax(0).values]
     assert seen[:6] == pytest.approx(best, abs=1e-6)
     assert float(found.best.max()) > 0
-    # The same again after an interruption inside that heat.
+    # The same again after an interruption inside that rung.
     stopped = tmp_path / "search.safetensors"
 
     def interrupt(step, _):
@@ -133,11 +129,26 @@ def test_a_search_can_begin_with_the_steering_shift(road, tmp_path):
             raise KeyboardInterrupt
 
     def once(**options):
-        return gradopt(measure, SPACE, schedule=schedule, restarts=2, seed=0, checkpoint=stopped, **options)
+        return gradopt(measure, SPACE, rungs, seed=0, checkpoint=stopped, **options)
 
     with pytest.raises(KeyboardInterrupt):
         once(on_step=interrupt)
     assert torch.equal(once().best_unit, found.best_unit)
+
+
+def test_a_search_without_gradients_drives_in_the_recorded_world_too(road, tmp_path):
+    pytest.importorskip("cmaes", reason="cmaes is not installed")
+    result = search(road, method=CMAES(calls=40), seed=1)
+    assert list(result.by_group) == ["all"], "to whichever side the car gives way"
+    assert result.history.shape == (40, 1, 1)
+    assert (np.diff(result.history[:, 0, 0]) >= 0).all()
+    assert result.history[-1, 0, 0] > result.history[0, 0, 0]
+    assert len(result.candidates) == 6
+    assert result.predicted_m > 0
+    assert "non-zero gradients" not in {check.name for check in result.checks}
+    assert torch.equal(search(road, method=CMAES(calls=40), seed=1).pattern.boxes, result.pattern.boxes)
+    result.save(tmp_path)
+    assert AttackResult.load(tmp_path).method == CMAES(calls=40)
 
 
 def test_objectives_that_make_no_sense_are_one_clear_line(road):

@@ -1,15 +1,17 @@
 """GradOpt: a known optimum is found, batches equal single searches, interrupted searches go on."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 import torch
 from safetensors import SafetensorError
 
-from roadproof.attacks import AttackResult, Heat, Schedule, Surrogate, attack
-from roadproof.attacks.gradopt import gradopt, random_search
-from roadproof.attacks.published import PublishedSurrogate
+from roadproof.attacks import AttackResult, GradOpt, PathDeviation, Published, SteeringShift, Surrogate, attack
+from roadproof.attacks.gradopt import Rung, dropping, gradopt, random_search
+from roadproof.attacks.methods import method_of
+from roadproof.attacks.published import PublishedMeasure
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
@@ -18,8 +20,25 @@ from roadproof.patterns import Pattern, boxes_from_published
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
 
-QUICK = Schedule.stretched(20)
-HEATED = dataclasses.replace(QUICK, heats=(Heat(starts=4, iterations=2, every=2),))
+QUICK = GradOpt(iterations=20, restarts=2, halving=False)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Laddered(GradOpt):
+    """GradOpt with few starts on its first rungs."""
+
+    first: tuple[Rung, ...] = (Rung(4, 2, every=2),)
+
+    def ladder(self, objective):
+        return (
+            *self.first,
+            *GradOpt(iterations=self.iterations, restarts=self.restarts, halving=False).ladder(objective),
+        )
+
+
+def stretched(iterations, starts):
+    """As the paper drops its rate, over fewer iterations."""
+    return dropping(starts, iterations, 0.1, after=(0.4, 0.8), factor=0.1)
 
 
 def pull_to_the_right(scale=1e-3):
@@ -63,18 +82,17 @@ def test_the_known_optimum_of_a_linear_controller_is_found():
 
 
 def test_both_sides_are_searched_and_the_stronger_is_kept():
-    result = attack(recording_set(), pull_to_the_right(), SearchSpace(figures=2), schedule=QUICK, restarts=2)
+    result = attack(recording_set(), pull_to_the_right(), SearchSpace(figures=2), method=QUICK)
     assert set(result.by_group) == {"clean+right", "clean+left"}
     assert result.surrogate_shift == max(result.by_group.values())
     assert min(result.by_group.values()) > 0
     assert result.history.shape == (20, 2, 2)
-    assert result.stopped == "all iterations done"
     assert result.cost.controller_frames > 20 * 2 * 2 * 8
 
 
 def test_the_best_pattern_is_the_one_the_history_promises():
     recordings, controller, space = recording_set(), pull_to_the_right(), SearchSpace(figures=2)
-    result = attack(recordings, controller, space, schedule=QUICK, restarts=2)
+    result = attack(recordings, controller, space, method=QUICK)
     surrogate = Surrogate(recordings, controller, (RIGHT_GROUP, LEFT_GROUP))
     batch = Pattern(result.pattern.shapes, result.pattern.boxes[None], result.pattern.colours[None])
     shown = surrogate.divergences([batch, batch])[:, 0]
@@ -84,7 +102,7 @@ def test_the_best_pattern_is_the_one_the_history_promises():
 
 def test_the_same_seed_gives_the_same_result_and_another_seed_another():
     run = lambda seed: attack(  # noqa: E731
-        recording_set(), pull_to_the_right(), SearchSpace(figures=2), schedule=QUICK, restarts=2, seed=seed
+        recording_set(), pull_to_the_right(), SearchSpace(figures=2), method=QUICK, seed=seed
     )
     one, again, other = run(3), run(3), run(4)
     np.testing.assert_array_equal(one.history, again.history)
@@ -94,44 +112,42 @@ def test_the_same_seed_gives_the_same_result_and_another_seed_another():
 
 def test_restarts_in_one_batch_are_the_restarts_one_by_one(monkeypatch):
     recordings, controller, space = recording_set(), pull_to_the_right(), SearchSpace(figures=2)
-    together = attack(recordings, controller, space, schedule=QUICK, restarts=4)
+    together = attack(recordings, controller, space, method=dataclasses.replace(QUICK, restarts=4))
     monkeypatch.setattr("roadproof.attacks.surrogate.MAX_FRAMES", 1)
-    apart = attack(recordings, controller, space, schedule=QUICK, restarts=4)
+    apart = attack(recordings, controller, space, method=dataclasses.replace(QUICK, restarts=4))
     np.testing.assert_allclose(together.history, apart.history, rtol=1e-3, atol=1e-4)
 
 
 def test_each_drop_of_the_rate_starts_from_the_best_so_far():
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
-    search = gradopt(surrogate, SearchSpace(figures=1), schedule=Schedule(iterations=9, drops=(6,)), restarts=3, seed=0)
+    search = gradopt(surrogate, SearchSpace(figures=1), (Rung(3, 6), Rung(3, 3, 0.01)), seed=0)
+    assert len(search.history) == 9
     torch.testing.assert_close(search.history[6], search.history[:6].amax(0), rtol=1e-4, atol=1e-5)
 
 
-def test_the_best_of_a_heat_go_on():
+def test_the_best_of_a_rung_go_on():
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP, LEFT_GROUP))
-    space, heat = SearchSpace(figures=2), Schedule(iterations=3, drops=())
-    alone = gradopt(surrogate, space, schedule=heat, restarts=6, seed=3)
-    schedule = Schedule(iterations=1, heats=(Heat(starts=6, iterations=3, every=1),))
-    chosen = gradopt(surrogate, space, schedule=schedule, restarts=2, seed=3).history[0]
+    space = SearchSpace(figures=2)
+    alone = gradopt(surrogate, space, (Rung(6, 3),), seed=3)
+    chosen = gradopt(surrogate, space, (Rung(6, 3), Rung(2, 1)), seed=3).history[0]
     torch.testing.assert_close(chosen, alone.best.topk(2).values, rtol=1e-4, atol=1e-5)
 
 
-def test_heats_run_on_few_frames_and_their_cost_is_counted():
+def test_first_rungs_run_on_few_frames_and_their_cost_is_counted():
     surrogate = Surrogate(recording_set(frames=4), pull_to_the_right(), (RIGHT_GROUP,))
     assert surrogate.thinned(3).lengths == [[2, 2]]
     before, steps = surrogate.frames_evaluated, []
-    schedule = Schedule(iterations=2, heats=(Heat(starts=3, iterations=5, every=2),))
     on_step = lambda step, _best: steps.append(step)  # noqa: E731
-    gradopt(surrogate, SearchSpace(figures=1), schedule=schedule, restarts=1, seed=0, on_step=on_step)
-    clean, heat, search = 4, 3 * 5 * 4, 2 * 8
-    assert surrogate.frames_evaluated - before == clean + heat + search
-    assert steps == list(range(1, schedule.steps + 1))
+    gradopt(surrogate, SearchSpace(figures=1), (Rung(3, 5, every=2), Rung(1, 2)), seed=0, on_step=on_step)
+    clean, first, search = 4, 3 * 5 * 4, 2 * 8
+    assert surrogate.frames_evaluated - before == clean + first + search
+    assert steps == list(range(1, 8))
 
 
-def test_heats_find_more_than_random_starts_of_equal_cost():
+def test_competing_starts_find_more_than_random_starts_of_equal_cost():
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP, LEFT_GROUP))
-    heats = Schedule(iterations=10, heats=(Heat(starts=12, iterations=5, every=2),))
-    search = lambda schedule: gradopt(surrogate, SearchSpace(figures=3), schedule=schedule, restarts=2, seed=0)  # noqa: E731
-    assert (search(heats).best.mean(1) > search(Schedule(iterations=25)).best.mean(1)).all()
+    search = lambda *rungs: gradopt(surrogate, SearchSpace(figures=3), rungs, seed=0)  # noqa: E731
+    assert (search(Rung(12, 5, every=2), Rung(2, 10)).best.mean(1) > search(Rung(2, 25)).best.mean(1)).all()
 
 
 class InterruptionError(Exception):
@@ -140,16 +156,15 @@ class InterruptionError(Exception):
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 13])
 def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path, at):
-    """Within the first heat, at its end, within the second, at its end, and in the search proper."""
-    schedule = dataclasses.replace(HEATED, iterations=11, heats=(*HEATED.heats, Heat(starts=3, iterations=2, every=1)))
+    """Within the first rung, at its end, within the second, at its end, and in those of the search proper."""
+    method = Laddered(iterations=11, restarts=2, first=(Rung(4, 2, every=2), Rung(3, 2)))
 
     def run(checkpoint, on_step=lambda _step, _best: None):
         return attack(
             recording_set(),
             pull_to_the_right(),
             SearchSpace(figures=2),
-            schedule=schedule,
-            restarts=2,
+            method=method,
             checkpoint=checkpoint,
             on_step=on_step,
         )
@@ -171,23 +186,11 @@ def test_an_interrupted_search_goes_on_to_the_same_result(tmp_path, at):
     assert resumed.cost.controller_frames >= straight.cost.controller_frames
 
 
-def test_a_search_that_stopped_early_is_not_searched_on(tmp_path):
-    schedule = Schedule(iterations=200, drops=(10,), patience=8)
-    surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
-    run = lambda: gradopt(  # noqa: E731
-        surrogate, SearchSpace(figures=1), schedule=schedule, restarts=1, seed=0, checkpoint=tmp_path / "s.safetensors"
-    )
-    once, again = run(), run()
-    assert torch.equal(once.history, again.history)
-    assert again.stopped == once.stopped
-
-
 def test_a_search_goes_on_from_the_candidates_of_another():
     recordings, controller, space = recording_set(), pull_to_the_right(), SearchSpace(figures=2)
-    first = attack(recordings, controller, space, schedule=QUICK, restarts=2)
-    more = attack(
-        recordings, controller, space, schedule=Schedule.stretched(3), restarts=3, starts=first.candidates, seed=7
-    )
+    first = attack(recordings, controller, space, method=QUICK)
+    again = GradOpt(iterations=3, restarts=3, halving=False)
+    more = attack(recordings, controller, space, method=again, starts=first.candidates, seed=7)
     for group, best in first.by_group.items():
         assert more.by_group[group] >= best - 1e-4
     found = {name: [c.surrogate_shift for c in first.candidates if c.group == name] for name in first.by_group}
@@ -199,8 +202,8 @@ def test_a_search_goes_on_from_the_candidates_of_another():
 def test_a_checkpoint_of_another_search_or_a_damaged_one_is_not_used(tmp_path):
     checkpoint = tmp_path / "search.safetensors"
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
-    space, short = SearchSpace(figures=1), Schedule.stretched(3)
-    run = lambda seed: gradopt(surrogate, space, schedule=short, restarts=1, seed=seed, checkpoint=checkpoint)  # noqa: E731
+    space = SearchSpace(figures=1)
+    run = lambda seed: gradopt(surrogate, space, (Rung(1, 3),), seed=seed, checkpoint=checkpoint)  # noqa: E731
     first = run(0)
     second = run(1)
     assert not torch.equal(first.history, second.history)
@@ -214,45 +217,86 @@ def test_a_checkpoint_on_a_full_disk_is_one_clear_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr("safetensors.torch.save_file", full)
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
-    checkpoint, short = tmp_path / "search.safetensors", Schedule.stretched(2)
+    checkpoint = tmp_path / "search.safetensors"
     with pytest.raises(OutputError, match="No space left"):
-        gradopt(surrogate, SearchSpace(figures=1), schedule=short, restarts=1, seed=0, checkpoint=checkpoint)
+        gradopt(surrogate, SearchSpace(figures=1), (Rung(1, 2),), seed=0, checkpoint=checkpoint)
     assert not list(tmp_path.iterdir())
 
 
-def test_patience_ends_a_search_that_gains_nothing():
-    schedule = Schedule(iterations=200, drops=(10,), patience=8)
-    result = attack(recording_set(), pull_to_the_right(), SearchSpace(figures=1), schedule=schedule, restarts=1)
-    assert len(result.history) < 200
-    assert "last 8 iterations" in result.stopped
+@pytest.mark.parametrize("masks", ["binary", "antialiased"])
+@pytest.mark.parametrize(
+    "space",
+    [
+        SearchSpace(figures=2),
+        SearchSpace(figures=1, colour=False),
+        SearchSpace(figures=1, family="published-canvas-centre"),
+    ],
+    ids=["coloured", "black", "canvas centre"],
+)
+def test_the_published_gradient_climbs(masks, space):
+    measure = PublishedMeasure(recording_set(frames=2), pull_to_the_right(), (RIGHT_GROUP,), masks=masks)
+    search = gradopt(measure.on_grid(10.0), space, (Rung(2, 12),), momentum=0.0, seed=0)
+    assert bool((search.best >= search.history[0]).all())
+    assert float(search.best.max()) > float(search.history[0].max()) + 0.1
 
 
-def test_the_published_gradient_climbs_too():
-    space = SearchSpace(figures=1)
-    surrogate = PublishedSurrogate(recording_set(frames=2), pull_to_the_right(), (RIGHT_GROUP,))
-    search = gradopt(surrogate, space, schedule=Schedule.stretched(15), restarts=2, seed=0)
-    assert bool((search.best > search.history[0] + 0.1).all())
-    with pytest.raises(PatternError, match="published family"):
-        surrogate.values(SearchSpace(figures=1, family="free"), torch.rand(1, 1, 1, 8))
+def test_the_published_measure_sums_frames_as_the_paper_does():
+    recordings, space = recording_set(frames=3), SearchSpace(figures=2)
+    published = PublishedMeasure(recordings, pull_to_the_right(), (RIGHT_GROUP,), masks="antialiased")
+    exact = Surrogate(recordings, pull_to_the_right(), (RIGHT_GROUP,))
+    unit = space.random((1, 2), torch.Generator().manual_seed(0))
+    # Six frames: three of the clean drive and three of the one pushed right.
+    torch.testing.assert_close(published.values(space, unit), 6 * exact.values(space, unit), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(published.readings(space, unit)[0], exact.values(space, unit), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("masks", ["binary", "antialiased"])
+def test_the_local_linearisation_is_what_two_renderings_say(masks):
+    """One parameter at a time, at both ends of its cell, every other as it is."""
+    space = SearchSpace(figures=2)
+    measure = PublishedMeasure(recording_set(frames=2), pull_to_the_right(), (RIGHT_GROUP,), masks=masks).on_grid(10.0)
+    unit = space.random((1, 1), torch.Generator().manual_seed(3))
+    _, gradient = measure.values_and_gradients(space, unit)
+    spans = torch.tensor(space.shape_ranges)
+    for figure, parameter in ((0, 0), (1, 1), (0, 2), (1, 3)):
+        low = float((unit[0, 0, figure, parameter] * spans[parameter] / 10).floor() * 10 / spans[parameter])
+        ends = unit.repeat(1, 2, 1, 1)
+        ends[0, :, figure, parameter] = torch.tensor([low, low + float(10 / spans[parameter])])
+        below, above = measure.values(space, ends)[0].tolist()
+        told = (above - below) * float(spans[parameter] / 10)
+        # This controller is linear in the picture, so that linearised and true differences are equal.
+        assert float(gradient[0, 0, figure, parameter]) == pytest.approx(told, rel=0.02, abs=0.02)
+
+
+def test_the_published_search_refuses_what_was_not_published():
+    recordings, controller = recording_set(frames=2), pull_to_the_right()
+    with pytest.raises(PatternError, match="published families alone"):
+        PublishedMeasure(recordings, controller, (RIGHT_GROUP,)).values(
+            SearchSpace(figures=1, family="free"), torch.rand(1, 1, 1, 8)
+        )
+    with pytest.raises(RoadproofError, match="enlarges the steering shift, not the path deviation"):
+        attack(recordings, controller, SearchSpace(figures=1), method=Published(), objective=PathDeviation())
+    with pytest.raises(RoadproofError, match="masks is 'soft', expected binary or antialiased"):
+        Published(masks="soft")
+    with pytest.raises(RoadproofError, match="method published has no iterations; it has masks, restarts"):
+        method_of("published", iterations=3)
 
 
 def test_gradients_beat_random_search_of_equal_cost():
     surrogate = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP, LEFT_GROUP))
     space = SearchSpace(figures=3)
-    search = gradopt(surrogate, space, schedule=Schedule.stretched(40), restarts=2, seed=0)
+    search = gradopt(surrogate, space, stretched(40, 2), seed=0)
     _, by_chance = random_search(surrogate, space, patterns=80, seed=5)
     assert (search.best.amax(1) > by_chance).all()
 
 
 def test_a_result_is_the_same_when_loaded(tmp_path):
-    result = attack(
-        recording_set(), pull_to_the_right(), SearchSpace(figures=2), schedule=HEATED, restarts=2, random_patterns=4
-    )
+    result = attack(recording_set(), pull_to_the_right(), SearchSpace(figures=2), method=QUICK, random_patterns=4)
     result.save(tmp_path)
     loaded = AttackResult.load(tmp_path)
     torch.testing.assert_close(loaded.pattern.boxes, result.pattern.boxes)
     np.testing.assert_allclose(loaded.history, result.history, atol=1e-6)
-    for name in ("group", "surrogate_shift", "by_group", "stopped", "cost", "checks", "space", "schedule", "seed"):
+    for name in ("group", "surrogate_shift", "by_group", "cost", "checks", "space", "method", "seed"):
         assert getattr(loaded, name) == getattr(result, name), name
 
 
@@ -265,26 +309,33 @@ def test_a_controller_for_other_frames_or_one_that_answers_nan_is_refused():
         Surrogate(recording_set(), LinearController(torch.full((3, 88, 200), torch.nan)), (RIGHT_GROUP,))
 
 
-@pytest.mark.parametrize("kwargs", [{"iterations": 0}, {"learning_rate": 0.0}])
-def test_schedules_that_make_no_sense_are_refused(kwargs):
-    with pytest.raises(RoadproofError):
-        Schedule(**kwargs)
+def test_methods_that_make_no_sense_are_refused():
+    for wrong in ({"iterations": 0}, {"restarts": 0}, {"restarts": True}, {"restarts": 9}):
+        with pytest.raises(RoadproofError, match=f"{next(iter(wrong))} is {next(iter(wrong.values()))}, expected"):
+            GradOpt(**wrong)
+    assert GradOpt(restarts=9, halving=False).restarts == 9
+    with pytest.raises(RoadproofError, match="too small"):
+        Rung(4, 2, every=0)
+    with pytest.raises(RoadproofError, match="method is 'magic', expected one of gradopt, published"):
+        method_of("magic")
 
 
-def test_restarts_must_be_at_least_one_and_heats_must_leave_as_many():
-    run = lambda restarts: attack(  # noqa: E731
-        recording_set(), pull_to_the_right(), SearchSpace(figures=1), schedule=HEATED, restarts=restarts
-    )
-    with pytest.raises(RoadproofError, match="restarts is 0"):
-        run(0)
-    with pytest.raises(RoadproofError, match="fewer than 5 restarts"):
-        run(5)
-    with pytest.raises(RoadproofError, match="number below 1"):
-        Heat(starts=4, iterations=2, every=0)
+def test_the_published_steps_are_the_papers():
+    rungs = Published().ladder
+    assert [(rung.starts, rung.iterations, rung.learning_rate, rung.grid) for rung in rungs] == [
+        (4, 100, 0.1, 10.0),
+        (4, 100, 0.01, 1.0),
+        (4, 50, 0.001, 1.0),
+    ]
+    assert Published().steps(SteeringShift()) == 250
 
 
-def test_the_published_schedule_is_the_papers():
-    schedule = Schedule()
-    assert [round(schedule.rate(i), 6) for i in (0, 99, 100, 199, 200, 249)] == [0.1, 0.1, 0.01, 0.01, 0.001, 0.001]
-    assert Schedule.stretched(250) == schedule == Schedule.stretched()
-    assert not schedule.heats
+def test_results_of_the_first_format_are_still_read(tmp_path):
+    result = attack(recording_set(), pull_to_the_right(), SearchSpace(figures=1), method=QUICK)
+    result.save(tmp_path)
+    told = json.loads((tmp_path / "result.json").read_text())
+    del told["method"]
+    told |= {"version": 1, "restarts": 3, "stopped": "all iterations done"}
+    told["schedule"] = {"iterations": 30, "learning_rate": 0.1, "drops": [15], "heats": [{"starts": 24}]}
+    (tmp_path / "result.json").write_text(json.dumps(told))
+    assert AttackResult.load(tmp_path).method == GradOpt(iterations=30, restarts=3)

@@ -88,14 +88,19 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke
         ["--family", "free", "--shape", "ellipse"],
         ["--groups", "all"],
         ["--albedo", "0.1", "0.7", "--max-painted-share", "0.2"],
-        ["--gradient", "published"],
+        ["--method", "published", "--family", "published-canvas-centre"],
+        ["--method", "published", "--masks", "antialiased", "--black"],
+        ["--method", "random", "--calls", "8"],
     ],
     ids=" ".join,
 )
 def test_every_kind_of_search_runs(here, tmp_path, options):
-    outcome = CliRunner().invoke(
-        app, command("--out", str(tmp_path), "--iterations", "2", "--schedule", "published", *options)
-    )
+    small = " ".join(command("--out", str(tmp_path), *options))
+    if "--method" in options:
+        small = small.replace("--iterations 4", "")
+    if "random" in options:
+        small = small.replace("--restarts 2", "")
+    outcome = CliRunner().invoke(app, small.split())
     assert outcome.exit_code == 0, outcome.output
 
 
@@ -135,7 +140,9 @@ MISTAKES = {
     "unknown family": (["--family", "publised"], {}, "did you mean published?"),
     "unknown shape": (["--shape", "star"], {}, "expected one of rectangle, ellipse"),
     "unknown group": (["--groups", "clean+up"], {}, "group 'clean+up' is unknown"),
-    "published with ellipses": (["--gradient", "published", "--family", "free"], {}, "published gradient needs"),
+    "published with iterations": (["--method", "published"], {}, "method published has no iterations; it has masks"),
+    "a black box with restarts": (["--method", "tpe"], {}, "method tpe has no iterations; it has calls"),
+    "an unknown method": (["--method", "magic"], {}, "method is 'magic', expected one of gradopt"),
 }
 
 

@@ -6,19 +6,20 @@ import pytest
 
 import needs
 from paint_shy import along_a_street
-from roadproof.attacks import Schedule, SteeringShift
+from roadproof.attacks import GradOpt, SteeringShift
+from roadproof.budget import BUDGETS, Budget
 from roadproof.datatypes import Weather
-from roadproof.loop import BUDGETS, Budget
+from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.scenarios import save_scenarios
 
 TINY = Budget(
     objective=SteeringShift(),
-    deviations_m=(1.5,),
-    frames=4,
-    schedule=Schedule.stretched(2),
-    restarts=1,
+    method=GradOpt(iterations=2, restarts=1, halving=False),
+    trajectories=Trajectories(perturbation=Swerve((1.5,))),
+    window=Window(frames=4),
     select=1,
     weathers=(Weather.CLEAR_NOON,),
+    starts=0,
     runs=0,
 )
 
@@ -54,7 +55,10 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
         (["--budget", "endless"], "--budget is 'endless'"),
         (["--scenario", "left-99"], "did you mean"),
         (["--attack-weathers", "clear-noon,rainy"], "--attack-weathers is 'rainy'"),
-        (["--attack-weathers", "clear-noon,rainy-noon", "--budget", "paper"], "choose two-paint"),
+        (
+            ["--attack-weathers", "clear-noon,rainy-noon", "--budget", "published"],
+            "weathers attacked 2: as published it is 1",
+        ),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
         (["--processes", "0"], "--processes is 0, expected 1"),

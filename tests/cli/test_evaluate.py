@@ -20,7 +20,7 @@ needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
 
 TESTS = Path(__file__).parents[1]
-ONE_DRIVE = ["--weathers", "clear-noon", "--runs", "0", "--controller", "paint_shy:paint_shy"]
+ONE_DRIVE = ["--weathers", "clear-noon", "--starts", "0", "--runs", "0", "--controller", "paint_shy:paint_shy"]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ REFUSED = [
     ((*ATTACK, "--seed", "1" + 23 * "0"), "--seed is 1"),
     ((*ATTACK, "--figures", "1000000"), "--figures is 1000000, expected 1 to 64"),
     ((*ATTACK, "--random-patterns", "-5"), "--random-patterns is -5, expected 0 to 100,000"),
-    ((*ATTACK, "--patience", "-1"), "--patience is -1, expected 1 to"),
+    ((*ATTACK, "--calls", "-1"), "--calls is -1, expected 1 to"),
     ((*ATTACK, "--max-painted-share", "nan"), "--max-painted-share is nan, expected 0.0 to 1.0"),
     ((*EVALUATE, "--random", "-1"), "--random is -1, expected 0 to"),
     ((*EVALUATE, "--runs", "-1"), "--runs is -1, expected 0 to"),

@@ -28,7 +28,7 @@ CONTROLLER = textwrap.dedent(
             return Control(0.0, throttle=0.7)
     """
 )
-RECORD = ["record", "straight-04", "--trajectories", "1", "--frames", "3", "--out", "runs"]
+RECORD = ["record", "straight-04", "--budget", "steering", "--trajectories", "1", "--frames", "3", "--out", "runs"]
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,12 @@ from short_drive import write_plan
 
 PLAN = """
 format = "roadproof-study"
-version = 1
+version = 2
 controller = "pilotnet"
 scenario_file = "short.toml"
 scenarios = ["short"]
 figures = ["1-b"]
+starts = { count = 1 }
 method = [{ name = "chance", search = "random", calls = 1 }]
 """
 

@@ -8,13 +8,11 @@ from roadproof.compositing import composite, view_canvas
 from roadproof.compositing.published import (
     canvas_mask,
     composite_published,
-    local_gradients,
     nearest_canvas_pixels,
     view_canvas_published,
 )
-from roadproof.coverage import Shape
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_INPUT
-from roadproof.patterns import Pattern, boxes_from_published, rectangles_from_published
+from roadproof.patterns import rectangles_from_published
 from scenes import PLAIN, road_frames
 
 ROWS = [[70.5, 191.5, 56.7, 37.7, 143.2, 196.7, 112.2], [154.4, 176.0, 44.0, 0.8, 8.4, 150.4, 193.1]]
@@ -42,24 +40,3 @@ def test_published_frames_are_ours_without_antialiasing():
     painted = (published != clean).any(-1)
     assert float((published - ours).abs()[painted].median()) < 0.01
     assert float((published - ours).abs().mean()) < 0.01
-
-
-def test_local_linearisation_points_where_the_exact_gradient_does():
-    frames, homographies = road_frames(3, 0), approach(3)
-    colours = torch.tensor(ROWS)[:, 4:] / 255
-    values = torch.tensor(ROWS)[:, :4]
-    rows, columns = torch.meshgrid(torch.linspace(-1, 1, 88), torch.linspace(-1, 1, 200), indexing="ij")
-    weight = (columns + rows)[None, :, :, None].expand(3, -1, -1, 3)
-    shape, colour = local_gradients(
-        values, colours, view_canvas_published(frames, homographies, CIL_INPUT, PLAIN), weight, step=10.0
-    )
-    leaf = torch.tensor(ROWS).requires_grad_()
-    exact_frames = composite(_pattern(leaf), view_canvas(frames, homographies, CIL_INPUT, PLAIN)).permute(0, 2, 3, 1)
-    (exact,) = torch.autograd.grad((exact_frames * weight).sum(), leaf)
-    cosine = torch.nn.functional.cosine_similarity
-    assert float(cosine(shape.flatten(), exact[:, :4].flatten(), dim=0)) > 0.8
-    assert float(cosine(colour.flatten(), exact[:, 4:].flatten(), dim=0)) > 0.98
-
-
-def _pattern(rows):
-    return Pattern((Shape.RECTANGLE,) * len(rows), boxes_from_published(rows[:, :4]), rows[:, 4:] / 255)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from paint_shy import PaintShy, just_before_the_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError, PatternError
-from roadproof.evaluation import Evaluation, evaluate, random_patterns
+from roadproof.evaluation import Evaluation, StartRange, evaluate, random_patterns
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.result import load_paint, path_of
 from roadproof.metrics import deviation_m, infraction_points, lateral_m, passage
@@ -25,7 +26,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 SHORT = just_before_the_canvas(2.5)
 MAGENTA = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON)
-CONDITIONS = {"weathers": WEATHERS, "runs": 2, "cars": 2, "pedestrians": 2, "seed": 3}
+CONDITIONS = {"weathers": WEATHERS, "starts": 0, "runs": 2, "cars": 2, "pedestrians": 2, "seed": 3}
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +137,7 @@ def test_a_second_call_drives_nothing_and_a_lost_drive_alone_is_made_again(done,
 
 def test_other_inputs_are_other_drives(done, town):
     folder = done[0]
-    one = {"weathers": WEATHERS[:1], "runs": 0, "seed": 3}
+    one = {"weathers": WEATHERS[:1], "starts": 0, "runs": 0, "seed": 3}
     known = {path.name for path in (folder / "episodes").iterdir()}
 
     def files(driver, pattern, scenario=SHORT):
@@ -160,6 +161,7 @@ def test_two_processes_drive_what_one_does(done, tmp_path):
         MAGENTA,
         folder=tmp_path,
         weathers=WEATHERS[:1],
+        starts=0,
         runs=1,
         cars=2,
         pedestrians=2,
@@ -186,6 +188,7 @@ def test_random_patterns_are_drawn_by_their_seed():
 MISTAKES = {
     "0 weathers": {"weathers": ()},
     "-1 runs": {"runs": -1},
+    "-1 starts": {"starts": -1},
     "no cars and no pedestrians": {"runs": 2, "cars": 0, "pedestrians": 0},
     "need a simulator each": {"processes": 2},
 }
@@ -196,6 +199,40 @@ def test_conditions_that_make_no_sense_are_refused(town, tmp_path, message):
     with pytest.raises(EpisodeError, match=message):
         evaluate(town, PaintShy(), SHORT, MAGENTA, folder=tmp_path, **MISTAKES[message])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, tmp_path):
+    narrow = StartRange(right_m=0.2, turned_rad=0.02, faster_mps=1.0)
+    options = {"weathers": WEATHERS, "starts": 3, "start_range": narrow, "runs": 1, "cars": 1, "seed": 3}
+    told = evaluate(town, PaintShy(), SHORT, MAGENTA, folder=tmp_path, **options)
+    alone = told.of(traffic=False, weather=WEATHERS[0])
+    starts = [trial.start for trial in alone]
+    assert (
+        starts == list(narrow.draw(3, seed=3)) == [trial.start for trial in told.of(traffic=False, weather=WEATHERS[1])]
+    )
+    assert len(set(starts)) == 3
+    assert told.of(traffic=True)[0].start == starts[0]
+    for trial in alone:
+        clean, painted = load_episodes(tmp_path, (trial.clean, trial.painted))
+        right = math.sin(SHORT.start.yaw_rad) * (clean.x_m[0] - SHORT.start.x_m)
+        right -= math.cos(SHORT.start.yaw_rad) * (clean.y_m[0] - SHORT.start.y_m)
+        assert right == pytest.approx(trial.start.right_m, abs=1e-3)
+        assert clean.speed_mps[0] - SHORT.start.speed_mps == pytest.approx(trial.start.faster_mps, abs=1e-3)
+        assert (painted.x_m[0], painted.yaw_rad[0]) == (clean.x_m[0], clean.yaw_rad[0])
+    row = told.rows()[0]
+    deviations = sorted(trial.deviation_m for trial in alone)
+    assert (row.count, row.median_m, row.least_m, row.most_m) == (3, deviations[1], deviations[0], deviations[2])
+    assert row.left_lane == np.mean([trial.leaves_lane for trial in alone])
+    assert row.deviation_m.low is not None, "drawn starts are a sample"
+    assert Evaluation.load(tmp_path).trials == told.trials
+    assert Evaluation.load(tmp_path).start_range == narrow
+
+
+@pytest.mark.parametrize("wrong", [{"right_m": 1.5}, {"turned_rad": -0.1}, {"faster_mps": math.nan}], ids=str)
+def test_starts_off_the_lane_are_refused(wrong):
+    name, value = next(iter(wrong.items()))
+    with pytest.raises(EpisodeError, match=f"{name} of the starts is {value}, expected 0 to"):
+        StartRange(**wrong)
 
 
 def test_a_pattern_that_paints_nothing_is_refused(town, tmp_path):

@@ -106,7 +106,7 @@ def test_the_clean_drive_that_is_given_is_not_made(town, street, tmp_path):
 def test_an_evaluation_finds_the_bare_drive_of_a_selection(done, town, street):
     folder, selection, _ = done
     evaluation = evaluate(
-        town, PaintShy(), street, selection.pattern, folder=folder, weathers=[Weather.CLEAR_NOON], runs=0
+        town, PaintShy(), street, selection.pattern, folder=folder, weathers=[Weather.CLEAR_NOON], starts=0, runs=0
     )
     assert evaluation.trials[0].clean == selection.driven[0].trial.clean
     assert evaluation.trials[0].deviation_m == selection.deviation_m, "the same drive again"

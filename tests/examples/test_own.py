@@ -15,9 +15,11 @@ from PIL import Image
 import needs
 import roadproof.loop
 from references import approach
-from roadproof.attacks import Schedule
+from roadproof.attacks import GradOpt
+from roadproof.attacks.gradopt import Rung
 from roadproof.controllers import check_controller
 from roadproof.datatypes import Weather
+from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.evaluation import Evaluation
 from roadproof.geometry import apply_homography
 
@@ -40,7 +42,7 @@ def test_a_recording_of_ones_own_is_attacked(tmp_path, monkeypatch, capsys):
         Image.fromarray(rng.integers(90, 140, (600, 800, 3), np.uint8)).save(drive / f"{number}.png")
     np.savetxt(drive / "corners.csv", np.column_stack([seen, np.full(3, 6.0)]), delimiter=",")
     # The example's own search, less of it.
-    monkeypatch.setattr(Schedule, "in_heats", staticmethod(lambda: Schedule(iterations=4, drops=())))
+    monkeypatch.setattr(GradOpt, "ladder", lambda self, objective: (Rung(2, 4),))
     run("own_recording.py", drive, "pilotnet", tmp_path / "out", monkeypatch=monkeypatch)
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["surrogate_shift"] > 0
@@ -53,15 +55,15 @@ def test_a_recording_of_ones_own_is_attacked(tmp_path, monkeypatch, capsys):
 def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys):
     needs.town()
     tiny = dataclasses.replace(
-        roadproof.loop.QUICK,
-        deviations_m=(1.5,),
-        frames=20,
-        schedule=Schedule(iterations=8, drops=()),
-        restarts=2,
+        roadproof.QUICK,
+        method=GradOpt(iterations=8, restarts=2, halving=False),
+        trajectories=Trajectories(perturbation=Swerve((1.5,))),
+        window=Window(frames=20, least_px=8),
         select=2,
         weathers=(Weather.CLEAR_NOON,),
+        starts=0,
     )
-    monkeypatch.setattr(roadproof.loop, "QUICK", tiny)
+    monkeypatch.setattr(roadproof.budget, "QUICK", tiny)
     names = run("own_controller.py", tmp_path, monkeypatch=monkeypatch)
     check_controller(names["LineFollower"]()).require()
     (trial,) = Evaluation.load(tmp_path / "evaluation").trials

@@ -37,7 +37,14 @@ def predicted(recordings, tmp_path_factory):
     run = tmp_path_factory.mktemp("predicted")
     with RecordedSimulator(recordings) as world:
         done = evaluate(
-            world, PaintShy(), world.scenario, BAR, folder=run / "evaluation", weathers=(Weather.CLEAR_NOON,), runs=0
+            world,
+            PaintShy(),
+            world.scenario,
+            BAR,
+            folder=run / "evaluation",
+            weathers=(Weather.CLEAR_NOON,),
+            starts=0,
+            runs=0,
         )
         film_trial(world, done, raster(BAR), run / "evaluation")
     write_report(run)
@@ -86,7 +93,7 @@ def test_the_report_says_that_nothing_was_driven(predicted):
     for words in (
         "Predicted, not driven",
         "Nothing was driven for real",
-        "mean deviation, predicted",
+        "median deviation, predicted",
         "Predicted<br>deviation m",
         "Not known: recordings have no map.",
         "Nothing here was driven for real.",

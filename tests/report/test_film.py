@@ -28,7 +28,9 @@ def stops_for_good(_):
 
 def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town, tmp_path):
     scenario = dataclasses.replace(SHORT, time_limit_s=8.0)
-    done = evaluate(town, stops_for_good, scenario, PATTERN, folder=tmp_path, weathers=(Weather.CLEAR_NOON,), runs=0)
+    done = evaluate(
+        town, stops_for_good, scenario, PATTERN, folder=tmp_path, weathers=(Weather.CLEAR_NOON,), starts=0, runs=0
+    )
     (drive,) = load_episodes(tmp_path, [done.shown().painted])
     assert film_trial(town, done, np.zeros((400, 400, 4), np.uint8), tmp_path)
     with av.open(str(tmp_path / "film.mp4")) as film:

@@ -2,7 +2,8 @@ import pytest
 
 from roadproof.datatypes import Weather
 from roadproof.scenarios import builtin_scenarios
-from roadproof.study.plan import MethodPlan, Study
+from roadproof.study.methods import BlackBoxPlan, GradOptPlan
+from roadproof.study.plan import Study
 
 
 @pytest.fixture
@@ -12,8 +13,8 @@ def small_study():
         scenarios=builtin_scenarios()[:1],
         figures=("1-b", 2),
         methods=(
-            MethodPlan(name="GradOpt", search="gradopt"),
-            MethodPlan(name="BO", search="published-bo", calls=10, random_calls=5),
+            GradOptPlan(name="GradOpt"),
+            BlackBoxPlan(name="BO", search="published-bo", calls=10, random_calls=5),
         ),
         weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON),
     )

@@ -68,7 +68,7 @@ def test_a_process_that_dies_takes_its_job_and_no_other(small_study, tmp_path):
 
 PLAN = """
 format = "roadproof-study"
-version = 1
+version = 2
 controller = "cil"
 scenarios = ["left-01"]
 figures = [1, 2]
@@ -88,15 +88,18 @@ def test_a_cluster_gives_the_same_rows_also_when_a_worker_dies(work, tmp_path):
 
 DRIVEN = """
 format = "roadproof-study"
-version = 1
+version = 2
 controller = "pilotnet"
 scenario_file = "short.toml"
 scenarios = ["short"]
 figures = [1]
+starts = { count = 1 }
 
 [[method]]
 name = "GradOpt"
 search = "gradopt"
+objective = "steering"
+halving = false
 trajectories = 1
 restarts = 1
 iterations = 2

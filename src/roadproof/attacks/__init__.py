@@ -2,10 +2,18 @@
 
 from roadproof.attacks.attack import attack as attack
 from roadproof.attacks.attack import kept_attack as kept_attack
+from roadproof.attacks.blackbox import CMAES as CMAES
+from roadproof.attacks.blackbox import TPE as TPE
+from roadproof.attacks.blackbox import BayesianOptimisation as BayesianOptimisation
+from roadproof.attacks.blackbox import BlackBox as BlackBox
+from roadproof.attacks.blackbox import GaussianProcess as GaussianProcess
+from roadproof.attacks.blackbox import RandomSearch as RandomSearch
 from roadproof.attacks.checks import Check as Check
-from roadproof.attacks.gradopt import Heat as Heat
-from roadproof.attacks.gradopt import Schedule as Schedule
-from roadproof.attacks.objective import GRADIENTS as GRADIENTS
+from roadproof.attacks.methods import METHODS as METHODS
+from roadproof.attacks.methods import GradOpt as GradOpt
+from roadproof.attacks.methods import Method as Method
+from roadproof.attacks.methods import Published as Published
+from roadproof.attacks.methods import method_of as method_of
 from roadproof.attacks.objective import OBJECTIVES as OBJECTIVES
 from roadproof.attacks.objective import Objective as Objective
 from roadproof.attacks.objective import PathDeviation as PathDeviation

@@ -11,13 +11,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.checks import check_search, check_world
+from roadproof.attacks.blackbox import BlackBox
+from roadproof.attacks.checks import check_gradients, check_search, check_world
 from roadproof.attacks.deviation import DeviationMeasure
-from roadproof.attacks.gradopt import Schedule, Search, gradopt
+from roadproof.attacks.gradopt import Search
+from roadproof.attacks.methods import GradOpt, Method
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.result import AttackResult, Candidate, Cost
 from roadproof.controllers import Controller
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
+from roadproof.objectives import Group
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -28,9 +30,8 @@ def attack(
     space: SearchSpace,
     *,
     objective: Objective | None = None,
-    groups: Sequence[Group] = (RIGHT_GROUP, LEFT_GROUP),
-    schedule: Schedule | None = None,
-    restarts: int = 4,
+    method: Method | None = None,
+    groups: Sequence[Group] | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
     random_patterns: int = 0,
@@ -46,11 +47,10 @@ def attack(
         space: the patterns allowed.
         objective: what is made large: `SteeringShift()` by default, as published, or `PathDeviation()`, which drives
             in the recordings and needs their tracks; or one of your own.
-        groups: drives attacked together; the paper's two sides by default, of which the stronger is kept.
-        schedule: `Schedule.in_heats()` by default, for a path deviation `Schedule.closed_loop()`; `Schedule()` is the
-            paper's.
-        restarts: of every group.
-        seed: of the random starts.
+        method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
+        groups: drives attacked together. By default, with gradients, the paper's two sides, of which the stronger is
+            kept; without gradients all drives, to whichever side they give way.
+        seed: of everything random.
         device: where to search.
         random_patterns: random patterns a group that the self-check compares with; 0 for none.
         starts: of an earlier search, to search on from: each for its own group, instead of as many random ones.
@@ -61,15 +61,14 @@ def attack(
         ControllerError: the controller takes other frames, or answers NaN.
         RecordingError: a group names drives that the set lacks.
     """
-    objective = objective or SteeringShift()
-    schedule = schedule or (Schedule.in_heats() if isinstance(objective, SteeringShift) else Schedule.closed_loop())
-    measure = objective.measure(recordings, controller, groups, device=device)
+    objective, method = objective or SteeringShift(), method or GradOpt()
+    groups = groups or method.groups(recordings)
+    measure = method.measure(objective, recordings, controller, groups, device=device)
     start = time.perf_counter()
-    search = gradopt(
+    search = method.search(
         measure,
         space,
-        schedule=schedule,
-        restarts=restarts,
+        objective,
         seed=seed,
         starts=[_points(space, starts, group) for group in groups],
         checkpoint=checkpoint,
@@ -78,6 +77,8 @@ def attack(
     candidates = _candidates(measure, search, space, groups)
     cost = Cost(controller_frames=measure.frames_evaluated, seconds=time.perf_counter() - start)
     checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
+    if not isinstance(method, BlackBox):
+        checks = (check_gradients(measure, space, search), *checks)
     if isinstance(measure, DeviationMeasure):
         checks += check_world(measure, candidates[0].pattern)
     return AttackResult(
@@ -90,12 +91,10 @@ def attack(
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
         candidates=candidates,
         history=search.history.double().numpy(),
-        stopped=search.stopped,
         cost=cost,
         checks=checks,
         space=space,
-        schedule=schedule,
-        restarts=restarts,
+        method=method,
         seed=seed,
     )
 

@@ -1,16 +1,16 @@
-"""Black-box search: patterns chosen by their values alone, however those are had, one whole drive each or composited.
+"""Searches without gradients: patterns chosen by their values alone, one whole drive each, predicted, or composited.
 
-Every method is a function from the trials so far to the next points. It keeps nothing between calls, and what is random
+Every kind is a function from the trials so far to the next points. It keeps nothing between calls, and what is random
 in it comes from the seed and the number of trials; a search that was killed therefore goes on exactly as it would have.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, cast, get_args
+from typing import Any, ClassVar, TypeAlias, Unpack, cast
 
 import torch
 from jaxtyping import Float
@@ -18,16 +18,160 @@ from torch import Tensor
 
 from roadproof.attacks import proposals
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
+from roadproof.attacks.gradopt import Running, Search
+from roadproof.attacks.objective import Measure, Objective
+from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
-from roadproof.search_space import SearchSpace
+from roadproof.objectives import Group, parse_groups
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import Family, SearchSpace
 
-Method = Literal["random", "published-bo", "gp", "tpe", "cma-es"]
-METHODS: tuple[Method, ...] = get_args(Method)
-PUBLISHED_RANDOM = 400
-"""Random points before the published Bayesian optimisation is guided by its model; of 1000 in all."""
+AT_ONCE = 16
+"""Patterns that are valued side by side on recordings."""
 
-Objective: TypeAlias = Callable[[Float[Tensor, "b k n"]], Float[Tensor, " b"]]
+KEPT = 6
+"""Of the patterns tried on recordings, so many stand in the result."""
+
+Value: TypeAlias = Callable[[Float[Tensor, "b k n"]], Float[Tensor, " b"]]
 """Values of points of a search space, to be made large; a batch is what may be measured side by side."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BlackBox:
+    """A search that knows patterns by their values alone; one of its kinds is meant.
+
+    Args:
+        calls: patterns tried.
+
+    Raises:
+        RoadproofError: a number is below 1.
+    """
+
+    word: ClassVar[str]
+    family: ClassVar[Family] = "published"
+    at_once: ClassVar[int] = AT_ONCE
+    calls: int = 1000
+
+    def __post_init__(self) -> None:
+        at_least_one(self, "calls")
+
+    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+        """What names the next points of a space; `given` of the points tried first are another search's."""
+        raise NotImplementedError
+
+    def steps(self, objective: Objective) -> int:
+        """One for each pattern."""
+        del objective
+        return self.calls
+
+    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+        """All drives, to whichever side they give way."""
+        return parse_groups("all", recordings)
+
+    def measure(
+        self,
+        objective: Objective,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        device: torch.device | str,
+    ) -> Measure:
+        """The objective's own."""
+        return objective.measure(recordings, controller, groups, device=device)
+
+    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+        """Try patterns on recorded frames or in the recorded world, some at once; each counts by its best group."""
+        del objective
+        groups = len(measure.groups)
+
+        def value(unit: Float[Tensor, "b k n"]) -> Float[Tensor, " b"]:
+            return measure.values(space, unit.to(measure.device).expand(groups, -1, -1, -1)).amax(0)
+
+        given = running.get("starts", ())
+        trials = blackbox_search(
+            value,
+            space,
+            self,
+            seed=running["seed"],
+            at_once=self.at_once,
+            first=torch.cat(list(given)) if sum(map(len, given)) else None,
+            world=measure.fingerprint(),
+            checkpoint=running.get("checkpoint"),
+            on_step=running.get("on_step", lambda _calls, _best: None),
+        )
+        best = trials.value.topk(min(KEPT, len(trials))).indices
+        unit = trials.unit[best].float().to(measure.device).expand(groups, -1, -1, -1)
+        return Search(unit, measure.values(space, unit), trials.best_so_far.float()[:, None, None])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RandomSearch(BlackBox):
+    """Points drawn as the authors draw the starts of their gradient search."""
+
+    word: ClassVar[str] = "random"
+
+    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+        """Independent draws."""
+        del given
+        return proposals.random(space, seed)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TPE(BlackBox):
+    """Optuna's tree of Parzen estimators."""
+
+    word: ClassVar[str] = "tpe"
+
+    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+        """Points of the unit cube."""
+        del given
+        return proposals.optuna("tpe", space.figures * len(space.names), seed)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GaussianProcess(BlackBox):
+    """Optuna's Gaussian process: Bayesian optimisation of today."""
+
+    word: ClassVar[str] = "gp"
+
+    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+        """Points of the unit cube."""
+        del given
+        return proposals.optuna("gp", space.figures * len(space.names), seed)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CMAES(BlackBox):
+    """Covariance matrix adaptation."""
+
+    word: ClassVar[str] = "cma-es"
+
+    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+        """From the cube's middle, or from the best of the points given."""
+        return proposals.cma_es(space.figures * len(space.names), seed, given)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BayesianOptimisation(BlackBox):
+    """Bayesian optimisation as the paper's baseline had it.
+
+    Args:
+        random_calls: how many of the calls are random, before the model guides.
+    """
+
+    word: ClassVar[str] = "published-bo"
+    family: ClassVar[Family] = "published-bo"
+    at_once: ClassVar[int] = 1
+    random_calls: int = 400
+
+    def __post_init__(self) -> None:
+        at_least_one(self, "calls", "random_calls")
+
+    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+        """Points in natural units, as published."""
+        del given
+        return proposals.published_bo(proposals.natural_ranges(space), self.random_calls, seed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,59 +204,58 @@ class Trials:
 
 
 def blackbox_search(
-    objective: Objective,
+    value: Value,
     space: SearchSpace,
+    method: BlackBox,
     *,
-    method: Method,
-    calls: int,
-    random_calls: int = PUBLISHED_RANDOM,
     seed: int = 0,
     at_once: int = 1,
     first: Float[Tensor, "f k n"] | None = None,
+    world: str = "",
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], object] = lambda _calls, _best: None,
 ) -> Trials:
     """Find the point of a search space with the largest value, without gradients.
 
     Args:
-        objective: gives the values.
+        value: gives the values.
         space: where to look; the authors' Bayesian optimisation had the "published-bo" family.
-        method: "random"; "published-bo", as the authors had it; "gp", "tpe" (Optuna) and "cma-es" (cmaes), of today.
-        calls: how many points are tried.
-        random_calls: "published-bo" only: how many of them are random, before the model guides.
+        method: proposes the points.
         seed: of everything random.
-        at_once: how many points are proposed before their values are asked for, for simulators side by side.
+        at_once: how many points are proposed before their values are asked for.
         first: points to begin with, as those of another search; the method goes on from what they are worth.
-        checkpoint: a file that keeps the trials after every call of the objective; a search that finds its own goes on.
+        world: tells what gives the values from what gives others.
+        checkpoint: a file that keeps the trials after every call for values; a search that finds its own goes on.
         on_step: told how many points have been tried, and the best value.
 
     Raises:
         RoadproofError: an argument makes no sense, or a value is not finite.
     """
-    for name, number in (("calls", calls), ("random_calls", random_calls), ("at_once", at_once)):
-        if number < 1:
-            raise RoadproofError(f"{name} is {number}, expected 1 or more")
-    if method == "published-bo" and at_once > 1:
+    if at_once < 1:
+        raise RoadproofError(f"at_once is {at_once}, expected 1 or more")
+    if at_once > 1 == method.at_once:
         raise RoadproofError(
-            f"at_once is {at_once}, but published-bo proposes one point at a time; run several scenarios side by side"
+            f"at_once is {at_once}, but {method.word} proposes one point at a time; run several scenarios side by side"
         )
     given = None if first is None else cast("list[Any]", first.tolist())
-    propose = _proposer(method, space, random_calls, seed, len(given or ()))
-    identity = repr((space, method, random_calls, seed, at_once, given))
+    propose = method.proposer(space, seed, len(given or ()))
+    # More calls are the same search, gone on with.
+    fields = {name: each for name, each in asdict(method).items() if name != "calls"}
+    identity = repr((space, method.word, fields, seed, at_once, given, world))
     trials = _resumed(checkpoint, space, identity)
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
-    while len(trials) < calls:
-        flat, value = trials.unit.flatten(1).numpy(), trials.value.numpy()
-        wanted = min(at_once, calls - len(trials))
+    while len(trials) < method.calls:
+        flat, known = trials.unit.flatten(1).numpy(), trials.value.numpy()
+        wanted = min(at_once, method.calls - len(trials))
         if first is not None and len(trials) < len(first):
             unit = first[len(trials) : len(trials) + wanted].double()
         else:
-            proposed = propose(flat, value, wanted)
+            proposed = propose(flat, known, wanted)
             unit = torch.as_tensor(proposed).view(-1, space.figures, len(space.names))
-        found = objective(unit.float()).double().cpu()
+        found = value(unit.float()).double().cpu()
         if not bool(found.isfinite().all()):
-            raise RoadproofError(f"the objective is NaN or infinite at call {len(trials) + 1}; check the controller")
+            raise RoadproofError(f"the value is NaN or infinite at call {len(trials) + 1}; check the controller")
         now = torch.full_like(found, before_s + time.perf_counter() - started)
         trials = Trials(
             torch.cat([trials.unit, unit]), torch.cat([trials.value, found]), torch.cat([trials.seconds, now])
@@ -124,22 +267,21 @@ def blackbox_search(
     return trials
 
 
-def _proposer(method: Method, space: SearchSpace, random_calls: int, seed: int, given: int) -> proposals.Propose:
-    dimensions = space.figures * len(space.names)
-    match method:
-        case "random":
-            return proposals.random(space, seed)
-        case "published-bo":
-            return proposals.published_bo(proposals.natural_ranges(space), random_calls, seed)
-        case "gp" | "tpe":
-            return proposals.optuna(method, dimensions, seed)
-        case "cma-es":
-            return proposals.cma_es(dimensions, seed, given)
-
-
 def _resumed(checkpoint: Path | None, space: SearchSpace, identity: str) -> Trials:
     state = load_checkpoint(checkpoint, identity, torch.device("cpu")) if checkpoint else None
     if state is not None:
         return Trials(state["unit"], state["value"], state["seconds"])
     nothing = torch.empty(0, dtype=torch.float64)
     return Trials(nothing.new_empty(0, space.figures, len(space.names)), nothing, nothing)
+
+
+def at_least_one(method: object, *names: str) -> None:
+    """See that fields of a method are whole numbers from 1, or None.
+
+    Raises:
+        RoadproofError: one is not; the message names it.
+    """
+    for name in names:
+        number = getattr(method, name)
+        if number is not None and (isinstance(number, bool) or not isinstance(number, int) or number < 1):
+            raise RoadproofError(f"{name} is {number!r}, expected a whole number from 1")

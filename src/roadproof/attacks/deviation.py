@@ -83,19 +83,13 @@ class DeviationMeasure:
             return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
 
     def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
-        """Metres to each group's side and their gradient at points of a search space.
+        """Metres to each group's side and their gradient at R points a group of a search space.
 
         The gradient of each point is scaled to unit length: closed loops amplify, and how much says nothing about how
         far a step should go.
-
-        Args:
-            space: the patterns.
-            unit: R points a group.
-            coarse: whether the search is still in its first stage; this gradient does not care.
         """
-        del coarse
         values: list[Tensor] = []
         gradients: list[Tensor] = []
         for part in self._parts(unit):

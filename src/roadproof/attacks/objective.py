@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias, get_args, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.deviation import DeviationMeasure
-from roadproof.attacks.published import PublishedSurrogate
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
@@ -24,9 +23,6 @@ from roadproof.objectives import Group
 from roadproof.recorded.world import Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
-
-Gradient = Literal["exact", "published"]
-GRADIENTS: tuple[Gradient, ...] = get_args(Gradient)
 
 Readings: TypeAlias = tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"] | None]
 """Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is: in
@@ -58,7 +54,7 @@ class Measure(Protocol):
         ...
 
     def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
         """Values of R points a group, and the directions in which they rise."""
         ...
@@ -94,13 +90,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SteeringShift:
-    """How far steering moves on recorded frames, open loop, as published; its value is steer units a frame.
-
-    Args:
-        gradient: "exact", or "published": the authors' binary compositing and local linearisation, to compare with.
-    """
-
-    gradient: Gradient = "exact"
+    """How far steering moves on recorded frames, open loop, as published; its value is steer units a frame."""
 
     @property
     def name(self) -> str:
@@ -111,8 +101,7 @@ class SteeringShift:
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
     ) -> Surrogate:
         """The surrogate on the groups' frames."""
-        kind = PublishedSurrogate if self.gradient == "published" else Surrogate
-        return kind(recordings, controller, groups, device=device)
+        return Surrogate(recordings, controller, groups, device=device)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

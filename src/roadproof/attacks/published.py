@@ -1,7 +1,8 @@
-"""The published search: binary compositing and locally linearised gradients, to compare with."""
+"""The published measure: rectangles by masks, gradients by local linearisation, differences summed over frames."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,26 +11,35 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.surrogate import Surrogate
-from roadproof.compositing.published import (
-    RANGES,
-    composite_published,
-    local_gradients,
-    view_canvas_published,
-)
+from roadproof.compositing.published import AntialiasedView, MaskedView, pasted, view_canvas_published
 from roadproof.controllers import Controller
 from roadproof.errors import PatternError
 from roadproof.objectives import Group, divergence
+from roadproof.patterns import visibilities
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
-COARSE_STEP, FINE_STEP = 10.0, 1.0
-"""Grid widths of the local linearisation before and after the first drop of the learning rate, as published."""
+MASKS = ("binary", "antialiased")
 
 
-class PublishedSurrogate(Surrogate):
-    """Divergence as the released code computes it, one restart after another.
+class PublishedMeasure:
+    """The divergence δ as published: a sum over frames, for every group.
 
-    Takes the same arguments as `Surrogate`.
+    Each shape parameter θ lies between neighbours θ⁻ ≤ θ ≤ θ⁺ of a grid; a frame is taken to be linear between its
+    renderings at both, all other parameters as they are.
+
+    Args:
+        recordings: the drives.
+        controller: on `device`.
+        groups: drives attacked together; each has patterns of its own.
+        masks: "binary" as the released code has them, "antialiased" as the paper's text says.
+        device: where frames are composited.
+
+    Raises:
+        ControllerError, RecordingError: as `Surrogate`.
+
+    References:
+        "Computing Adversarial Perturbations" of the paper, eqs. sgrad and cgrad.
     """
 
     def __init__(
@@ -38,67 +48,117 @@ class PublishedSurrogate(Surrogate):
         controller: Controller,
         groups: Sequence[Group],
         *,
+        masks: str = "binary",
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(recordings, controller, groups, device=device)
-        drives = [group.select(recordings) for group in groups]
-        self._published_views = [
+        self._exact = Surrogate(recordings, controller, groups, device=device)
+        self.groups, self.controller = self._exact.groups, controller
+        self.device = self._exact.device
+        self.frames_evaluated = 0
+        self._masks = masks
+        self.grid = 1.0
+        self._views: dict[bool, list[MaskedView]] = {}
+
+    def on_grid(self, grid: float) -> PublishedMeasure:
+        """The same, linearised between values so many px or degrees apart."""
+        other = copy.copy(self)
+        other.grid, other.frames_evaluated = grid, 0
+        return other
+
+    def thinned(self, every: int) -> Surrogate:
+        """The shift on every n-th frame."""
+        return self._exact.thinned(every)
+
+    def open_loop(self) -> Surrogate:
+        """The shift itself, with exact gradients."""
+        return self._exact
+
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """δ at points of the published search space."""
+        with torch.no_grad():
+            rows = [[self._shown(space, group, point)[0] for point in points] for group, points in enumerate(unit)]
+        return torch.stack([torch.stack(row) for row in rows])
+
+    def values_and_gradients(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+        """δ and the paper's approximation of its gradient, one point after another."""
+        values, gradients = unit.new_empty(unit.shape[:2]), torch.empty_like(unit)
+        for group, points in enumerate(unit):
+            for start, point in enumerate(points):
+                values[group, start], gradients[group, start] = self._climbed(space, group, point)
+        return values, gradients
+
+    def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> tuple[Float[Tensor, "g r"], None]:
+        """The mean shift a frame; where the car goes is not known."""
+        lengths = unit.new_tensor([sum(lengths) for lengths in self._exact.lengths])
+        return self.values(space, unit) / lengths[:, None], None
+
+    def fingerprint(self) -> str:
+        """Tells this measure from every other."""
+        return f"published {self._masks} {self._exact.fingerprint()}"
+
+    def _shown(
+        self, space: SearchSpace, group: int, point: Float[Tensor, "k n"]
+    ) -> tuple[Float[Tensor, ""], MaskedView, Tensor, Tensor, Tensor]:
+        """δ of one point, its view, masks and colours, and the pixels that the controller saw."""
+        if not space.family.startswith("published") or space.max_painted_share is not None:
+            raise PatternError("the published search knows the published families alone, without a limit of the area")
+        exact, view = self._exact, self._view(group, coloured=space.colour)
+        pattern = space.pattern(point.detach())
+        masks, colours = view.masks(pattern.boxes), pattern.colours.requires_grad_()
+        pixels = view.pixels(visibilities(masks), colours)
+        frames = pasted(view, pixels).permute(0, 3, 1, 2)
+        self.frames_evaluated += len(frames)
+        shift = exact.steer_of(frames, group) - exact.clean_steer[group]
+        value = divergence(shift, exact.lengths[group], exact.groups[group].direction) * len(shift)
+        return value, view, masks, colours, pixels
+
+    def _climbed(self, space: SearchSpace, group: int, point: Float[Tensor, "k n"]) -> tuple[Tensor, Tensor]:
+        """δ of one point and its gradient."""
+        value, view, masks, colours, pixels = self._shown(space, group, point)
+        on_pixels, on_colours = torch.autograd.grad(value, (pixels, colours))
+        with torch.no_grad():
+            shape = self._linearised(space, point, view, masks, colours, on_pixels)
+        darkest, brightest = space.albedo
+        return value.detach(), torch.cat([shape, on_colours * (brightest - darkest)], -1)[:, : point.shape[1]]
+
+    def _linearised(
+        self, space: SearchSpace, point: Tensor, view: MaskedView, masks: Tensor, colours: Tensor, on_pixels: Tensor
+    ) -> Float[Tensor, "k s"]:
+        """∂δ/∂(shape parameters) of the unit cube: 8 K renderings, in each of which one figure differs."""
+        count = len(space.shape_ranges)
+        spans = point.new_tensor(space.shape_ranges)
+        gradients = point.new_zeros(len(point), count)
+        for k in range(len(point)):
+            natural = point[k, :count] * spans
+            low = ((natural / self.grid).floor().clamp_max((spans / self.grid) - 1) * self.grid).clamp_min(0.0)
+            ends = point.repeat(2 * count, 1, 1)
+            for j in range(count):
+                ends[2 * j, k, j], ends[2 * j + 1, k, j] = low[j] / spans[j], (low[j] + self.grid) / spans[j]
+            moved = masks.repeat(2 * count, 1, 1)
+            moved[:, k] = view.masks(space.pattern(ends).boxes[:, k])
+            told = (view.pixels(visibilities(moved), colours) * on_pixels).sum((1, 2))
+            gradients[k] = (told[1::2] - told[::2]) / self.grid * spans
+        return gradients
+
+    def _view(self, group: int, *, coloured: bool) -> MaskedView:
+        if coloured not in self._views:
+            self._views[coloured] = self._made(coloured=coloured)
+        return self._views[coloured][group]
+
+    def _made(self, *, coloured: bool) -> list[MaskedView]:
+        exact = self._exact
+        if self._masks == "antialiased":
+            return [AntialiasedView(view) for view in exact.views]
+        colour = exact.recordings.colour if coloured else None  # the code draws black without its colour model
+        return [
             view_canvas_published(
                 np.concatenate([drive.frames for drive in members]),
                 np.concatenate([drive.image_from_canvas for drive in members]),
-                recordings.view,
-                recordings.colour,
-                device=device,
+                exact.recordings.view,
+                colour,
+                device=self.device,
             )
-            for members in drives
+            for members in (group.select(exact.recordings) for group in self.groups)
         ]
-
-    def fingerprint(self) -> str:
-        """Another search than the exact one on the same drives."""
-        return f"published {super().fingerprint()}"
-
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """δ per frame at points of the published search space."""
-        with torch.no_grad():
-            rows = [
-                torch.stack([self._value(group, self._frames(space, group, point)) for point in points])
-                for group, points in enumerate(unit)
-            ]
-        return torch.stack(rows)
-
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
-        """δ per frame and the paper's approximation of its gradient."""
-        values = unit.new_empty(unit.shape[:2])
-        gradients = torch.empty_like(unit)
-        for group, points in enumerate(unit):
-            for restart, point in enumerate(points):
-                frames = self._frames(space, group, point).requires_grad_()
-                value = self._value(group, frames)
-                (on_frames,) = torch.autograd.grad(value, frames)
-                values[group, restart] = value.detach()
-                gradients[group, restart] = self._gradient(space, group, point, on_frames, coarse=coarse)
-        return values, gradients
-
-    def _frames(self, space: SearchSpace, group: int, point: Float[Tensor, "k n"]) -> Float[Tensor, "f h w 3"]:
-        if space.family != "published" or not space.colour or space.max_painted_share is not None:
-            raise PatternError(
-                "the published gradient needs coloured rectangles of the published family, no area limit"
-            )
-        return composite_published(space.pattern(point), self._published_views[group])
-
-    def _value(self, group: int, frames: Float[Tensor, "f h w 3"]) -> Float[Tensor, ""]:
-        steer = self._steer(frames.permute(0, 3, 1, 2), self._speed[group], self._command[group])
-        return divergence(steer - self.clean_steer[group], self.lengths[group], self.groups[group].direction)
-
-    def _gradient(
-        self, space: SearchSpace, group: int, point: Tensor, on_frames: Tensor, *, coarse: bool
-    ) -> Float[Tensor, "k n"]:
-        ranges = point.new_tensor(RANGES)
-        step = COARSE_STEP if coarse else FINE_STEP
-        colours = space.pattern(point).colours
-        view = self._published_views[group]
-        shape, colour = local_gradients(point[:, :4] * ranges, colours, view, on_frames, step=step)
-        darkest, brightest = space.albedo
-        return torch.cat([shape * ranges, colour * (brightest - darkest)], -1)

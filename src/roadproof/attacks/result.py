@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.attacks.checks import Check
-from roadproof.attacks.gradopt import Schedule
+from roadproof.attacks.methods import GradOpt, Method, method_of, stored
 from roadproof.errors import RoadproofError
 from roadproof.io.files import read_json, write_atomically
 from roadproof.io.records import record
@@ -19,7 +19,7 @@ from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
 
 FORMAT = "roadproof-attack"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -70,17 +70,17 @@ class AttackResult:
         predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where the
             search did not drive there.
         predicted_range_m: least and most of it over those errors.
-        by_group: the best value of every group, in the objective's unit: steer a frame, or metres.
+        by_group: the best value of every group, in the objective's unit: steer a frame, or metres; the published
+            method's is a sum over frames.
         candidates: every start's best, the strongest first: by the least predicted deviation where there is one. The
             steering shift ranks only coarsely, so that driving over its first few finds a stronger one than the first.
-        history: value at every iteration after the heats, (iterations, groups, restarts).
-        stopped: why the search ended.
+        history: value at every iteration after the first rungs, (iterations, groups, restarts); without gradients the
+            best so far, (calls, 1, 1).
         cost: what it took.
         checks: what the attack found when it distrusted itself.
         space: where it looked.
-        schedule: its steps.
-        restarts: of every group.
-        seed: of the random starts.
+        method: how it searched.
+        seed: of everything random.
     """
 
     pattern: Pattern
@@ -89,12 +89,10 @@ class AttackResult:
     by_group: dict[str, float]
     candidates: tuple[Candidate, ...]
     history: Float[np.ndarray, "i g r"]
-    stopped: str
     cost: Cost
     checks: tuple[Check, ...]
     space: SearchSpace
-    schedule: Schedule
-    restarts: int
+    method: Method
     seed: int
     objective: str = "steering shift"
     predicted_m: float | None = None
@@ -116,6 +114,7 @@ class AttackResult:
                 [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
             ],
             "history": np.round(self.history.astype(float), 6).tolist(),
+            "method": stored(self.method),
         }
         kind = "surrogate and predicted: composited frames, not driving"
         content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, **told}
@@ -143,7 +142,8 @@ class AttackResult:
             pattern=load_pattern(folder / "pattern.json"),
             candidates=tuple(candidates),
             history=history,
-            **{name: getattr(told, name) for name in _Stored.__slots__ if name not in ("candidates", "history")},
+            method=_method(told, path, remedy),
+            **{name: getattr(told, name) for name in _Stored.__slots__ if name not in _MADE},
         )
 
 
@@ -159,20 +159,34 @@ class _Ranked:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Stored:
-    """result.json; results that do not name their objective are older than the word."""
+    """result.json; of version 1 with schedule and restarts instead of a method, and at first without an objective."""
 
     group: str
     surrogate_shift: float
     by_group: dict[str, float]
-    stopped: str
-    restarts: int
     seed: int
     candidates: list[list[Any]]
     history: list[list[list[float]]]
     cost: Cost
     checks: tuple[Check, ...]
     space: SearchSpace
-    schedule: Schedule
+    method: dict[str, Any] = field(default_factory=dict[str, Any])
+    schedule: dict[str, Any] = field(default_factory=dict[str, Any])
+    restarts: int = 0
     objective: str = "steering shift"
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+
+
+_MADE = ("candidates", "history", "method", "schedule", "restarts")
+
+
+def _method(told: _Stored, path: Path, remedy: str) -> Method:
+    given = dict(told.method)
+    try:
+        if not given:
+            halving, iterations = bool(told.schedule.get("heats")), told.schedule.get("iterations")
+            return GradOpt(iterations=iterations, restarts=told.restarts, halving=halving)
+        return method_of(str(given.pop("method", "")), **given)
+    except RoadproofError as error:
+        raise RoadproofError(f"{path} is incomplete or damaged ({error}); {remedy}") from None

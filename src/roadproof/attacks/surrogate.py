@@ -119,16 +119,9 @@ class Surrogate:
             return torch.cat([self.divergences(_patterns(space, part)) for part in self._batches(unit)], 1)
 
     def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"], *, coarse: bool = False
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
-        """δ per frame and its gradient at points of a search space, a bounded number of frames at a time.
-
-        Args:
-            space: the patterns.
-            unit: R points a group.
-            coarse: whether the search is still in its first stage; exact gradients do not care.
-        """
-        del coarse
+        """δ per frame and its gradient at R points a group of a search space, a bounded number of frames at a time."""
         values: list[Tensor] = []
         gradients: list[Tensor] = []
         for part in self._batches(unit):
@@ -161,6 +154,10 @@ class Surrogate:
         if self._kept is None or self._kept[0] != copies:
             self._kept = (copies, Compositor(self.views, copies))
         return self._kept[1]
+
+    def steer_of(self, frames: Float[Tensor, "f 3 h w"], group: int) -> Float[Tensor, " f"]:
+        """The controller's answers to a group's frames, in whatever way they were painted."""
+        return self._steer(frames, self._speed[group], self._command[group])
 
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
         self.frames_evaluated += len(frames)

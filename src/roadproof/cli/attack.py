@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from roadproof.cli.options import ControllerSpec, Device, Figures, choice, number
-from roadproof.errors import RoadproofError
 from roadproof.limits import MANY, MAX_SEED
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult, Schedule, ShownDrive
+    from roadproof.attacks import AttackResult, ShownDrive
     from roadproof.search_space import SearchSpace
 
 
@@ -39,24 +37,40 @@ def attack(
         ),
     ] = None,
     groups: Annotated[
-        str, typer.Option(help="Drives attacked together: clean+right,clean+left, or all.")
-    ] = "clean+right,clean+left",
-    schedule: Annotated[
-        str, typer.Option(help="heats: many starts on few frames, the best go on; published: random starts.")
-    ] = "heats",
-    iterations: Annotated[
-        int | None,
-        number(
-            "Steps of every restart; after heats 100, for a deviation 32; 250 as published.",
-            1,
-            MANY,
+        str | None,
+        typer.Option(
+            help="Drives attacked together: clean+right,clean+left, or all.  [default: by method]",
             show_default=False,
         ),
     ] = None,
-    restarts: Annotated[int, number("Patterns of every group that are searched to the end.", 1, 1000)] = 4,
-    gradient: Annotated[str, typer.Option(help="exact, or published: the authors' way, to compare with.")] = "exact",
-    patience: Annotated[
-        int | None, number("Stop after so many late steps without gain.", 1, MANY, show_default=False)
+    method: Annotated[
+        str,
+        typer.Option(
+            help="gradopt; published, as the paper's authors had it; or without gradients: random, tpe, gp, cma-es, "
+            "published-bo."
+        ),
+    ] = "gradopt",
+    iterations: Annotated[
+        int | None,
+        number("gradopt: last steps.  [default: 100; 32 for a deviation]", 1, MANY, show_default=False),
+    ] = None,
+    restarts: Annotated[
+        int | None,
+        number(
+            "gradopt, published: patterns of every group searched to the end.  [default: 4]",
+            1,
+            1000,
+            show_default=False,
+        ),
+    ] = None,
+    masks: Annotated[
+        str | None,
+        typer.Option(
+            help="published: binary, as the code, or antialiased, as the text.  [default: binary]", show_default=False
+        ),
+    ] = None,
+    calls: Annotated[
+        int | None, number("Without gradients: patterns tried.  [default: 1000]", 1, MANY, show_default=False)
     ] = None,
     random_patterns: Annotated[
         int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
@@ -68,7 +82,7 @@ def attack(
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import GRADIENTS, OBJECTIVES, SteeringShift, show_pattern
+    from roadproof.attacks import OBJECTIVES, method_of, show_pattern
     from roadproof.attacks import attack as run
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
@@ -87,31 +101,26 @@ def attack(
         albedo=albedo,
         max_painted_share=max_painted_share,
     )
+    given = {"iterations": iterations, "restarts": restarts, "masks": masks, "calls": calls}
+    searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
     hold(out)
     drives = load_recordings(recordings)
     pushed = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in drives.recordings}
-    driven_in = gradient == "exact" and drives.is_placed and pushed
-    word = objective or ("deviation" if driven_in else "steering")
-    wanted = OBJECTIVES[choice(word, "objective", tuple(OBJECTIVES))]
-    if gradient != "exact":
-        if word != "steering":
-            raise RoadproofError(f"--gradient {gradient} is of the steering shift; expected --objective steering")
-        wanted = SteeringShift(choice(gradient, "gradient", GRADIENTS))
-    steps = _schedule(choice(schedule, "schedule", ("heats", "published")), word, iterations, patience)
+    driven_in = method != "published" and drives.is_placed and pushed
+    word = choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
-    chosen = parse_groups(groups, drives)
+    chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
     checkpoint = out / "search.safetensors"
-    with progress("Searching", steps.steps) as on_step:
+    with progress("Searching", searched.steps(OBJECTIVES[word])) as on_step:
         result = run(
             drives,
             attacked,
             space,
-            objective=wanted,
+            objective=OBJECTIVES[word],
+            method=searched,
             groups=chosen,
-            schedule=steps,
-            restarts=restarts,
             seed=seed,
             device=device,
             random_patterns=random_patterns,
@@ -124,16 +133,6 @@ def attack(
     _draw(result, shown, out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, space, out)
-
-
-def _schedule(kind: str, objective: str, iterations: int | None, patience: int | None) -> Schedule:
-    from roadproof.attacks import Schedule
-
-    if kind == "heats":
-        make = Schedule.closed_loop if objective == "deviation" else Schedule.in_heats
-    else:
-        make = Schedule.stretched
-    return replace(make() if iterations is None else make(iterations), patience=patience)
 
 
 def _draw(result: AttackResult, shown: tuple[ShownDrive, ...], out: Path) -> None:
@@ -167,7 +166,7 @@ def _summarise(result: AttackResult, space: SearchSpace, out: Path) -> None:
     say(f"Strongest for {result.group}: {shift}")
     say(f"Best {result.objective} of each group: {sides}")
     say(
-        f"{space.figures} figures, {result.restarts} restarts × {len(result.history)} iterations, {result.stopped}; "
+        f"{space.figures} figures, {result.method.word}: {result.history.shape[2]} × {len(result.history)} last steps; "
         f"{result.cost.controller_frames} frames in {result.cost.seconds:.0f} s"
     )
     for check in result.checks:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
+    BudgetName,
     ControllerSpec,
     Device,
     Figures,
@@ -35,15 +36,7 @@ def demo(
     scenario: ScenarioName = "left-03",
     scenarios: ScenarioFile = None,
     controller: ControllerSpec = "pilotnet",
-    budget: Annotated[str, typer.Option(help="quick: minutes; paper: as much as the paper spends.")] = "quick",
-    objective: Annotated[
-        str | None,
-        typer.Option(
-            help="What the search makes large: deviation, driven in the recordings, or steering, as published."
-            "  [default: the budget's]",
-            show_default=False,
-        ),
-    ] = None,
+    budget: BudgetName = "quick",
     rounds: Annotated[int, number("Rounds of searching on along the way that the attacked car took.", 0, 100)] = 0,
     attack_weathers: Annotated[
         str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
@@ -59,12 +52,12 @@ def demo(
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import OBJECTIVES
+    from roadproof.budget import BUDGETS
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.io.files import write_atomically
     from roadproof.io.locks import hold
-    from roadproof.loop import BUDGETS, stress_test
+    from roadproof.loop import stress_test
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -72,8 +65,6 @@ def demo(
     tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
     check_processes(processes, simulator)
     spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
-    if objective is not None:
-        spent = replace(spent, objective=OBJECTIVES[choice(objective, "objective", tuple(OBJECTIVES))])
     spent = replace(spent, rounds=rounds, attack_weathers=weathers_of(attack_weathers, "attack-weathers"))
     space = SearchSpace(figures=figures)
     hold(out)
@@ -104,7 +95,6 @@ def demo(
         "figures": figures,
         "seed": seed,
         "simulator": simulator,
-        **({"objective": objective} if objective else {}),
         **({"scenarios": scenarios} if scenarios else {}),
         "out": out,
     }
@@ -116,8 +106,8 @@ def demo(
 
 def _film(world: Simulator, controller: Controller, result: StressTest, out: Path) -> None:
     """The clean and the painted drive side by side; composited frames beside the rendered ones."""
+    from roadproof.drives import load_drives
     from roadproof.evaluation import compare_with_rendered, rendered_frames
-    from roadproof.evaluation.episodes import load_episodes
     from roadproof.evaluation.result import load_paint
     from roadproof.recordings import load_recordings
     from roadproof.report.film import film_trial
@@ -126,7 +116,7 @@ def _film(world: Simulator, controller: Controller, result: StressTest, out: Pat
     film_trial(world, evaluation, load_paint(place), place)
     recordings = load_recordings(out / "recordings")
     clean = recordings.recordings[0]
-    (driven,) = load_episodes(place, [evaluation.shown().clean])
+    driven = load_drives(out / "record").drives[0].episode
     rendered = rendered_frames(world, evaluation.scenario, driven, result.pattern, clean.frame_number)
     compared = compare_with_rendered(result.pattern, recordings, controller, rendered, drive=clean.name)
     compared.save(place / "fidelity.npz")

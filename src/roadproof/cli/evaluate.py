@@ -45,10 +45,18 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    starts: Annotated[
+        int,
+        number("Drives alone in each weather, each from a start of its own; 0 for one from the scenario's.", 0, 1000),
+    ] = 5,
+    start_range: Annotated[
+        tuple[float, float, float],
+        typer.Option(help="Those starts: at most so many metres aside, radians turned and m/s faster."),
+    ] = (0.3, 0.05, 2.0),
     runs: Annotated[
         int | None,
         number(
-            "Drives with traffic in each weather, besides the one alone; 10 by default, 0 in recordings.",
+            "Drives with traffic in each weather, besides those alone; 10 by default, 0 in recordings.",
             0,
             10_000,
             show_default=False,
@@ -75,7 +83,7 @@ def evaluate(
     from roadproof.cli.progress import progress
     from roadproof.controllers import Controller
     from roadproof.errors import PatternError
-    from roadproof.evaluation import PAPER_WEATHERS, random_patterns
+    from roadproof.evaluation import PAPER_WEATHERS, StartRange, random_patterns
     from roadproof.evaluation import evaluate as run
     from roadproof.io.locks import hold
     from roadproof.patterns import load_pattern, read_paint
@@ -91,6 +99,7 @@ def evaluate(
         _check_recorded(runs, recordings)
         cars = pedestrians = 0
     check_processes(processes, simulator)
+    begun = StartRange(**dict(zip(StartRange.__slots__, start_range, strict=True)))
     figures = load_pattern(pattern) if pattern.suffix == ".json" else None
     paint = read_paint(pattern)
     if figures is None and (random or recordings):
@@ -109,6 +118,8 @@ def evaluate(
                 folder=out,
                 driver_name=controller,
                 weathers=skies,
+                starts=starts,
+                start_range=begun,
                 runs=runs if runs is not None else 10 if inside is None else 0,
                 cars=cars,
                 pedestrians=pedestrians,
@@ -146,9 +157,9 @@ def _compared(
 ) -> Fidelity | None:
     """The surrogate's frames beside the simulator's, where the set was recorded on this clean drive."""
     from roadproof.evaluation import compare_with_rendered, is_drive_of, rendered_frames
-    from roadproof.evaluation.episodes import load_episodes
+    from roadproof.rollout import rollout
 
-    (clean,) = load_episodes(out, [evaluation.shown().clean])
+    clean = rollout(world, who, evaluation.scenario, weather=evaluation.weathers[0])
     drive = next((each for each in recorded.recordings if each.push == "clean"), None)
     if drive is None or not is_drive_of(drive, clean):
         return None
@@ -161,7 +172,7 @@ def _compared(
 def _infractions(row: Row) -> list[str]:
     from roadproof.report.words import mean_in_words
 
-    return [mean_in_words(row.points, 1), mean_in_words(row.clean_points, 1), f"{row.failed:.0%}"]
+    return [mean_in_words(row.points, 1), mean_in_words(row.clean_points, 1)]
 
 
 def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: RecordingSet | None, out: Path) -> None:
@@ -175,8 +186,16 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: Reco
     foreseen = evaluation.predicted
     title = "Predicted: composited into recorded frames, nothing was driven for real" if foreseen else None
     table = Table("pattern", "weather", "with", box=box.SIMPLE, title=title, title_justify="left")
-    driven = ("deviation m", "furthest m", "points", "clean points", "with events")
-    predicted = ("predicted deviation m", "predicted furthest m", "infractions")
+    driven = ("deviation m", "median", "least", "most", "furthest m", "leave lane", "points", "clean points")
+    predicted = (
+        "predicted deviation m",
+        "median",
+        "least",
+        "most",
+        "predicted furthest m",
+        "leave lane",
+        "infractions",
+    )
     for column in ("drives", *(predicted if foreseen else driven)):
         table.add_column(column, justify="right")
     for row in evaluation.rows():
@@ -187,7 +206,9 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: Reco
             traffic,
             str(row.count),
             mean_in_words(row.deviation_m, 2),
+            *(f"{value:.2f}" for value in (row.median_m, row.least_m, row.most_m)),
             mean_in_words(row.lateral_m, 2),
+            f"{row.left_lane:.0%}",
             *([UNKNOWN] if row.failed is None else _infractions(row)),
         )
     console.print(table)

@@ -50,6 +50,13 @@ ControllerSpec: TypeAlias = Annotated[str, typer.Option("--controller", help=f"W
 DriverSpec: TypeAlias = Annotated[
     str, typer.Option("--controller", "--driver", help=f"expert, or a controller: {CONTROLLERS}")
 ]
+BudgetName: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        help="quick: for the path in the recorded world; steering: for the steering shift on recorded frames; "
+        "published: as the paper's authors had it, hours."
+    ),
+]
 ScenarioName: TypeAlias = Annotated[str, typer.Option(help="One of those that `roadproof scenarios` lists.")]
 ScenarioOrRecorded: TypeAlias = Annotated[
     str | None,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import (
+    BudgetName,
     Device,
     DriverSpec,
     ScenarioFile,
@@ -30,13 +31,11 @@ def record(
     scenarios: ScenarioFile = None,
     driver: DriverSpec = "expert",
     weather: WeatherName = "clear-noon",
-    objective: Annotated[
-        str, typer.Option(help="What will be searched in them: steering, or deviation in the recorded world.")
-    ] = "steering",
+    budget: BudgetName = "quick",
     trajectories: Annotated[
         int | None,
         typer.Option(
-            help="T, how many drives: 1, 3, 5 or 7.  [default: a clean one and a pair for each size]",
+            help="T, how many drives: 1, 3, 5 or 7.  [default: the budget's]",
             show_default=False,
         ),
     ] = None,
@@ -46,8 +45,7 @@ def record(
     deviation_m: Annotated[
         list[float] | None,
         typer.Option(
-            help="How far drives are pushed aside; several are taken in turn, and for a deviation the last weaves.  "
-            "[default: 1.5; 1.5 and 0.5 for a deviation]",
+            help="How far drives are pushed aside; several are taken in turn.  [default: the budget's]",
             show_default=False,
         ),
     ] = None,
@@ -58,7 +56,7 @@ def record(
     horizon_m: Annotated[float, number("Keep frames from so far before the canvas.", 1.0, 1000.0)] = 25.0,
     frames: Annotated[
         int | None,
-        number("Keep at most so many a drive.  [default: 24; 40 for a deviation]", 1, 10_000, show_default=False),
+        number("Keep at most so many a drive.  [default: the budget's]", 1, 10_000, show_default=False),
     ] = None,
     seed: Annotated[int, number("Of the perturbations.", 0, MAX_SEED)] = 0,
     simulator: SimulatorSpec = "town",
@@ -69,15 +67,14 @@ def record(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from dataclasses import replace
 
-    from roadproof.attacks import OBJECTIVES
+    from roadproof.budget import BUDGETS
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Weather
-    from roadproof.drives import Scheme, Trajectories
+    from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError, ScenarioError
     from roadproof.io.files import inside
     from roadproof.io.locks import hold
-    from roadproof.loop import PAPER, QUICK
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator
 
@@ -86,19 +83,19 @@ def record(
     sky = Weather(choice(weather, "weather", tuple(Weather)))
     if noise_deg is not None and deviation_m:
         raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to push drives aside")
-    usual = QUICK if choice(objective, "objective", tuple(OBJECTIVES)) == "deviation" else PAPER
-    budget = replace(
-        usual,
-        deviations_m=tuple(deviation_m or usual.deviations_m),
-        frames=usual.frames if frames is None else frames,
-        noise_deg=noise_deg,
-    )
+    usual = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
+    perturbation = usual.trajectories.perturbation
+    if deviation_m:
+        perturbation = Swerve(tuple(deviation_m))
+    if noise_deg is not None:
+        perturbation = SteeringNoise(*noise_deg)
     wanted = Trajectories(
-        count=budget.trajectories if trajectories is None else trajectories,
+        count=usual.trajectories.count if trajectories is None else trajectories,
         scheme=Scheme(choice(scheme, "scheme", tuple(Scheme))),
-        perturbation=budget.perturbation,
+        perturbation=perturbation,
     )
-    window = replace(budget.window, horizon_m=horizon_m)
+    kept = usual.window.frames if frames is None else frames
+    window = replace(usual.window, horizon_m=horizon_m, frames=kept)
     places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
     for place in places.values():
         hold(place)

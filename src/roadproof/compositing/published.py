@@ -1,8 +1,9 @@
-"""Compositing as the paper's authors released it, to compare with: binary masks, nearest canvas pixel, whole frames.
+"""Compositing as published, to compare with: as the authors' code has it, or as the paper's text says.
 
-Kept to their conventions on purpose: picture coordinates without the half-pixel shift, corners cut to integers, no
-antialiasing, colours cut to 8 bits, figures blended one after another over every frame. Its shape gradients come from
-`local_gradients`: pairs of whole renderings with one parameter rounded down and up.
+`BinaryView` keeps to the code on purpose: picture coordinates without the half-pixel shift, nearest canvas pixel,
+corners cut to integers, no antialiasing, colours cut to 8 bits, black figures drawn as they are. `AntialiasedView` has
+the fractional masks of the text. Both give the colours of the canvas' pixels for any visibility of the figures, which
+is what a local linearisation needs (`attacks.published`).
 
 References:
     "Computing Adversarial Perturbations" of the paper; shape_fly_simulator.py and main.py of the released code.
@@ -11,49 +12,117 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.coverage import Shape, polygon_vertices
+from roadproof.compositing.composite import blend
+from roadproof.compositing.view import CanvasView
+from roadproof.coverage import Shape, coverage, polygon_vertices
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
-from roadproof.patterns import Pattern, boxes_from_published
+from roadproof.patterns import Pattern, visibilities
 from roadproof.photometry import ColourTransform
-
-RANGES = (180.0, 380.0, 100.0, 70.0)
-"""Ranges of the four published shape parameters: rotation, position, width, length."""
 
 _OFF_CANVAS = CANVAS_SIZE_PX**2
 
 
+@runtime_checkable
+class MaskedView(Protocol):
+    """Frames and the P pixels of theirs through which the canvas shows, painted by masks."""
+
+    @property
+    def frames(self) -> Float[Tensor, "f h w 3"]:
+        """Clean frames, in [0, 1]."""
+        ...
+
+    @property
+    def index(self) -> Int[Tensor, " p"]:
+        """Where in the flattened frames the canvas' pixels are."""
+        ...
+
+    def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
+        """How much of each pixel a rectangle covers."""
+        ...
+
+    def pixels(self, visibility: Float[Tensor, "*b k p"], colours: Float[Tensor, "k 3"]) -> Float[Tensor, "*b p 3"]:
+        """Colours of the canvas' pixels, differentiable in the paint's colours."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class PublishedView:
-    """Frames, and for every pixel of them the canvas pixel it is painted with.
+class BinaryView:
+    """Frames as the released code paints them.
 
     Args:
         frames: clean frames, (F, H, W, 3), in [0, 1].
-        lookup: index into the flattened canvas for every pixel of every frame, the canvas' size where there is none.
-        colour: painted → seen; its flat response alone is used.
+        index: where in the flattened frames the canvas' pixels are, (P,).
+        lookup: the canvas pixel that each of them is painted with, row-major, (P,).
+        colour: painted to seen; its flat response alone is used. None draws paint in its own colour.
     """
 
     frames: Float[Tensor, "f h w 3"]
-    lookup: Int[Tensor, "f h w"]
-    colour: ColourTransform
+    index: Int[Tensor, " p"]
+    lookup: Int[Tensor, " p"]
+    colour: ColourTransform | None
+
+    def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
+        """0 or 1 for each pixel."""
+        return canvas_mask(boxes).to(self.frames.dtype).flatten(-2)[..., self.lookup]
+
+    def pixels(self, visibility: Float[Tensor, "*b k p"], colours: Float[Tensor, "k 3"]) -> Float[Tensor, "*b p 3"]:
+        """Colours of the canvas' pixels; gradients ignore clipping and rounding, as the released code does."""
+        seen = colours if self.colour is None else self.colour.response(colours)
+        cut = seen.detach().clamp(0, 1).mul(255).floor() / 255
+        seen = seen + (cut - seen).detach()
+        clean = self.frames.reshape(-1, 3)[self.index]
+        return visibility.mT @ seen + (1 - visibility.sum(-2))[..., None] * clean
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AntialiasedView:
+    """Frames painted with the fractional masks of the paper's text.
+
+    Args:
+        view: frames and their view of the canvas.
+    """
+
+    view: CanvasView
+
+    @property
+    def frames(self) -> Float[Tensor, "f h w 3"]:
+        """Clean frames, in [0, 1]."""
+        return self.view.frames
+
+    @property
+    def index(self) -> Int[Tensor, " p"]:
+        """Where in the flattened frames the canvas' pixels are."""
+        return self.view.index
+
+    def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
+        """The share of each pixel."""
+        return coverage(Shape.RECTANGLE, boxes[..., None, :], self.view.footprints)[..., 0, :]
+
+    def pixels(self, visibility: Float[Tensor, "*b k p"], colours: Float[Tensor, "k 3"]) -> Float[Tensor, "*b p 3"]:
+        """Colours of the canvas' pixels (eq. composite)."""
+        seen = self.view.response(colours).expand(*visibility.shape[:-1], -1)
+        return blend(visibility, seen, self.view)
 
 
 def view_canvas_published(
     frames: UInt8[np.ndarray, "f h w 3"],
     image_from_canvas: Float[np.ndarray, "f 3 3"],
     view: CropResize,
-    colour: ColourTransform,
+    colour: ColourTransform | None,
     *,
     device: torch.device | str = "cpu",
-) -> PublishedView:
-    """Prepare frames for compositing as published."""
-    lookup = torch.as_tensor(nearest_canvas_pixels(image_from_canvas, view), device=device)
-    return PublishedView(torch.tensor(frames, device=device).float() / 255, lookup, colour)
+) -> BinaryView:
+    """Prepare frames for compositing as the released code does."""
+    lookup = torch.as_tensor(nearest_canvas_pixels(image_from_canvas, view), device=device).flatten()
+    index = (lookup < _OFF_CANVAS).nonzero()[:, 0]
+    return BinaryView(torch.tensor(frames, device=device).float() / 255, index, lookup[index], colour)
 
 
 def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize) -> Int[np.ndarray, "f h w"]:
@@ -76,75 +145,21 @@ def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: C
     return index.reshape(len(image_from_canvas), view.height_px, view.width_px)
 
 
-def composite_published(pattern: Pattern, view: PublishedView) -> Float[Tensor, "f h w 3"]:
-    """Whole frames with one pattern of rectangles, the figures blended one after another."""
-    seen = view.colour.response(pattern.colours).clamp(0, 1)
-    frames = view.frames
-    for box, colour in zip(pattern.boxes, seen.mul(255).floor() / 255, strict=True):
-        mask = canvas_mask(box).to(frames.dtype).flatten()
-        alpha = torch.cat([mask, mask.new_zeros(1)])[view.lookup][..., None]
-        frames = alpha * colour + (1 - alpha) * frames
-    return frames
+def composite_published(pattern: Pattern, view: MaskedView) -> Float[Tensor, "f h w 3"]:
+    """Whole frames with one pattern of rectangles."""
+    pixels = view.pixels(visibilities(view.masks(pattern.boxes)), pattern.colours)
+    return pasted(view, pixels)
 
 
-def canvas_mask(box: Float[Tensor, "5"]) -> Tensor:
-    """Which canvas pixels a rectangle paints: corners cut to integers, edges included, (400, 400) of bool."""
-    corners = polygon_vertices(Shape.RECTANGLE, box).trunc()
-    line = torch.arange(CANVAS_SIZE_PX, device=box.device, dtype=box.dtype)
-    points = torch.stack([line.expand(CANVAS_SIZE_PX, -1), line[:, None].expand(-1, CANVAS_SIZE_PX)], -1)
-    edges = corners.roll(-1, 0) - corners
-    offsets = points[..., None, :] - corners
-    return (edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= 0).all(-1)
+def pasted(view: MaskedView, pixels: Float[Tensor, "p 3"]) -> Float[Tensor, "f h w 3"]:
+    """Whole frames with other colours of the canvas' pixels."""
+    return view.frames.reshape(-1, 3).index_copy(0, view.index, pixels).view_as(view.frames)
 
 
-def local_gradients(
-    values: Float[Tensor, "k 4"],
-    colours: Float[Tensor, "k 3"],
-    view: PublishedView,
-    frame_gradients: Float[Tensor, "f h w 3"],
-    *,
-    step: float,
-) -> tuple[Float[Tensor, "k 4"], Float[Tensor, "k 3"]]:
-    """The paper's gradients: shapes by local linearisation, colours through the visible masks.
-
-    Each shape parameter θ lies between neighbours θ⁻ ≤ θ ≤ θ⁺ of a grid of width `step`; the frame is taken to be
-    linear between its renderings at both, all other parameters as they are: 8 K renderings of all frames.
-
-    Args:
-        values: published shape parameters (see `patterns.boxes_from_published`).
-        colours: paint, RGB in [0, 1].
-        view: the frames.
-        frame_gradients: ∂L/∂I at the actual frames.
-        step: grid width in px and degrees; 10, then 1, as published.
-
-    Returns:
-        ∂L/∂values and ∂L/∂colours.
-    """
-    shapes = (Shape.RECTANGLE,) * len(values)
-    grads = torch.zeros_like(values)
-    for k in range(len(values)):
-        for j, span in enumerate(RANGES):
-            low = (values[k, j] / step).floor().clamp_max((span / step) - 1) * step
-            ends: list[Tensor] = []
-            for end in (low, low + step):
-                moved = values.clone()
-                moved[k, j] = end
-                ends.append(composite_published(Pattern(shapes, boxes_from_published(moved), colours), view))
-            grads[k, j] = ((ends[1] - ends[0]) * frame_gradients).sum() / step
-    return grads, _colour_gradients(values, colours, view, frame_gradients)
-
-
-def _colour_gradients(values: Tensor, colours: Tensor, view: PublishedView, frame_gradients: Tensor) -> Tensor:
-    """Eq. cgrad: ∂L/∂x_k = ∑ Cᵀ ∑ V_k ∂L/∂I."""
-    leaf = colours.detach().requires_grad_()
-    with torch.enable_grad():
-        seen = view.colour.response(leaf)
-    on_seen = torch.zeros_like(colours)
-    bare = torch.ones_like(view.frames[..., 0])
-    for k, box in reversed(list(enumerate(boxes_from_published(values)))):
-        mask = canvas_mask(box).to(bare.dtype).flatten()
-        visible = torch.cat([mask, mask.new_zeros(1)])[view.lookup] * bare
-        bare = bare - visible
-        on_seen[k] = (visible[..., None] * frame_gradients).sum((0, 1, 2))
-    (gradient,) = torch.autograd.grad(seen, leaf, on_seen)
-    return gradient
+def canvas_mask(boxes: Float[Tensor, "*b 5"]) -> Tensor:
+    """Which canvas pixels a rectangle paints: corners cut to integers, edges included, (*b, 400, 400) of bool."""
+    corners = polygon_vertices(Shape.RECTANGLE, boxes).trunc()[..., None, None, :, :]
+    line = torch.arange(CANVAS_SIZE_PX, device=boxes.device, dtype=boxes.dtype)
+    x, y = line[:, None], line[:, None, None]
+    edges = corners.roll(-1, -2) - corners
+    return (edges[..., 0] * (y - corners[..., 1]) - edges[..., 1] * (x - corners[..., 0]) >= 0).all(-1)

@@ -17,3 +17,5 @@ from roadproof.evaluation.result import Row as Row
 from roadproof.evaluation.result import Trial as Trial
 from roadproof.evaluation.selection import Selection as Selection
 from roadproof.evaluation.selection import select_by_driving as select_by_driving
+from roadproof.evaluation.starts import StartOffset as StartOffset
+from roadproof.evaluation.starts import StartRange as StartRange

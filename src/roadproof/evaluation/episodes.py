@@ -22,6 +22,7 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError
 from roadproof.evaluation.result import Trial, judge
+from roadproof.evaluation.starts import NOMINAL, StartOffset
 from roadproof.io.files import inside
 from roadproof.rollout import Driver, Episode, rollout
 from roadproof.scenarios import Scenario, identity
@@ -42,6 +43,7 @@ class Conditions:
         cars: others on the road.
         pedestrians: people about.
         seed: of both.
+        start: how it begins.
     """
 
     paint: str
@@ -49,6 +51,7 @@ class Conditions:
     cars: int = 0
     pedestrians: int = 0
     seed: int = 0
+    start: StartOffset = NOMINAL
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -94,6 +97,7 @@ class Episodes:
         """What it is called."""
         told = [self.common, self.digests[drive.paint]]
         told += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
+        told += [] if drive.start == NOMINAL else [repr(drive.start)]
         among = f"traffic-{drive.seed}" if drive.cars + drive.pedestrians else "alone"
         ending = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:12]
         return f"{drive.weather}-{among}-{drive.paint}-{ending}.npz"
@@ -114,7 +118,7 @@ class Episodes:
         episode = rollout(
             simulator,
             self.driver,
-            self.scenario,
+            drive.start.of(self.scenario),
             weather=drive.weather,
             pattern=self.paints.get(drive.paint),
             cars=drive.cars,
@@ -140,6 +144,7 @@ class Episodes:
             pattern=painted.paint,
             clean_file=self.file(clean),
             painted_file=self.file(painted),
+            start=painted.start,
         )
 
     def _path(self, drive: Conditions) -> Path:

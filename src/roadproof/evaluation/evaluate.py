@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import wait
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import TypeAlias
 
@@ -19,6 +20,7 @@ from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.evaluation.episodes import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
 from roadproof.evaluation.result import ATTACK, Evaluation
+from roadproof.evaluation.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.patterns import Pattern, raster
 from roadproof.processes import processes_beside
 from roadproof.scenarios import Scenario
@@ -41,6 +43,8 @@ def evaluate(
     folder: Path,
     driver_name: str = "",
     weathers: Sequence[Weather] = PAPER_WEATHERS,
+    starts: int = 5,
+    start_range: StartRange = USUAL_STARTS,
     runs: int = 10,
     cars: int = 20,
     pedestrians: int = 20,
@@ -49,7 +53,9 @@ def evaluate(
     processes: int = 1,
     on_drive: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Evaluation:
-    """Drive a scenario with and without a pattern: once a weather alone, then `runs` times with cars and people.
+    """Drive a scenario with and without a pattern, from several starts alone, and with cars and people.
+
+    A pattern is chosen from the scenario's own start; it is judged from others, so that what chose it never reports it.
 
     Args:
         simulator: an open one, or a function that makes one, such as `TownSimulator`; needed for several processes.
@@ -60,11 +66,14 @@ def evaluate(
         folder: keeps every drive; an interrupted evaluation goes on from it.
         driver_name: what reports call the driver; by default its type or name.
         weathers: in which; the paper's four by default.
-        runs: drives with traffic a weather, each with a seed of its own.
+        starts: drives alone a weather, each from a start drawn from `start_range`; 0 drives once from the scenario's.
+        start_range: by default 0.3 m and 0.05 rad to either side and up to 2 m/s faster.
+        runs: drives with traffic a weather, each with a seed and a start of its own.
         cars: others on the road in those.
         pedestrians: people about in those.
-        seed: of the first run.
-        baseline: other patterns to compare with: all of them driven alone, and in turn with traffic.
+        seed: of the first run, and of the starts.
+        baseline: other patterns to compare with: each driven alone from one of the starts in turn, and in turn with
+            traffic.
         processes: drives made at once, each in a process with a simulator of its own.
         on_drive: told after each drive how many are done, and of how many.
 
@@ -74,11 +83,12 @@ def evaluate(
         SimulatorError: the simulator refuses the conditions.
         OutputError: the folder cannot be written.
     """
-    if not weathers or min(runs, cars, pedestrians) < 0 or processes < 1:
+    if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
         raise EpisodeError(
-            f"{len(weathers)} weathers, {runs} runs, {cars} cars, {pedestrians} pedestrians, {processes} processes; "
-            "expected at least one weather and process, and nothing below 0"
+            f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "
+            f"{processes} processes; expected at least one weather and process, and nothing below 0"
         )
+    begins = start_range.draw(starts, seed) if starts else (NOMINAL,)
     if runs and not cars + pedestrians:
         raise EpisodeError(f"{runs} runs with traffic but no cars and no pedestrians; ask for some, or for 0 runs")
     if processes > 1 and not callable(simulator):
@@ -88,7 +98,7 @@ def evaluate(
     with ExitStack() as stack:
         world = stack.enter_context(simulator()) if callable(simulator) else simulator
         episodes = Episodes.of(world, driver, scenario, paints, folder)
-        planned = _planned(list(paints), weathers, runs, cars, pedestrians, seed)
+        planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
         drives = list(dict.fromkeys(drive for pair in planned for drive in pair))
         missing = [drive for drive in drives if not episodes.has(drive)]
         made = len(drives) - len(missing)
@@ -112,6 +122,8 @@ def evaluate(
         simulator_calls=0 if world.paint.predicted else len(drives),
         seconds=time.perf_counter() - started,
         paint=world.paint,
+        starts=starts,
+        start_range=start_range,
     )
     evaluation.save(folder, paints[ATTACK])
     return evaluation
@@ -132,17 +144,24 @@ def _raster(pattern: Pattern | PatternImage) -> PatternImage:
 
 
 def _planned(
-    paints: Iterable[str], weathers: Sequence[Weather], runs: int, cars: int, pedestrians: int, seed: int
+    paints: Iterable[str],
+    weathers: Sequence[Weather],
+    starts: Sequence[StartOffset],
+    runs: int,
+    cars: int,
+    pedestrians: int,
+    seed: int,
 ) -> list[tuple[Conditions, Conditions]]:
     """Every clean drive with each painted one that is compared with it."""
     random = [name for name in paints if name != ATTACK]
     pairs: list[tuple[Conditions, Conditions]] = []
     for weather in weathers:
-        clean = Conditions(paint=CLEAN, weather=weather, seed=seed)
-        pairs += [(clean, replace(clean, paint=paint)) for paint in paints]
+        alone = [Conditions(paint=CLEAN, weather=weather, seed=seed, start=start) for start in starts]
+        pairs += [(clean, replace(clean, paint=ATTACK)) for clean in alone]
+        pairs += [(clean, replace(clean, paint=paint)) for clean, paint in zip(cycle(alone), random, strict=False)]
         for run in range(runs):
             painted = [ATTACK, *random[run % len(random) : run % len(random) + 1]] if random else [ATTACK]
-            clean = replace(clean, cars=cars, pedestrians=pedestrians, seed=seed + run)
+            clean = replace(alone[run % len(alone)], cars=cars, pedestrians=pedestrians, seed=seed + run)
             pairs += [(clean, replace(clean, paint=paint)) for paint in painted]
     return pairs
 

@@ -26,11 +26,13 @@ from PIL import Image
 
 from roadproof.datatypes import Ending, Event, Weather
 from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.evaluation.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import check_name, read_json, write_atomically
 from roadproof.io.records import record
 from roadproof.metrics import (
     HORIZON_M,
+    LEAVES_LANE_M,
     Mean,
     Path2D,
     counted,
@@ -81,6 +83,7 @@ class Trial:
         ending: why the painted drive ended.
         events: of the painted drive, those that count (`metrics.counted`), so that anyone can count again.
         clean_events: of the clean one.
+        start: how both drives begin.
 
     Raises:
         EpisodeError: the name of an episode's file is not a plain one.
@@ -103,6 +106,12 @@ class Trial:
     ending: str
     events: tuple[Event, ...] = ()
     clean_events: tuple[Event, ...] = ()
+    start: StartOffset = NOMINAL
+
+    @property
+    def leaves_lane(self) -> bool:
+        """Whether part of the car gets over its lane's edge, or it commits more infractions than without paint."""
+        return abs(self.lateral_m) >= LEAVES_LANE_M or (self.points or 0.0) > (self.clean_points or 0.0)
 
     def __post_init__(self) -> None:
         for name in filter(None, (self.clean, self.painted)):  # drives that were not kept have none
@@ -121,6 +130,9 @@ class Row:
         deviation_m: the paper's deviation.
         lateral_m: largest offset from the clean path, to whichever side.
         count: how many trials.
+        median_m: of the deviation.
+        least_m: of it, as most_m.
+        left_lane: share of the drives that leave their lane (`Trial.leaves_lane`): the success rate.
         points: infraction points with paint; None where nothing is known of them, as for the next three.
         clean_points: without.
         leaderboard: the Leaderboard's factor with paint.
@@ -134,6 +146,10 @@ class Row:
     deviation_m: Mean
     lateral_m: Mean
     count: int
+    median_m: float
+    least_m: float
+    most_m: float
+    left_lane: float
     points: Mean | None
     clean_points: Mean | None
     leaderboard: Mean | None
@@ -153,6 +169,8 @@ class Evaluation:
         cars: on the road in those.
         pedestrians: about in those.
         seed: of the first run; the others count on from it.
+        starts: drives alone in each weather, each from a start of its own; 0 where there was one from the scenario's.
+        start_range: what those are drawn from.
         trials: every drive over paint.
         simulator_calls: drives that all this takes, clean ones included; 0 where they are predicted.
         seconds: wall time of the drives made now; those found in the folder cost nothing.
@@ -171,6 +189,8 @@ class Evaluation:
     simulator_calls: int
     seconds: float
     paint: PaintKind = PaintKind.RENDERED
+    starts: int = 0
+    start_range: StartRange = USUAL_STARTS
 
     @property
     def predicted(self) -> bool:
@@ -225,6 +245,7 @@ class Evaluation:
         }
         content |= {"scenario": self.scenario.name}
         content |= {name: getattr(self, name) for name in self.__slots__ if name not in ("scenario", "trials")}
+        content["start_range"] = asdict(self.start_range)
         content |= {"trials": [asdict(trial) for trial in self.trials], "rows": [asdict(row) for row in self.rows()]}
         write_atomically(
             folder / "evaluation.json",
@@ -284,7 +305,14 @@ def _approach(episode: Episode, length_m: float) -> Path2D:
 
 
 def judge(
-    clean: Episode, painted: Episode, canvas: CanvasPlacement, *, pattern: str, clean_file: str, painted_file: str
+    clean: Episode,
+    painted: Episode,
+    canvas: CanvasPlacement,
+    *,
+    pattern: str,
+    clean_file: str,
+    painted_file: str,
+    start: StartOffset = NOMINAL,
 ) -> Trial:
     """The trial of two drives that differ in the paint alone.
 
@@ -311,12 +339,14 @@ def judge(
         ending=str(painted.ending),
         events=counted(painted.events),
         clean_events=counted(clean.events),
+        start=start,
     )
 
 
 def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:
-    # Alone, one pattern has one drive a weather, and the weathers asked for are no sample of all there are.
-    drawn = traffic or pattern != ATTACK
+    # From one start alone, one pattern has one drive a weather, and the weathers are no sample of all there are.
+    drawn = traffic or pattern != ATTACK or any(trial.start != NOMINAL for trial in trials)
+    deviations = [trial.deviation_m for trial in trials]
 
     def mean(values: Sequence[float]) -> Mean:
         found = mean_95(values)
@@ -334,7 +364,11 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
         weather=weather,
         traffic=traffic,
         count=len(trials),
-        deviation_m=mean([trial.deviation_m for trial in trials]),
+        deviation_m=mean(deviations),
+        median_m=float(np.median(deviations)),
+        least_m=min(deviations),
+        most_m=max(deviations),
+        left_lane=sum(trial.leaves_lane for trial in trials) / len(trials),
         lateral_m=mean([abs(trial.lateral_m) for trial in trials]),
         points=points,
         clean_points=known(lambda trial: trial.clean_points),

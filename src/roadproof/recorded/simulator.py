@@ -28,7 +28,7 @@ from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, Homogra
 from roadproof.io.files import is_plain_name
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.recorded.world import RecordedWorld
+from roadproof.recorded.world import RecordedWorld, Start
 from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Kind, Scenario
 from roadproof.simulators.arguments import check_pattern
@@ -84,9 +84,9 @@ class _Drive:
 class RecordedSimulator:
     """Drives in calibrated recordings, as a `Simulator`.
 
-    Every drive begins where the recorded stretch of the clean drive begins, at its speed there, wherever a scenario
-    says that it starts; it ends at the canvas' end. Where the car leaves the band in which pictures can be trusted, it
-    ends as well, and the ending says so.
+    A drive begins where the recorded stretch of the clean drive begins, at its speed there; a scenario that starts near
+    that place, as `scenario` with another start, begins where it says. It ends at the canvas' end. Where the car leaves
+    the band in which pictures can be trusted, it ends as well, and the ending says so.
 
     There are no full pictures. Where they are asked for, the frame is enlarged to the place that it has in the camera
     picture; around it, where nothing was recorded, the picture is black.
@@ -222,8 +222,8 @@ class RecordedSimulator:
         """Begin a drive at the beginning of the recorded stretch.
 
         Args:
-            scenario: its canvas must be the recordings'; its time limit counts from the beginning of the stretch, and
-                its start, goal and map are not looked at.
+            scenario: its canvas must be the recordings'; its time limit counts from the beginning of the stretch. Its
+                start counts where it is near that beginning; goal and map are not looked at.
             weather: that of the recordings.
             pattern: painted on the canvas; None leaves the road bare.
             cars: 0, since the recordings have none.
@@ -247,7 +247,8 @@ class RecordedSimulator:
             )
         _check_canvas(scenario.canvas, self._world.bank.canvas)
         check_pattern(pattern)
-        self._drive = _Drive(scenario=scenario, pattern=pattern, full_pictures=full_pictures, car=self._world.begin())
+        car = self._world.begin((self._start(scenario.start),))
+        self._drive = _Drive(scenario=scenario, pattern=pattern, full_pictures=full_pictures, car=car)
         return self._observe(self._drive)
 
     def step(self, control: Control) -> Observation:
@@ -270,6 +271,17 @@ class RecordedSimulator:
             SimulatorError: there was no reset.
         """
         return homography_from_pose(self.camera, self.state, self._world.bank.canvas)
+
+    def _start(self, asked: VehicleState) -> Start:
+        """How an asked start differs from the recorded one; not at all where it is another place."""
+        here = self.scenario.start
+        dx, dy = asked.x_m - here.x_m, asked.y_m - here.y_m
+        c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
+        turned = math.remainder(asked.yaw_rad - here.yaw_rad, 2 * math.pi)
+        right_m = s * dx - c * dy
+        if abs(c * dx + s * dy) > SAME_PLACE_M or not _told_of(right_m, turned).inside:
+            return Start()
+        return Start(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
 
     def _running(self) -> _Drive:
         if self._drive is None:
@@ -325,6 +337,10 @@ def _poses(car: Motion) -> Poses:
 
 def _told(gap: Gap) -> RecordedGap:
     return RecordedGap(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
+
+
+def _told_of(right_m: float, turned_rad: float) -> RecordedGap:
+    return RecordedGap(0.0, -right_m, turned_rad)
 
 
 def _check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:

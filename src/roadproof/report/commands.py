@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import astuple
 
 from roadproof.attacks import AttackResult
 from roadproof.evaluation import Evaluation
@@ -32,14 +33,16 @@ def commands_of(run: Run) -> tuple[str, ...]:
 
 def _attack(attack: AttackResult) -> list[str]:
     options = ["--figures", str(attack.space.figures), "--family", attack.space.family]
-    options += ["--groups", ",".join(attack.by_group), "--schedule", "heats" if attack.schedule.heats else "published"]
-    options += ["--iterations", str(attack.schedule.iterations)]
-    return [*options, "--restarts", str(attack.restarts), "--seed", str(attack.seed)]
+    options += ["--groups", ",".join(attack.by_group), "--method", attack.method.word]
+    for name in ("iterations", "restarts", "masks", "calls"):
+        value = getattr(attack.method, name, None)
+        options += [f"--{name}", str(value)] if value is not None else []
+    return [*options, "--seed", str(attack.seed)]
 
 
 def _evaluate(evaluation: Evaluation) -> list[str]:
     options = ["--scenario", evaluation.scenario.name, "--controller", evaluation.controller]
-    options += ["--weathers", ",".join(evaluation.weathers), "--runs", str(evaluation.runs)]
+    options += ["--weathers", ",".join(evaluation.weathers), *_starts(evaluation), "--runs", str(evaluation.runs)]
     options += ["--cars", str(evaluation.cars), "--pedestrians", str(evaluation.pedestrians)]
     # Where a server stood is nobody's to keep; that it was one is.
     where = (
@@ -53,7 +56,15 @@ def _evaluate(evaluation: Evaluation) -> list[str]:
 def _foresee(run: Run, evaluation: Evaluation) -> list[str]:
     """Scenario and weather are those of the recordings; where these lay is not kept, if not in the run."""
     recordings = str(run.folder) if run.recordings is not None else "RECORDINGS"
-    return ["--controller", evaluation.controller, *_random(evaluation), "--simulator", f"recorded:{recordings}"]
+    options = [*_starts(evaluation), *_random(evaluation)]
+    return ["--controller", evaluation.controller, *options, "--simulator", f"recorded:{recordings}"]
+
+
+def _starts(evaluation: Evaluation) -> list[str]:
+    if not evaluation.starts:
+        return ["--starts", "0"]
+    among = map(str, astuple(evaluation.start_range))
+    return ["--starts", str(evaluation.starts), "--start-range", *among]
 
 
 def _random(evaluation: Evaluation) -> list[str]:

@@ -83,8 +83,9 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     """
     trial = evaluation.shown()
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
-    bare = _pictures(simulator, evaluation.scenario, clean, None)
-    driven = _pictures(simulator, evaluation.scenario, painted, paint)
+    begun = evaluation.shown().start.of(evaluation.scenario)
+    bare = _pictures(simulator, begun, clean, None)
+    driven = _pictures(simulator, begun, painted, paint)
     beside = lateral_m(path_of(clean), path_of(painted))
     seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
     last = min(len(clean), len(painted)) - 1

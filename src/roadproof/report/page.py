@@ -141,9 +141,10 @@ def _key_figures(run: Run) -> list[Fields]:
             "note": f"to the {'left' if furthest.lateral_m > 0 else 'right'}, {in_words(furthest.weather)}",
         },
         {
-            "value": f"{np.mean([t.deviation_m for t in alone]):.2f} m",
-            "label": f"mean deviation{predicted}",
-            "note": f"the paper’s measure, {len(alone)} weather{'s' if len(alone) != 1 else ''}, alone on the road",
+            "value": f"{np.median([t.deviation_m for t in alone]):.2f} m",
+            "label": f"median deviation{predicted}",
+            "note": f"the paper’s measure, {min(t.deviation_m for t in alone):.2f} to "
+            f"{max(t.deviation_m for t in alone):.2f} over {len(alone)} drives alone",
         },
     ]
     if evaluation.predicted:
@@ -158,9 +159,9 @@ def _key_figures(run: Run) -> list[Fields]:
             "note": f"{np.mean(clean_points):.1f} on the bare road{', in traffic' if traffic else ''}",
         },
         {
-            "value": f"{failed} of {len(trials)}",
-            "label": "drives with infractions",
-            "note": f"{before} on the bare road",
+            "value": f"{sum(t.leaves_lane for t in trials)} of {len(trials)}",
+            "label": "drives leave the lane",
+            "note": f"{failed} with infractions, {before} on the bare road",
         },
     ]
 
@@ -202,11 +203,12 @@ def _judged(judged: Judged | None) -> Fields | None:
                 "traffic": "in traffic" if row.traffic else "alone",
                 "count": row.count,
                 "deviation": mean_in_words(row.deviation_m, 2),
+                "median": f"{row.median_m:.2f}",
+                "left_lane": f"{row.left_lane:.0%}",
                 "lateral": mean_in_words(row.lateral_m, 2),
                 "points": mean_in_words(row.points, 1),
                 "clean_points": mean_in_words(row.clean_points, 1),
                 "leaderboard": mean_in_words(row.leaderboard, 2),
-                "failed": MISSING if row.failed is None else f"{row.failed:.0%}",
                 "first": mean_in_words(row.first_event_s, 1),
             }
             for row in evaluation.rows()
@@ -262,15 +264,16 @@ def _attack(run: Run) -> Fields | None:
     attack = run.attack
     if attack is None:
         return None
-    starts = f"{attack.restarts} start{'s' if attack.restarts != 1 else ''}"
+    count = attack.history.shape[2]
+    starts = f"{attack.method.word}: {count} start{'s' if count != 1 else ''}"
     return {
         "chart": charts.search(attack.history, tuple(attack.by_group), attack.objective),
         "objective": attack.objective,
         "shift": f"{attack.surrogate_shift:+.3f}",
         "group": attack.group,
         "groups": [(name, f"{value:+.3f}") for name, value in attack.by_group.items()],
-        "how": f"{starts} a group, {len(attack.history)} iterations, {attack.space.figures} figures of the "
-        f"{attack.space.family} family, seed {attack.seed}; {attack.stopped}",
+        "how": f"{starts} a group, {len(attack.history)} last steps, {attack.space.figures} figures of the "
+        f"{attack.space.family} family, seed {attack.seed}",
         "checks": [asdict(check) for check in attack.checks],
     }
 

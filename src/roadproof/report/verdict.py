@@ -73,7 +73,7 @@ def _foreseen(evaluation: Evaluation) -> Verdict:
 def _driven(evaluation: Evaluation) -> Verdict:
     trials = [*evaluation.of(traffic=False), *evaluation.of(traffic=True)]
     alone = evaluation.of(traffic=False)
-    worse = sum((trial.points or 0.0) > (trial.clean_points or 0.0) for trial in trials)
+    left = sum(trial.leaves_lane for trial in trials)
     furthest = max(abs(trial.lateral_m) for trial in trials)
     who, where, n = evaluation.controller, evaluation.scenario.name, len(trials)
     points = mean_in_words(mean_95([trial.points or 0.0 for trial in trials]), 1)
@@ -85,12 +85,14 @@ def _driven(evaluation: Evaluation) -> Verdict:
             f"{who} already commits infractions on the bare road of {where} ({before} points a drive), so nothing can "
             f"be blamed on the pattern; choose a scenario it masters.",
         )
-    if worse:
+    if left:
+        deviations = [trial.deviation_m for trial in trials]
         return Verdict(
             "fails",
             "Fails over the paint",
-            f"Over the pattern {who} fares worse than on the bare road in {worse} of {n} drives of {where}: it leaves "
-            f"its path by up to {furthest:.1f} m, and a drive costs {points} penalty points instead of {before}.",
+            f"Over the pattern {who} leaves its lane in {left} of {n} drives of {where}: it deviates by "
+            f"{np.median(deviations):.2f} m (median; {min(deviations):.2f} to {max(deviations):.2f}), is up to "
+            f"{furthest:.1f} m aside, and a drive costs {points} penalty points instead of {before}.",
         )
     if furthest >= SWAYED_M:
         return Verdict(

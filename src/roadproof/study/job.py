@@ -7,6 +7,9 @@ A row is one drive over the pattern against the same drive without it. Its colum
     weather                       of both drives, as "clear-noon"
     traffic                       whether there were cars and people
     traffic_seed                  of cars and people
+    start_right_m       m         how both drives begin beside the scenario's start: to the right,
+    start_turned_rad    rad       turned, left positive,
+    start_faster_mps    m/s       and faster
     deviation_m         m         the paper's deviation between the two drives
     lateral_m           m         largest offset from the clean path, left positive
     points                        the CARLA challenge's infraction points with paint
@@ -14,8 +17,10 @@ A row is one drive over the pattern against the same drive without it. Its colum
     leaderboard                   the CARLA Leaderboard's factor with paint, 1 where nothing happened
     clean_leaderboard             the same without
     first_event_s       s         when something first went wrong with paint; none where nothing did
+    left_lane                     whether the car left its lane (`evaluation.Trial.leaves_lane`)
     ending                        why the painted drive ended
     events                        of the painted drive, those that count, as JSON: kind, seconds, with what or where
+    clean_events                  of the clean one
     search_calls        drives    of the simulator before the evaluation: recording, calibration and selection; in a
                                   black-box search one for each pattern tried and a clean one, and what its start took
     search_seconds      s         that finding the pattern took
@@ -41,36 +46,37 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 
-from roadproof.attacks import OBJECTIVES, Schedule
-from roadproof.attacks.blackbox import Method as BlackBox
+from roadproof.attacks import OBJECTIVES, BayesianOptimisation, BlackBox, GradOpt, Published, method_of
 from roadproof.attacks.blackbox import blackbox_search
+from roadproof.budget import PUBLISHED, QUICK, STEERING, Budget
 from roadproof.calibration import Method as Calibration
 from roadproof.controllers import Controller, load_controller
-from roadproof.datatypes import Weather
-from roadproof.drives import Scheme
-from roadproof.evaluation import DrivenObjective, Evaluation, evaluate
+from roadproof.datatypes import Event, Weather
+from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
+from roadproof.evaluation import DrivenObjective, Evaluation, StartRange, evaluate
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.objective import Measure
 from roadproof.evaluation.result import Trial, path_of
 from roadproof.evaluation.selection import first_of_each_group
 from roadproof.io.arrays import packed
-from roadproof.loop import Budget, StressTest, stress_test
+from roadproof.loop import StressTest, stress_test
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.plan import BLACK, Job, MethodPlan
+from roadproof.study.methods import BlackBoxPlan, GradOptPlan, MethodPlan, PublishedPlan
+from roadproof.study.plan import BLACK, Job
 from roadproof.study.rows import JobResult, Row, job_columns
 from roadproof.study.views import views
-
-SWERVES_M = (1.5, 0.8, 1.2)
-"""How far the first, second and third pair of perturbed drives are pushed aside."""
 
 MEASURED = (
     "controller",
     "weather",
     "traffic",
     "traffic_seed",
+    "start_right_m",
+    "start_turned_rad",
+    "start_faster_mps",
     "deviation_m",
     "lateral_m",
     "points",
@@ -78,8 +84,10 @@ MEASURED = (
     "leaderboard",
     "clean_leaderboard",
     "first_event_s",
+    "left_lane",
     "ending",
     "events",
+    "clean_events",
     "search_calls",
     "search_seconds",
     "evaluation_calls",
@@ -121,8 +129,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     """
     controller = load_controller(job.controller)
     with open_simulator(job.simulator) as world:
-        search = _by_gradient if job.method.search == "gradopt" else _by_black_box
-        found = search(job, world, controller, scratch)
+        drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
+        found = (_by_driving if drives else _in_recordings)(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
         (clean,) = load_episodes(scratch / "evaluation", [parts[0].shown().clean])
         seen = views(world, job.scenario, found.pattern, clean, job.weathers)
@@ -149,6 +157,9 @@ def measured(trial: Trial) -> Row:
         "weather": str(trial.weather),
         "traffic": trial.traffic,
         "traffic_seed": trial.seed,
+        "start_right_m": trial.start.right_m,
+        "start_turned_rad": trial.start.turned_rad,
+        "start_faster_mps": trial.start.faster_mps,
         "deviation_m": trial.deviation_m,
         "lateral_m": trial.lateral_m,
         "points": trial.points,
@@ -156,9 +167,21 @@ def measured(trial: Trial) -> Row:
         "leaderboard": trial.leaderboard,
         "clean_leaderboard": trial.clean_leaderboard,
         "first_event_s": trial.first_event_s,
+        "left_lane": trial.leaves_lane,
         "ending": trial.ending,
-        "events": json.dumps([(each.kind, each.time_s, each.detail) for each in trial.events]),
+        "events": _told(trial.events),
+        "clean_events": _told(trial.clean_events),
     }
+
+
+def _told(events: Sequence[Event]) -> str:
+    return json.dumps([(each.kind, each.time_s, each.detail) for each in events])
+
+
+def start_range(job: Job) -> StartRange:
+    """What the starts of a job's evaluation are drawn from."""
+    plan = job.starts
+    return StartRange(right_m=plan.right_m, turned_rad=plan.turned_rad, faster_mps=plan.faster_mps)
 
 
 def history(
@@ -183,42 +206,65 @@ def history(
 
 
 def budget_of(method: MethodPlan, weather: Weather) -> Budget:
-    """What a gradopt method spends on finding a pattern."""
-    # A black box's objective is of its own drives; the search that it begins with stays the published one.
-    objective = method.objective if method.search == "gradopt" else "steering"
-    heats = Schedule.closed_loop if objective == "deviation" else Schedule.in_heats
-    schedule = heats if method.schedule == "heats" else Schedule.stretched
-    return Budget(
-        objective=OBJECTIVES[objective],
-        deviations_m=SWERVES_M[: (method.trajectories - 1) // 2],
-        scheme=Scheme.RANDOM if method.scheme == "random" else Scheme.GROUP,
-        pooled=method.scheme != "group",
-        frames=method.frames,
-        calibration=Calibration(method.calibration),
-        schedule=schedule(method.iterations),
-        restarts=method.restarts,
-        select=method.select,
-        weathers=(weather,),
-        runs=0,
-    )
+    """What a method that searches in recordings spends on finding a pattern."""
+    found: dict[str, Any] = {}
+    match method:
+        case GradOptPlan():
+            deviation = method.objective == "deviation"
+            swerve = Swerve(method.swerves_m, method.weaves_m)
+            how = swerve if method.noise_deg is None else SteeringNoise(*method.noise_deg)
+            found = {
+                "method": GradOpt(iterations=method.iterations, restarts=method.restarts, halving=method.halving),
+                "objective": OBJECTIVES[method.objective],
+                "trajectories": _trajectories(method, how),
+                "window": Window(
+                    frames=method.frames, least_px=QUICK.window.least_px if deviation else Window().least_px
+                ),
+                "pooled": method.scheme != "group",
+                "calibration": Calibration(method.calibration),
+                "select": method.select,
+                "rounds": method.rounds,
+            }
+        case PublishedPlan():
+            how = SteeringNoise(*method.noise_deg)
+            found = {
+                "method": Published(masks=method.masks, restarts=method.restarts),
+                "trajectories": _trajectories(method, how),
+                "pooled": method.scheme != "group",
+            }
+            return replace(PUBLISHED, weathers=(weather,), runs=0, **found)
+        case BlackBoxPlan():
+            found = {"method": _black_box(method), "objective": OBJECTIVES[method.objective]}
+    return replace(QUICK, weathers=(weather,), **found)
+
+
+def _trajectories(method: GradOptPlan | PublishedPlan, how: Swerve | SteeringNoise) -> Trajectories:
+    scheme = Scheme.RANDOM if method.scheme == "random" else Scheme.GROUP
+    return Trajectories(count=method.trajectories, scheme=scheme, perturbation=how)
+
+
+def _black_box(method: BlackBoxPlan) -> BlackBox:
+    more = {"random_calls": method.random_calls} if method.search == BayesianOptimisation.word else {}
+    return cast("BlackBox", method_of(method.search, calls=method.calls, **more))
 
 
 def space_of(job: Job) -> SearchSpace:
     """The patterns a job searches: published rectangles, in its own bounds for the published baseline."""
-    family = "published-bo" if job.method.search == "published-bo" else "published"
+    family = BayesianOptimisation.family if job.method.search == BayesianOptimisation.word else "published"
     if job.figures == BLACK:
         return SearchSpace(figures=1, family=family, colour=False)
     return SearchSpace(figures=int(job.figures), family=family)
 
 
-def _by_gradient(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
-    # Its own evaluation, one pair of drives, is the first of the study's conditions and kept where those are.
-    found, calls, seconds = _searched(job, world, controller, folder, select=job.method.select)
+def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
+    # Its own evaluation is a part of the study's conditions and kept where those are.
+    budget = replace(budget_of(job.method, job.weathers[0]), starts=job.starts.count, start_range=start_range(job))
+    found, calls, seconds = _searched(job, world, controller, folder, budget)
     strongest = found.attack.history.max((1, 2))
     before = [found.cost[stage] for stage in ("record", "calibrate")]
     # All steps cost much the same, so the time of the search is spread evenly over them.
     steps = found.cost["attack"].seconds * np.arange(1, len(strongest) + 1) / len(strongest)
-    driven = int(found.selection is not None)
+    chosen = found.selection if found.rounds is None else found.rounds.best
     return _Answer(
         found.pattern,
         calls,
@@ -231,24 +277,24 @@ def _by_gradient(job: Job, world: Simulator, controller: Controller, folder: Pat
             cast("list[float]", np.maximum.accumulate(strongest).tolist()),
             measure=found.attack.objective,
             driven={
-                "calls": [calls] * driven,
-                "seconds": [seconds] * driven,
-                "best": [found.evaluation.shown().deviation_m] * driven,
+                "calls": [] if chosen is None else [calls],
+                "seconds": [] if chosen is None else [seconds],
+                "best": [] if chosen is None else [chosen.deviation_m],
             },
         ),
     )
 
 
 def _searched(
-    job: Job, world: Simulator, controller: Controller, folder: Path, *, select: int
+    job: Job, world: Simulator, controller: Controller, folder: Path, budget: Budget
 ) -> tuple[StressTest, int, float]:
-    """A gradopt search with so many candidates driven; its simulator calls and seconds without the evaluation."""
+    """A search in recordings; its simulator calls and seconds without the evaluation."""
     found = stress_test(
         world,
         controller,
         job.scenario,
         folder,
-        budget=replace(budget_of(job.method, job.weathers[0]), select=select),
+        budget=budget,
         space=space_of(job),
         seed=job.seed,
         controller_name=job.controller,
@@ -257,16 +303,16 @@ def _searched(
     return found, sum(cost.simulator_calls for cost in costs), sum(cost.seconds for cost in costs)
 
 
-def _by_black_box(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
-    space = space_of(job)
-    start = _started(job, world, controller, folder / "start") if job.method.start else None
+def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Answer:
+    plan, space = cast("BlackBoxPlan", job.method), space_of(job)
+    start = _started(job, world, controller, folder / "start", plan.start) if plan.start else None
     calls_before, seconds_before = (start.calls, start.seconds) if start else (0, 0.0)
     objective = DrivenObjective(
         world,
         controller,
         job.scenario,
         space,
-        measure=cast("Measure", job.method.objective),
+        measure=cast("Measure", plan.objective),
         weather=job.weathers[0],
         seed=job.seed,
         keep=folder / "driven.json",
@@ -274,9 +320,7 @@ def _by_black_box(job: Job, world: Simulator, controller: Controller, folder: Pa
     trials = blackbox_search(
         objective,
         space,
-        method=cast("BlackBox", job.method.search),
-        calls=job.method.calls,
-        random_calls=job.method.random_calls,
+        _black_box(plan),
         seed=job.seed,
         first=torch.stack([space.point(pattern) for pattern in start.patterns]) if start else None,
         checkpoint=folder / "trials.safetensors",
@@ -294,7 +338,7 @@ def _by_black_box(job: Job, world: Simulator, controller: Controller, folder: Pa
             [calls_before + 2 + count for count in range(len(trials))],
             seconds,
             cast("list[float]", trials.best_so_far.tolist()),
-            measure=job.method.objective,
+            measure=plan.objective,
             deviation_m=[objective.effect(patterns[index]).deviation for index in best],
         ),
     )
@@ -309,10 +353,11 @@ class _Start:
     seconds: float
 
 
-def _started(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Start:
-    """Record, calibrate and search; the candidates are for the black box to drive."""
-    found, calls, seconds = _searched(job, world, controller, folder, select=0)
-    chosen = first_of_each_group(found.attack.candidates, job.method.select)
+def _started(job: Job, world: Simulator, controller: Controller, folder: Path, count: int) -> _Start:
+    """Record, calibrate and search the steering shift; the candidates are for the black box to drive."""
+    budget = replace(STEERING, select=0, weathers=job.weathers[:1])
+    found, calls, seconds = _searched(job, world, controller, folder, budget)
+    chosen = first_of_each_group(found.attack.candidates, count)
     return _Start(tuple(candidate.pattern for _, candidate in chosen), calls, seconds)
 
 
@@ -334,6 +379,8 @@ def _evaluate(
             folder=scratch / name,
             driver_name=job.controller,
             weathers=weathers,
+            starts=job.starts.count,
+            start_range=start_range(job),
             runs=others.runs if others else 0,
             cars=others.cars if others else 0,
             pedestrians=others.pedestrians if others else 0,

@@ -1,14 +1,21 @@
 """What a study compares, as a TOML file says it, and the independent jobs that come of it.
 
 format = "roadproof-study"
-version = 1
+version = 2
 controller = "cil"
 simulator = "town"                        # or carla://HOST:PORT, for one worker
 scenario_file = "own.toml"                # beside the study; left out, the built-in scenarios
 scenarios = ["straight-01", "left-*"]     # names or patterns of names
 figures = ["1-b", 1, 3, 5]                # K; 1-b is one black figure
 seeds = [0]
+reference = "GradOpt"                     # the method that tables compare with others; the first, left out
 weathers = ["clear-noon", "rainy-noon"]   # of the evaluation; attacks are found in the first
+
+[starts]                                  # of the drives that judge a pattern, in each weather; these are the defaults
+count = 5
+right_m = 0.3                             # to either side; drawn uniformly, as the others
+turned_rad = 0.05
+faster_mps = 2.0
 
 [traffic]                                 # leave it out for static objects only
 cars = 20
@@ -16,123 +23,43 @@ pedestrians = 20
 runs = 10
 weathers = "all"                          # or "first": the others are driven alone
 
-[[method]]
-name = "GradOpt"                          # stands in the tables
-search = "gradopt"                        # or a black-box method: random, published-bo, gp, tpe, cma-es
-trajectories = 3                          # gradopt: recorded drives; scheme: group, group-all or random
-scheme = "group"
-restarts = 4
-iterations = 250
-schedule = "published"                    # or "heats": many starts on few frames, the best go on
-calibration = "two-paint"                 # or published, or pose
-frames = 24                               # kept of every recorded drive
-select = 6                                # of the best starts, driven to keep the strongest; 0 believes the surrogate
+[[method]]                                # see study.methods
+name = "GradOpt"
+search = "gradopt"
 
 [[method]]
 name = "BO"
 search = "published-bo"
-calls = 1000                              # black box: how many patterns are tried, each in a whole drive
-random_calls = 400
-objective = "steering"                    # as published, or "deviation": what is reported
-start = "gradopt"                         # left out as published: the patterns that are tried first are GradOpt's, with
-                                          # the settings above; `select` of them
+objective = "steering"
 """
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any
 
 from roadproof.controllers.loading import runs_code
 from roadproof.datatypes import Weather
 from roadproof.errors import StudyError
-from roadproof.limits import MANY, MAX_CROWD, MAX_FIGURES, MAX_SEED
+from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
+from roadproof.study.methods import MethodPlan, method_plan
+from roadproof.study.reading import build, one_of, within
 
 FORMAT = "roadproof-study"
-FORMAT_VERSION = 1
-JOB_VERSION = 2
+FORMAT_VERSION = 2
+JOB_VERSION = 3
 """Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
 
-Scheme = Literal["group", "group-all", "random"]
-SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
-SCHEDULES = ("published", "heats")
 BLACK = "1-b"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MethodPlan:
-    """One way of finding a pattern.
-
-    Args:
-        name: stands in the tables.
-        search: "gradopt", or a black-box method of `attacks.blackbox`.
-        trajectories: gradopt: T, how many drives are recorded.
-        scheme: gradopt: how they are perturbed and pooled.
-        restarts: gradopt: starts of every group.
-        iterations: gradopt: steps of every start.
-        select: gradopt: how many of the best starts are driven, to keep the strongest; 0 believes the surrogate.
-        calls: black box: patterns tried, each in a whole drive.
-        random_calls: published-bo: how many of them before the model guides.
-        schedule: gradopt: "published" steps, or in "heats".
-        calibration: gradopt: how recorded drives are calibrated, a `calibration.Method`.
-        frames: gradopt: kept of every recorded drive, at most.
-        objective: what is made large. Black box: of a drive, an `evaluation.objective.Measure`. gradopt: "steering",
-            the shift on recorded frames, or "deviation", the car's path in the recorded world.
-        start: black box: "gradopt" tries `select` patterns first that a gradopt search of these settings found.
-    """
-
-    name: str
-    search: str
-    trajectories: int = 3
-    scheme: str = "group"
-    restarts: int = 4
-    iterations: int = 250
-    select: int = 0
-    calls: int = 1000
-    random_calls: int = 400
-    schedule: str = "published"
-    calibration: str = "two-paint"
-    frames: int = 24
-    objective: str = "steering"
-    start: str = ""
-
-    def __post_init__(self) -> None:
-        # Late, since torch comes with it; a process that only passes plans on is spared.
-        from roadproof.attacks.blackbox import METHODS
-        from roadproof.calibration import METHODS as CALIBRATIONS
-        from roadproof.drives.trajectories import COUNTS
-        from roadproof.evaluation.objective import MEASURES
-
-        _one_of(self.search, "search", ("gradopt", *METHODS))
-        _one_of(self.scheme, "scheme", SCHEMES)
-        _one_of(self.schedule, "schedule", SCHEDULES)
-        _one_of(self.calibration, "calibration", CALIBRATIONS)
-        _one_of(self.objective, "objective", MEASURES)
-        _one_of(self.start, "start", ("", "gradopt"))
-        for name in ("restarts", "iterations", "calls", "random_calls", "frames"):
-            _within(getattr(self, name), name, 1, MANY)
-        _within(self.select, "select", 0, 1000)
-        if self.search == "published-bo" and self.random_calls >= self.calls:
-            raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
-        if self.start and (self.search == "gradopt" or not self.select):
-            raise StudyError(f"start is {self.start!r}, expected it with a black-box search and select of 1 or more")
-        sides = self.scheme == "group" and self.trajectories > 1
-        if self.search == "gradopt" and self.objective == "deviation" and not sides:
-            raise StudyError(
-                "objective deviation is searched for each side apart; expected scheme group and trajectories 3 or more"
-            )
-        if self.trajectories not in COUNTS:
-            raise StudyError(f"trajectories is {self.trajectories}, expected {', '.join(map(str, COUNTS))}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -153,11 +80,33 @@ class TrafficPlan:
 
     def __post_init__(self) -> None:
         for name in ("cars", "pedestrians"):
-            _within(getattr(self, name), name, 0, MAX_CROWD)
+            within(getattr(self, name), name, 0, MAX_CROWD)
         if not self.cars + self.pedestrians:
             raise StudyError("cars and pedestrians are 0; leave [traffic] out to drive alone")
-        _within(self.runs, "runs", 1, 10_000)
-        _one_of(self.weathers, "weathers", ("all", "first"))
+        within(self.runs, "runs", 1, 10_000)
+        one_of(self.weathers, "weathers", ("all", "first"))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StartPlan:
+    """Where the drives begin that judge a pattern: not where it was chosen.
+
+    Args:
+        count: drives alone in each weather.
+        right_m: see `evaluation.starts.StartRange`, as turned_rad and faster_mps.
+    """
+
+    count: int = 5
+    right_m: float = 0.3
+    turned_rad: float = 0.05
+    faster_mps: float = 2.0
+
+    def __post_init__(self) -> None:
+        from roadproof.evaluation.starts import MOST
+
+        within(self.count, "count", 1, 1000)
+        for name, most in MOST.items():
+            within(getattr(self, name), name, 0.0, most)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -172,6 +121,7 @@ class Job:
         seed: of the recording and the search.
         weathers: of the evaluation; found in the first.
         traffic: of the evaluation, or None.
+        starts: of the evaluation.
         simulator: its spec, see `simulators.loading`.
         weights: digest of the file that the controller's spec names; empty for one that comes with the package, and for
             a function of yours, whose weights a study does not see.
@@ -184,6 +134,7 @@ class Job:
     seed: int
     weathers: tuple[Weather, ...]
     traffic: TrafficPlan | None
+    starts: StartPlan = StartPlan()
     simulator: str = "town"
     weights: str = ""
 
@@ -201,6 +152,18 @@ class Job:
 class Study:
     """Scenarios × K × methods × seeds, evaluated in some weathers, with and without traffic.
 
+    Args:
+        controller: its spec.
+        scenarios: where.
+        figures: K, or "1-b" for one black figure.
+        methods: how patterns are found.
+        seeds: of recording and search.
+        weathers: of the evaluation; patterns are found in the first.
+        traffic: of the evaluation, or None.
+        starts: of the evaluation.
+        simulator: its spec.
+        reference: name of the method that tables compare with the others; None for the first.
+
     Raises:
         StudyError: a list is empty, something stands in it twice, or a value makes no sense.
     """
@@ -212,12 +175,14 @@ class Study:
     seeds: tuple[int, ...] = (0,)
     weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
     traffic: TrafficPlan | None = None
+    starts: StartPlan = StartPlan()
     simulator: str = "town"
+    reference: str | None = None
 
     def __post_init__(self) -> None:
-        for field in ("scenarios", "figures", "methods", "seeds", "weathers"):
-            if not getattr(self, field):
-                raise StudyError(f"{field} is empty, expected at least one")
+        for name in ("scenarios", "figures", "methods", "seeds", "weathers"):
+            if not getattr(self, name):
+                raise StudyError(f"{name} is empty, expected at least one")
         for figures in self.figures:
             known = isinstance(figures, int) and not isinstance(figures, bool) and 1 <= figures <= MAX_FIGURES
             if figures != BLACK and not known:
@@ -227,15 +192,17 @@ class Study:
         if self.simulator != "town" and not is_server(self.simulator):
             raise StudyError(f"simulator is {self.simulator!r}, expected {SPECS}")
         for seed in self.seeds:
-            _within(seed, "seeds", 0, MAX_SEED)
+            within(seed, "seeds", 0, MAX_SEED)
         # What is asked for twice would be two jobs that write the same folder.
         named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": [m.name for m in self.methods]}
-        for field in ("figures", "seeds", "weathers"):
-            named[field] = list(map(str, getattr(self, field)))
-        for field, names in named.items():
+        for what in ("figures", "seeds", "weathers"):
+            named[what] = list(map(str, getattr(self, what)))
+        for what, names in named.items():
             twice = [name for name in names if names.count(name) > 1]
             if twice:
-                raise StudyError(f"{field} has {twice[0]} twice, expected each once")
+                raise StudyError(f"{what} has {twice[0]} twice, expected each once")
+        if self.reference is not None:
+            one_of(self.reference, "reference", named["method"])
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -250,6 +217,7 @@ class Study:
                 seed=seed,
                 weathers=self.weathers,
                 traffic=self.traffic,
+                starts=self.starts,
                 simulator=self.simulator,
                 weights=weights,
             )
@@ -292,94 +260,60 @@ def _check_harmless(study: Study) -> None:
         raise StudyError(f"simulator {study.simulator!r} is another machine; give --trust (trust=True) to call it")
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Stated:
+    """A plan as its file says it."""
+
+    controller: str
+    scenarios: tuple[str, ...]
+    figures: tuple[int | str, ...]
+    method: tuple[dict[str, Any], ...]
+    scenario_file: str | None = None
+    seeds: tuple[int, ...] = (0,)
+    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
+    traffic: dict[str, Any] | None = None
+    starts: dict[str, Any] = field(default_factory=dict[str, Any])
+    simulator: str = "town"
+    reference: str | None = None
+
+
 def _study(content: dict[str, Any], folder: Path) -> Study:
-    if content.pop("format", None) != FORMAT or content.pop("version", None) != FORMAT_VERSION:
-        raise StudyError(f'expected format = "{FORMAT}" and version = {FORMAT_VERSION}')
-    listed = content.pop("scenario_file", None)
-    own = folder / str(listed) if listed is not None else BUILTIN_FILE
+    if content.pop("format", None) != FORMAT:
+        raise StudyError(f'expected format = "{FORMAT}"')
+    if (version := content.pop("version", None)) != FORMAT_VERSION:
+        raise StudyError(
+            f"version is {version!r}, expected {FORMAT_VERSION}; version 1 had other keys, see docs/studies.md"
+        )
+    stated = build(_Stated, content, "the study")
+    listed = stated.scenario_file
+    own = BUILTIN_FILE if listed is None else folder / listed
     if listed is not None and not own.resolve().is_relative_to(folder.resolve()):
         raise StudyError(f"scenario_file {listed!r} leaves the study's folder; put it beside the study")
-    stated = {"methods" if key == "method" else key: value for key, value in content.items()}
-    _known(stated, Study, "the study")
-    for key in ("controller", "scenarios", "figures", "methods"):
-        if key not in stated:
-            raise StudyError(f"{'method' if key == 'methods' else key} is missing")
-    traffic = stated.get("traffic")
+    methods = tuple(map(method_plan, stated.method))
     return Study(
-        controller=str(stated["controller"]),
-        scenarios=_chosen(_list(stated, "scenarios"), load_scenarios(own)),
-        figures=tuple(_list(stated, "figures")),
-        methods=tuple(_build(MethodPlan, method, "method") for method in _list(stated, "methods")),
-        seeds=tuple(_seed(value) for value in _list(stated, "seeds", (0,))),
-        weathers=tuple(_weather(name) for name in _list(stated, "weathers", (Weather.CLEAR_NOON,))),
-        traffic=None if traffic is None else _build(TrafficPlan, traffic, "traffic"),
-        simulator=str(stated.get("simulator", "town")),
+        controller=stated.controller,
+        scenarios=_chosen(stated.scenarios, load_scenarios(own)),
+        figures=stated.figures,
+        methods=methods,
+        seeds=stated.seeds,
+        weathers=stated.weathers,
+        traffic=None if stated.traffic is None else build(TrafficPlan, stated.traffic, "traffic"),
+        starts=build(StartPlan, stated.starts, "starts"),
+        simulator=stated.simulator,
+        reference=stated.reference,
     )
 
 
-def _chosen(patterns: Iterable[object], scenarios: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
+def _chosen(patterns: Iterable[str], scenarios: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
     """Scenarios by name or pattern of names, each once, in the order first named."""
     chosen: dict[str, Scenario] = {}
-    for pattern in map(str, patterns):
+    for pattern in patterns:
         found = [scenario for scenario in scenarios if fnmatch.fnmatchcase(scenario.name, pattern)]
         chosen |= {scenario.name: scenario for scenario in found or [find_scenario(pattern, scenarios)]}
     return tuple(chosen.values())
-
-
-def _build(noun: type[Any], stated: object, what: str) -> Any:  # noqa: ANN401  # the noun that was asked for
-    if not isinstance(stated, dict):
-        raise StudyError(f"{what} is {stated!r}, expected a table")
-    values = cast("dict[str, Any]", stated)
-    _known(values, noun, what)
-    for field in fields(noun):
-        value = values.get(field.name)
-        wanted = str if field.type == "str" else int
-        if value is not None and (not isinstance(value, wanted) or isinstance(value, bool)):
-            raise StudyError(f"{what}: {field.name} is {value!r}, expected {'a text' if wanted is str else 'a number'}")
-    try:
-        return noun(**values)
-    except TypeError:
-        missing = [name for name in ("name", "search") if name not in values]
-        raise StudyError(f"{what} lacks {missing[0]}") from None
-
-
-def _known(stated: Mapping[str, Any], noun: type[Any], what: str) -> None:
-    names = [field.name for field in fields(noun)]
-    for key in stated:
-        if key not in names:
-            nearest = difflib.get_close_matches(key, names, n=1, cutoff=0.0)
-            raise StudyError(f"{what} has an unknown key {key!r}; did you mean {nearest[0]!r}?")
-
-
-def _list(stated: Mapping[str, Any], key: str, otherwise: tuple[Any, ...] = ()) -> tuple[Any, ...]:
-    value = stated.get(key, otherwise)
-    if not isinstance(value, list | tuple):
-        raise StudyError(f"{key} is {value!r}, expected a list")
-    return tuple(cast("list[Any]", value))
 
 
 def _digest(controller: str) -> str:
     """Of the file that a spec names, as `cil:FILE.safetensors` does; empty where it names none."""
     path = Path(controller.partition(":")[2] or controller)
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.suffix and path.is_file() else ""
-
-
-def _seed(value: object) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise StudyError(f"seeds has {value!r}, expected whole numbers")
-    return value
-
-
-def _weather(name: object) -> Weather:
-    _one_of(str(name), "weathers", tuple(Weather))
-    return Weather(str(name))
-
-
-def _one_of(value: str, name: str, choices: Iterable[str]) -> None:
-    if value not in choices:
-        raise StudyError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
-
-
-def _within(value: int, name: str, least: int, most: int) -> None:
-    if not least <= value <= most:
-        raise StudyError(f"{name} is {value}, expected {least} to {most}")

@@ -1,5 +1,6 @@
 """What a job gives back, where it is kept in the folder of its study, and all of it as one table.
 
+study.json            which method tables compare with the others
 jobs/KEY/job.json     what was done, in words; for people
 jobs/KEY/rows.json    its rows; there when the job is finished, or has failed
 jobs/KEY/…            the job's files: pattern.json, paths.npz
@@ -18,13 +19,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from roadproof.errors import StudyError
 from roadproof.io.files import read_json, write_atomically
-from roadproof.study.plan import Job
+from roadproof.study.plan import Job, Study
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 FORMAT = "roadproof-study-rows"
 FORMAT_VERSION = 1
+STUDY_FORMAT = "roadproof-study-run"
 Row: TypeAlias = Mapping[str, str | int | float | bool | None]
 
 JOB_COLUMNS = ("scenario", "kind", "figures", "method", "seed")
@@ -74,6 +76,15 @@ def write_result(job: Job, result: JobResult, folder: Path) -> None:
         write_atomically(place / name, lambda part, content=content: part.write_bytes(content))
     _write_json(place / "job.json", asdict(job))
     _write_json(place / "rows.json", {"format": FORMAT, "version": FORMAT_VERSION, "rows": list(result.rows)})
+
+
+def write_study(study: Study, folder: Path) -> None:
+    """Keep what a report cannot know from the jobs.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    _write_json(folder / "study.json", {"format": STUDY_FORMAT, "version": 1, "reference": study.reference})
 
 
 def read_rows(job: Job, folder: Path) -> tuple[Row, ...] | None:

@@ -17,7 +17,7 @@ from roadproof.memory import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
 from roadproof.study.plan import Job, Study
-from roadproof.study.rows import JobResult, failed, is_done, write_result, write_table
+from roadproof.study.rows import JobResult, failed, is_done, write_result, write_study, write_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -60,6 +60,7 @@ def run_study(
     if is_server(study.simulator) and (workers > 1 or cluster is not None):
         raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
     with working_in(folder):
+        write_study(study, folder)
         left = [job for job in study.jobs if not is_done(job, folder)]
         done = len(study.jobs) - len(left)
         results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)

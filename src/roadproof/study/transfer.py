@@ -22,7 +22,7 @@ from roadproof.io.files import inside, write_atomically
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.job import measured
+from roadproof.study.job import measured, start_range
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Row, is_done, job_columns, pandas
 
@@ -57,17 +57,19 @@ def transfer(
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
     rows: list[Row] = []
+    done = 0
     with open_simulator(study.simulator) as world:
         for spec, driver in drivers.items():
             for job in found:
-                rows.append(_row(job, folder, world, spec, driver))
-                on_pattern(len(rows), len(drivers) * len(found))
+                rows += _rows(job, folder, world, spec, driver)
+                done += 1
+                on_pattern(done, len(drivers) * len(found))
     frame = pandas().DataFrame(rows)
     write_atomically(folder / "transfer.parquet", lambda part: frame.to_parquet(part, index=False))
     return frame
 
 
-def _row(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> Row:
+def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> list[Row]:
     place = inside(folder / "transfer" / re.sub(r"[^\w.-]", "_", spec), job.scenario.name, "scenario", ScenarioError)
     evaluation = evaluate(
         world,
@@ -77,7 +79,10 @@ def _row(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller
         folder=place,
         driver_name=spec,
         weathers=job.weathers[:1],
+        starts=job.starts.count,
+        start_range=start_range(job),
         runs=0,
         seed=job.seed,
     )
-    return {**job_columns(job), "found_on": job.controller, "controller": spec, **measured(evaluation.trials[0])}
+    told = {**job_columns(job), "found_on": job.controller, "controller": spec}
+    return [{**told, **measured(trial)} for trial in evaluation.trials]

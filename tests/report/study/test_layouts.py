@@ -63,8 +63,8 @@ def test_differences_come_with_ties_test_and_all_k_together(records):
 
 def test_cost_stands_beside_what_was_found(records):
     table = tables_of(records)["methods"]
-    assert rows_of(table)[0] == ("1", "GradOpt", "4", "61", "30", "1.88", "5.25")
-    assert rows_of(table)[1] == ("", "BO", "4", "1000", "30", "1.50", "4.50")
+    assert rows_of(table)[0] == ("1", "GradOpt", "4", "61", "30", "1.88", "5.25", "1.75 (1.38 to 2.25)", "100%")
+    assert rows_of(table)[1] == ("", "BO", "4", "1000", "30", "1.50", "4.50", "1.50 (0.88 to 2.12)", "100%")
 
 
 def test_the_ablation_compares_variants_over_what_all_have():
@@ -86,6 +86,8 @@ def test_the_ablation_compares_variants_over_what_all_have():
     assert rows_of(table) == [("1", "7.00", "7.00", "11.00", "8.00")]
     assert "1 job: left-01, K = 1, R, seed 0 (no luck)" in table.note
     assert reference(variants).name == "G3"
+    named = [dataclasses.replace(each, reference=each.name == "BO") for each in (*variants, BO)]
+    assert reference(named).name == "BO", "what the plan names"
 
 
 def test_variants_that_differ_otherwise_go_by_their_names():

@@ -13,7 +13,7 @@ from roadproof.errors import PatternError, StudyError
 from roadproof.report.study.folder import read_found
 from roadproof.report.study.page import write_study
 from roadproof.report.study.results import JobId
-from roadproof.study.plan import MethodPlan
+from roadproof.study.methods import BlackBoxPlan
 
 HOSTILE = "<b>_all_ 100% $x"
 
@@ -23,7 +23,7 @@ def finished(tmp_path_factory):
     """Folder, rows and page of a study with a failed job and a hostile name."""
     folder = tmp_path_factory.mktemp("study")
     whole = made_up_study()
-    methods = (METHODS[0], METHODS[3], MethodPlan(name=HOSTILE, search="random", calls=20))
+    methods = (METHODS[0], METHODS[3], BlackBoxPlan(name=HOSTILE, search="random", calls=20))
     study = made_up_study(
         scenarios=(whole.scenarios[0], whole.scenarios[3], whole.scenarios[4]), figures=("1-b", 3), methods=methods
     )

@@ -21,16 +21,18 @@ from paint_shy import just_before_the_canvas
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
-from roadproof.attacks import Schedule, SteeringShift
+from roadproof.attacks import GradOpt, SteeringShift
+from roadproof.budget import Budget
 from roadproof.calibration import load_report
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
+from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import Evaluation, Fidelity, Trial, compare_with_rendered, rendered_frames
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.result import judge, path_of
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.loop import Budget, StressTest, stress_test
+from roadproof.loop import StressTest, stress_test
 from roadproof.metrics import lateral_m
 from roadproof.recordings import load_recordings
 from roadproof.rollout import Episode, rollout
@@ -44,12 +46,12 @@ CAMERA = CameraModel(width_px=400, height_px=300, fov_deg=100.0, forward_m=2.0, 
 INPUT = CropResize(left_px=0, top_px=57, right_px=400, bottom_px=255, width_px=200, height_px=88)
 BUDGET = Budget(
     objective=SteeringShift(),
-    deviations_m=(0.7,),
-    frames=5,
-    schedule=Schedule.stretched(12),
-    restarts=1,
+    method=GradOpt(iterations=12, restarts=1, halving=False),
+    trajectories=Trajectories(perturbation=Swerve((0.7,))),
+    window=Window(frames=5),
     select=1,
     weathers=(Weather.CLEAR_NOON,),
+    starts=0,
     runs=0,
 )
 SCENARIO = just_before_the_canvas(3.0)
@@ -146,7 +148,7 @@ def test_recordings_are_calibrated_as_well_as_in_the_town(sides):
     # 0.29 px in the town and 0.15 px here from what was seen, 0.30 and 0.03 from what the simulators state.
     for side, residual_px, stated_px in zip(sides, (0.6, 0.3), (0.6, 0.1), strict=True):
         for drive in load_report(side.folder / "calibration" / "report.json").drives:
-            assert drive.frames == BUDGET.frames
+            assert drive.frames == BUDGET.window.frames
             assert drive.residual_px.mean < residual_px
             assert drive.stated_px.mean < stated_px
 

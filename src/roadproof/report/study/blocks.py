@@ -19,6 +19,7 @@ class Metric:
 
 
 DEVIATION = Metric("deviation_m", "Deviation", "m")
+LEFT_LANE = Metric("left_lane", "Leave the lane", "share of drives")
 PENALTY = Metric("points", "Infraction penalty", "points")
 
 
@@ -60,10 +61,11 @@ def overall(results: Results) -> tuple[Block, Block]:
 
 
 def reference(methods: Sequence[Method]) -> Method:
-    """The method that others are compared with: GradOpt as the paper chose it, else any GradOpt, else the first."""
+    """The method that others are compared with: the plan's, else GradOpt in groups of three, any GradOpt, the first."""
+    named = [method for method in methods if method.reference]
     gradopt = [method for method in methods if method.search == "gradopt"]
     chosen = [method for method in gradopt if (method.scheme, method.trajectories) == ("group", 3)]
-    return [*chosen, *gradopt, *methods][0]
+    return [*named, *chosen, *gradopt, *methods][0]
 
 
 def compared(methods: Sequence[Method]) -> list[str]:

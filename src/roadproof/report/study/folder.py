@@ -1,5 +1,6 @@
 """What the jobs of a study left in its folder besides rows: patterns, paths, the course of each search.
 
+DIR/study.json                  which method tables compare with the others
 DIR/jobs/KEY/job.json           what was to be done
 DIR/jobs/KEY/rows.json          what came of it
 DIR/jobs/KEY/pattern.json       the pattern
@@ -29,6 +30,7 @@ from roadproof.patterns import Pattern, load_pattern
 from roadproof.report.study.results import JobId, Method, Record
 
 HISTORY_FORMAT, HISTORY_VERSION = "roadproof-study-history", 1
+STUDY = ("roadproof-study-run", 1)
 CLOSED_LOOP = "closed loop"
 
 Series = Float[np.ndarray, " n"]
@@ -166,6 +168,17 @@ def read_found(folder: Path, records: Iterable[Record]) -> dict[JobId, Found]:
     return found
 
 
+def reference_of(folder: Path) -> str | None:
+    """The name of the method that the study's plan compares with the others; None where it names none.
+
+    Raises:
+        StudyError: the file is damaged.
+    """
+    path = folder / "study.json"
+    name = read_json(path, *STUDY, StudyError).get("reference") if path.exists() else None
+    return None if name is None else str(name)
+
+
 def _read(path: Path) -> Found:
     try:
         content: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -179,8 +192,8 @@ def _read(path: Path) -> Found:
             method=Method(
                 name=str(method["name"]),
                 search=str(method["search"]),
-                trajectories=int(method["trajectories"]),
-                scheme=str(method["scheme"]),
+                trajectories=int(method.get("trajectories", 0)),
+                scheme=str(method.get("scheme", "")),
             ),
             folder=path.parent,
         )

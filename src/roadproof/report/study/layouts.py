@@ -7,9 +7,12 @@ out. In every row that compares two methods both means are over the cases that b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from roadproof.metrics import Mean
-from roadproof.report.study.blocks import DEVIATION, PENALTY, Block, Metric, overall, reference, rivals
+from roadproof.report.study.blocks import DEVIATION, LEFT_LANE, PENALTY, Block, Metric, overall, reference, rivals
 from roadproof.report.study.notes import note
 from roadproof.report.study.results import Method, Results
 from roadproof.report.study.statistics import Paired, mean_over_scenarios, paired
@@ -192,6 +195,7 @@ def ablation_table(results: Results, variants: Sequence[Method], metric: Metric)
 def methods_table(results: Results) -> Table:
     """What every method found, and what finding it took: simulator calls and seconds of the search."""
     blocks = overall(results)
+    lane = replace(blocks[0], metric=LEFT_LANE)
     rows: list[tuple[Cell, ...]] = []
     for figures in results.figures:
         found = {
@@ -209,6 +213,8 @@ def methods_table(results: Results) -> Table:
                 _plain([cost.calls for cost in costs]),
                 _plain([cost.seconds for cost in costs]),
                 *(column[number] for column in shown),
+                _spread(results.deviations(name, figures, blocks[0].weather, traffic=blocks[0].traffic)),
+                _share(mean_over_scenarios(lane.values(results, name, figures))),
             ))  # fmt: skip
     return Table(
         name="methods",
@@ -217,11 +223,27 @@ def methods_table(results: Results) -> Table:
             results,
             blocks,
             [method.name for method in results.methods],
-            "Simulator calls and seconds: mean of one search as its job noted them, without judging its pattern.",
+            "Simulator calls and seconds: mean of one search, without judging its pattern. Median "
+            "and quartiles: over all drives, each from a start of its own. Leave the lane: share of those drives.",
         ),
         header=(
-            (Heading(""), Heading(""), Heading(""), Heading("Search", 2), Heading("Found", 2)),
-            tuple(map(Heading, ("K", "method", "patterns", "simulator calls", "seconds", "deviation", "penalty"))),
+            (Heading(""), Heading(""), Heading(""), Heading("Search", 2), Heading("Found", 4)),
+            tuple(
+                map(
+                    Heading,
+                    (
+                        "K",
+                        "method",
+                        "patterns",
+                        "simulator calls",
+                        "seconds",
+                        "deviation",
+                        "penalty",
+                        "median",
+                        "leave the lane",
+                    ),
+                )
+            ),
         ),
         rows=tuple(rows),
         left=2,
@@ -266,6 +288,18 @@ def _row_of(means: Sequence[Mean | None]) -> list[Cell]:
         return MISSING if mean is None else Estimate(mean, best=one and mean.value == top)
 
     return list(map(cell, means))
+
+
+def _spread(values: Sequence[float]) -> str:
+    """Median and quartiles."""
+    if not values:
+        return MISSING
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
+    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _share(mean: Mean | None) -> str:
+    return MISSING if mean is None else f"{mean.value:.0%}"
 
 
 def _plain(values: Sequence[float]) -> str:

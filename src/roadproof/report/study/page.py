@@ -9,6 +9,7 @@ OUT/figures/*.png
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import roadproof
@@ -17,7 +18,7 @@ from roadproof.report.html import data_url, environment
 from roadproof.report.plots import save
 from roadproof.report.study.blocks import DEVIATION, PENALTY
 from roadproof.report.study.charts import Picture, by_figures, progress
-from roadproof.report.study.folder import Found, read_found
+from roadproof.report.study.folder import Found, read_found, reference_of
 from roadproof.report.study.layouts import GAPS, paper_tables
 from roadproof.report.study.pictures import gallery, in_weathers, trajectories
 from roadproof.report.study.results import BLACK, Method, Record, Results, results_of
@@ -44,7 +45,8 @@ def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Se
     """
     rows = list(records)
     found = read_found(folder, rows)
-    methods = {job.method.name: job.method for job in found.values()}
+    named = reference_of(folder)
+    methods = {job.method.name: replace(job.method, reference=job.method.name == named) for job in found.values()}
     results = results_of(rows, methods.values())
     drawn = (by_figures(results), progress(results, tuple(found.values())), trajectories(results, found))
     matrices = [transfer_of(transfer, metric) for metric in (DEVIATION, PENALTY)] if transfer else []

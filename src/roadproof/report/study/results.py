@@ -19,7 +19,8 @@ Record: TypeAlias = Mapping[Any, Any]
 
 BLACK = "1-b"
 _NEEDED = ("scenario", "kind", "figures", "method", "seed", "error")
-_DRIVEN = ("weather", "traffic", "deviation_m", "points", "clean_points", "search_calls", "search_seconds")
+_NUMBERS = ("deviation_m", "left_lane", "points", "clean_points")
+_DRIVEN = ("weather", "traffic", *_NUMBERS, "search_calls", "search_seconds")
 
 
 class JobId(NamedTuple):
@@ -43,12 +44,14 @@ class Method:
         search: "gradopt", or a black-box method; empty where nobody said.
         trajectories: gradopt: T.
         scheme: gradopt: "group", "group-all" or "random".
+        reference: whether the plan says that tables compare it with the others.
     """
 
     name: str
     search: str = ""
     trajectories: int = 0
     scheme: str = ""
+    reference: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,9 +64,10 @@ class Instance:
         weather: of the drives.
         traffic: whether there were others.
         deviation_m: mean deviation.
+        left_lane: share of its drives that left their lane.
         points: mean infraction penalty.
         clean_points: the same on the bare road.
-        drives: how many.
+        deviations_m: of each drive.
     """
 
     job: JobId
@@ -71,9 +75,15 @@ class Instance:
     weather: str
     traffic: bool
     deviation_m: float
+    left_lane: float
     points: float
     clean_points: float
-    drives: int
+    deviations_m: tuple[float, ...]
+
+    @property
+    def drives(self) -> int:
+        """How many."""
+        return len(self.deviations_m)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -144,6 +154,11 @@ class Results:
             if kind is None or each.kind == kind
         }
 
+    def deviations(self, method: str, figures: str, weather: str, *, traffic: bool) -> tuple[float, ...]:
+        """The deviation of every drive over a method's patterns, in metres."""
+        found = self._values.get((method, figures, weather, traffic), [])
+        return tuple(value for each in found for value in each.deviations_m)
+
     @property
     def jobs(self) -> tuple[JobId, ...]:
         """Every combination of the scenarios, K, methods and seeds that occur, done or not."""
@@ -203,7 +218,7 @@ def results_of(records: Iterable[Record], methods: Iterable[Method] = ()) -> Res
     failures: dict[JobId, str] = {}
     costs: dict[JobId, SearchCost] = {}
     kinds: dict[str, str] = {}
-    drives: dict[tuple[JobId, str, bool], list[tuple[float, float, float]]] = {}
+    drives: dict[tuple[JobId, str, bool], list[list[float]]] = {}
     for row in rows:
         job = JobId(str(row["scenario"]), str(row["figures"]), str(row["method"]), int(row["seed"]))
         kinds[job.scenario] = str(row["kind"])
@@ -211,9 +226,8 @@ def results_of(records: Iterable[Record], methods: Iterable[Method] = ()) -> Res
             failures[job] = row["error"]
             continue
         _check_columns(row, _DRIVEN)
-        numbers = [_finite(row, name, job) for name in ("deviation_m", "points", "clean_points")]
         where = (job, str(row["weather"]), bool(row["traffic"]))
-        drives.setdefault(where, []).append((numbers[0], numbers[1], numbers[2]))
+        drives.setdefault(where, []).append([_finite(row, name, job) for name in _NUMBERS])
         costs[job] = SearchCost(calls=_finite(row, "search_calls", job), seconds=_finite(row, "search_seconds", job))
     if not drives:
         job, reason = next(iter(failures.items()))
@@ -226,8 +240,8 @@ def results_of(records: Iterable[Record], methods: Iterable[Method] = ()) -> Res
             kind=kinds[job.scenario],
             weather=weather,
             traffic=traffic,
-            **dict(zip(("deviation_m", "points", "clean_points"), np.mean(trials, 0).tolist(), strict=True)),
-            drives=len(trials),
+            **dict(zip(_NUMBERS, np.mean(trials, 0).tolist(), strict=True)),
+            deviations_m=tuple(trial[0] for trial in trials),
         )
         for (job, weather, traffic), trials in drives.items()
     )

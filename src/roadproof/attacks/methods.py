@@ -1,0 +1,238 @@
+"""How a pattern is searched, as objects: GradOpt, GradOpt as published, and searches without gradients.
+
+    attack(recordings, controller, space, method=GradOpt(restarts=3), objective=PathDeviation())
+    attack(recordings, controller, space, method=CMAES(calls=1000), objective=PathDeviation())
+    attack(recordings, controller, space, method=Published(), objective=SteeringShift())
+
+A method knows what to make large only by its measure; where a pattern's value comes from is the objective's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, ClassVar, Protocol, Unpack, cast, runtime_checkable
+
+import torch
+
+from roadproof.attacks.blackbox import CMAES, TPE, BayesianOptimisation, GaussianProcess, RandomSearch, at_least_one
+from roadproof.attacks.gradopt import Ladder, Rung, Running, Search, dropping, gradopt
+from roadproof.attacks.objective import Measure, Objective, SteeringShift
+from roadproof.attacks.published import MASKS, PublishedMeasure
+from roadproof.controllers import Controller
+from roadproof.errors import RoadproofError
+from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import SearchSpace
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A way to search the pattern of largest value."""
+
+    word: ClassVar[str]
+
+    def steps(self, objective: Objective) -> int:
+        """How often `on_step` is called."""
+        ...
+
+    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+        """Drives attacked together, where nothing else is said."""
+        ...
+
+    def measure(
+        self,
+        objective: Objective,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        device: torch.device | str,
+    ) -> Measure:
+        """What it climbs of an objective.
+
+        Raises:
+            RoadproofError: it does not climb that objective.
+        """
+        ...
+
+    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+        """Make an objective's measure large for all of its groups."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GradOpt:
+    """Exact gradients, and starts that compete (successive halving) before the best of them are searched to the end.
+
+    Args:
+        iterations: steps of the search proper; 100 for a steering shift and 32 for a path deviation by default.
+        restarts: starts of every group that are searched to the end.
+        halving: whether many starts compete for those places; else they are random.
+
+    Raises:
+        RoadproofError: a number is below 1.
+    """
+
+    word: ClassVar[str] = "gradopt"
+    iterations: int | None = None
+    restarts: int = 4
+    halving: bool = True
+
+    def __post_init__(self) -> None:
+        at_least_one(self, "iterations", "restarts")
+        most = min(rung.starts for rung in (*SHIFT_RUNGS, *PATH_RUNGS))
+        if self.halving and self.restarts > most:
+            raise RoadproofError(
+                f"restarts is {self.restarts}, expected 1 to {most} places to compete for; or no halving"
+            )
+
+    def ladder(self, objective: Objective) -> Ladder:
+        """Its rungs for an objective.
+
+        A search in the recorded world takes smaller steps, since a loop amplifies. It begins where the steering shift
+        is large: a controller that holds its lane well brings the car back from what a random pattern does, and the
+        path has hardly a gradient there, while what also turns the wheel where a car is aside takes it further
+        (measured). Random patterns join them, for controllers that need no such help.
+        """
+        shift = isinstance(objective, SteeringShift)
+        rate, usual, first = (0.1, 100, SHIFT_RUNGS) if shift else (0.05, 32, PATH_RUNGS)
+        proper = dropping(self.restarts, self.iterations or usual, rate, after=(0.5, 0.8), factor=0.3)
+        return (*first, *proper) if self.halving else proper
+
+    def steps(self, objective: Objective) -> int:
+        """Iterations of all rungs."""
+        return sum(rung.iterations for rung in self.ladder(objective))
+
+    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+        """The paper's two groups: the drives of each side apart."""
+        del recordings
+        return (RIGHT_GROUP, LEFT_GROUP)
+
+    def measure(
+        self,
+        objective: Objective,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        device: torch.device | str,
+    ) -> Measure:
+        """The objective's own."""
+        return objective.measure(recordings, controller, groups, device=device)
+
+    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+        """Climb its ladder."""
+        return gradopt(measure, space, self.ladder(objective), **running)
+
+
+SHIFT_RUNGS = (Rung(24, 30, every=4), Rung(8, 30, every=2))
+PATH_RUNGS = (Rung(16, 12, every=8, open_loop=True), Rung(24, 4, every=6), Rung(6, 10, every=4))
+"""On which starts compete before a search of the steering shift, and of the path; most for their cost (measured)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _OnGrid(Rung):
+    """Steps with gradients linearised on a grid of px and degrees."""
+
+    grid: float = 1.0
+
+    def view(self, measure: Measure) -> Measure:
+        """The published measure on that grid."""
+        return cast("PublishedMeasure", measure).on_grid(self.grid)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Published:
+    """GradOpt as its authors published it: to compare with, not to use.
+
+    Locally linearised gradients, Adam without momentum, random starts of 250 iterations each with rates of 0.1, 0.01
+    and 0.001, each rate beginning at the best point so far; differences of steering summed over frames. A grid of 10 px
+    or degrees at the first rate and of 1 after it, as the released code was run.
+
+    Args:
+        masks: "binary", those of the released code; "antialiased", those of the paper's text.
+        restarts: of every group; the paper's text has four, its code one.
+
+    Raises:
+        RoadproofError: a value makes no sense.
+
+    References:
+        "Attack Optimization" of the paper; run.sh of the released code. There TensorFlow's Adam corrects its bias
+        twice an iteration, which makes early steps up to 1.4 times larger; that is not done here.
+    """
+
+    word: ClassVar[str] = "published"
+    masks: str = "binary"
+    restarts: int = 4
+
+    def __post_init__(self) -> None:
+        at_least_one(self, "restarts")
+        if self.masks not in MASKS:
+            raise RoadproofError(f"masks is {self.masks!r}, expected {' or '.join(MASKS)}")
+
+    def steps(self, objective: Objective) -> int:
+        """250."""
+        del objective
+        return sum(rung.iterations for rung in self.ladder)
+
+    @property
+    def ladder(self) -> Ladder:
+        """Its three rates."""
+        stages = ((100, 0.1, 10.0), (100, 0.01, 1.0), (50, 0.001, 1.0))
+        return tuple(_OnGrid(self.restarts, count, rate, grid=grid) for count, rate, grid in stages)
+
+    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+        """The paper's two groups: the drives of each side apart."""
+        del recordings
+        return (RIGHT_GROUP, LEFT_GROUP)
+
+    def measure(
+        self,
+        objective: Objective,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        device: torch.device | str,
+    ) -> PublishedMeasure:
+        """The published divergence.
+
+        Raises:
+            RoadproofError: another objective is asked for.
+        """
+        if not isinstance(objective, SteeringShift):
+            raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
+        return PublishedMeasure(recordings, controller, groups, masks=self.masks, device=device)
+
+    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+        """Climb as published."""
+        del objective
+        return gradopt(measure, space, self.ladder, momentum=0.0, **running)
+
+
+METHODS: dict[str, type[Any]] = {
+    kind.word: kind for kind in (GradOpt, Published, RandomSearch, TPE, GaussianProcess, CMAES, BayesianOptimisation)
+}
+"""Every method by its word."""
+
+
+def method_of(word: str, **given: object) -> Method:
+    """A method from its word and values of its fields.
+
+    Raises:
+        RoadproofError: there is none of that word, it has no such field, or a value makes no sense.
+    """
+    if word not in METHODS:
+        raise RoadproofError(f"method is {word!r}, expected one of {', '.join(METHODS)}")
+    kind = METHODS[word]
+    known = [field.name for field in fields(kind)]
+    for name in given:
+        if name not in known:
+            raise RoadproofError(f"method {word} has no {name}; it has {', '.join(known)}")
+    return kind(**given)
+
+
+def stored(method: Method) -> dict[str, Any]:
+    """A method as its word and fields, for files."""
+    return {"method": method.word, **asdict(cast("Any", method))}

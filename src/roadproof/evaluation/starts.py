@@ -1,0 +1,76 @@
+"""Where drives begin that judge a pattern: not where it was chosen, but aside, turned and faster, by a drawn amount."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from roadproof.errors import EpisodeError
+from roadproof.scenarios import Scenario
+
+MOST = {"right_m": 1.0, "turned_rad": 0.3, "faster_mps": 5.0}
+"""Further aside or more turned a car stands over its lane's edge or looks off the road."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StartOffset:
+    """How a drive's start differs from its scenario's.
+
+    Args:
+        right_m: to the right.
+        turned_rad: heading, left positive.
+        faster_mps: speed; nobody drives backwards.
+    """
+
+    right_m: float = 0.0
+    turned_rad: float = 0.0
+    faster_mps: float = 0.0
+
+    def of(self, scenario: Scenario) -> Scenario:
+        """The scenario that begins so."""
+        start = scenario.start
+        moved = replace(
+            start,
+            x_m=start.x_m + math.sin(start.yaw_rad) * self.right_m,
+            y_m=start.y_m - math.cos(start.yaw_rad) * self.right_m,
+            yaw_rad=start.yaw_rad + self.turned_rad,
+            speed_mps=max(0.0, start.speed_mps + self.faster_mps),
+        )
+        return replace(scenario, start=moved)
+
+
+NOMINAL = StartOffset()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StartRange:
+    """What starts are drawn from, uniformly.
+
+    Args:
+        right_m: at most so far to either side.
+        turned_rad: at most so much to either side.
+        faster_mps: up to so much faster: scenarios may begin from a stand.
+
+    Raises:
+        EpisodeError: a number is below 0, or so large that a car would not stand on its lane.
+    """
+
+    right_m: float = 0.3
+    turned_rad: float = 0.05
+    faster_mps: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name, most in MOST.items():
+            if not 0.0 <= (value := getattr(self, name)) <= most:
+                raise EpisodeError(f"{name} of the starts is {value}, expected 0 to {most:g}")
+
+    def draw(self, count: int, seed: int) -> tuple[StartOffset, ...]:
+        """So many starts; the same for the same seed."""
+        low, high = np.array([-self.right_m, -self.turned_rad, 0.0]), np.array(list(asdict(self).values()))
+        drawn = np.random.default_rng((seed, 0x57A27)).uniform(low, high, (count, 3)).round(4)
+        return tuple(StartOffset(right_m=r, turned_rad=t, faster_mps=f) for r, t, f in drawn.tolist())
+
+
+USUAL_STARTS = StartRange()
