@@ -17,7 +17,7 @@ def card(**stated):
     "written",
     [
         ControllerCard(),
-        ControllerCard(architecture="cil", width=0.5),
+        ControllerCard(architecture="cil", width=0.5, origin="a checkpoint"),
         ControllerCard(architecture="pilotnet", activation="relu", target_speed_mps=8.0, preparation=PILOTNET_ON_CARLA),
     ],
 )

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from roadproof.errors import RoadproofError
-from roadproof.io.arrays import packed, read_archive, read_array, read_record, write_archive
+from roadproof.io.arrays import archive_names, packed, read_archive, read_array, read_record, write_archive
 
 NUMBERS = {"x": np.arange(12.0).reshape(3, 4), "n": np.array([1, 2], np.int8), "f": np.asfortranarray(np.eye(3))}
 
@@ -59,6 +59,16 @@ def test_arrays_and_header_come_back_as_they_were(tmp_path: Path) -> None:
     arrays["x"][0, 0] = 5.0  # what is read can be written to, as numpy's own
     with np.load(path, allow_pickle=False) as stored:
         np.testing.assert_array_equal(stored["x"], NUMBERS["x"])
+
+
+def test_names_are_told_without_reading_arrays(tmp_path: Path) -> None:
+    """Those with slashes too; what is no array is left out."""
+    path = tmp_path / "a.npz"
+    path.write_bytes(archive({"x.npy": b"no array", "a/b.npy": b"", "a/notes.txt": b""}))
+    assert archive_names(path, RoadproofError, "again") == {"x", "a/b"}
+    path.write_bytes(bomb())
+    with pytest.raises(RoadproofError, match=r"it unpacks to .*; again"):
+        archive_names(path, RoadproofError, "again")
 
 
 def test_same_arrays_same_bytes() -> None:

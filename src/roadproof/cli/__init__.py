@@ -17,6 +17,7 @@ from roadproof.cli.calibrate import calibrate
 from roadproof.cli.carla import carla
 from roadproof.cli.check_controller import check_controller
 from roadproof.cli.controllers import controllers
+from roadproof.cli.convert_cil import convert_cil
 from roadproof.cli.demo import demo
 from roadproof.cli.drive import drive
 from roadproof.cli.evaluate import evaluate
@@ -47,6 +48,7 @@ VERBS = (
     scenarios,
     controllers,
     check_controller,
+    convert_cil,
     train,
 )
 for verb in VERBS:

@@ -15,6 +15,7 @@ from roadproof.controllers.pilotnet import PilotNet as PilotNet
 from roadproof.controllers.pilotnet import pilotnet_controller as pilotnet_controller
 from roadproof.controllers.protocol import Controller as Controller
 from roadproof.controllers.protocol import PedalController as PedalController
+from roadproof.controllers.published import convert_cil as convert_cil
 from roadproof.controllers.shipped import ModelCard as ModelCard
 from roadproof.controllers.shipped import model_card as model_card
 from roadproof.controllers.shipped import shipped_names as shipped_names

@@ -39,6 +39,7 @@ class ControllerCard:
         activation: PilotNet's, "elu" or "relu".
         target_speed_mps: speed held when a network that only steers drives.
         preparation: how frames become the network's input, or None for the architecture's own.
+        origin: what the weights were made from, in words, or None where that is not said.
     """
 
     architecture: str | None = None
@@ -46,6 +47,7 @@ class ControllerCard:
     activation: str = "elu"
     target_speed_mps: float = 6.0
     preparation: FramePreparation | None = None
+    origin: str | None = None
 
     def to_json(self) -> str:
         """The card as text, with its format version."""
@@ -74,7 +76,7 @@ def read_card(text: str, source: str) -> ControllerCard:
         raise ControllerError(f"card {source} has version {version!r}, this roadproof reads version {CARD_VERSION}")
     _known(stated, ControllerCard, source)
     values: dict[str, Any] = {
-        name: _text(stated, name, source) for name in ("architecture", "activation") if name in stated
+        name: _text(stated, name, source) for name in ("architecture", "activation", "origin") if name in stated
     }
     values |= {name: _number(stated[name], name, source) for name in ("width", "target_speed_mps") if name in stated}
     if "preparation" in stated:

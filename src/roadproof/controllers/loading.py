@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -100,7 +101,11 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
 
 
 def save_controller(
-    controller: CIL | ConditionalPilotNet | SteeringController, path: Path, *, dtype: str = "float32"
+    controller: CIL | ConditionalPilotNet | SteeringController,
+    path: Path,
+    *,
+    dtype: str = "float32",
+    origin: str | None = None,
 ) -> None:
     """Write a CIL or PilotNet controller as safetensors, its card in the header.
 
@@ -108,6 +113,7 @@ def save_controller(
         controller: as it was trained.
         path: the file.
         dtype: what its numbers are kept in, "float16" or "float32"; half the bytes cost steering of about 0.001.
+        origin: what the weights were made from, for the card.
 
     Raises:
         ControllerError: another network, or a folded one: save it as it was trained.
@@ -131,7 +137,7 @@ def save_controller(
         raise ControllerError(f"cannot save a {type(network).__name__}, expected CIL or PilotNet; export it instead")
     kept = torch.float16 if dtype == "float16" else torch.float32
     tensors = {name: tensor.detach().cpu().to(kept).contiguous() for name, tensor in network.state_dict().items()}
-    write_tensors(path, tensors, {_METADATA_KEY: card.to_json()})
+    write_tensors(path, tensors, {_METADATA_KEY: replace(card, origin=origin).to_json()})
 
 
 def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:

@@ -13,7 +13,8 @@ import os
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -128,6 +129,21 @@ def read_record(
     return told, arrays
 
 
+def archive_names(path: Path, error: type[RoadproofError], remedy: str) -> frozenset[str]:
+    """Names of the arrays that an archive holds; the arrays themselves are not read.
+
+    Args:
+        path: of the archive.
+        error: what to raise.
+        remedy: what the user can do where it is missing or damaged.
+
+    Raises:
+        error: it is missing, no archive, or packed in a way that roadproof never writes.
+    """
+    with _opened(path, error, remedy, MOST_BYTES) as archive:
+        return frozenset(name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy"))
+
+
 def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarray:
     """The numbers of a .npy file.
 
@@ -146,11 +162,20 @@ def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarr
 def _read(
     path: Path, names: tuple[str, ...], header: str | None, error: type[RoadproofError], remedy: str, most_bytes: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    with _opened(path, error, remedy, most_bytes) as archive:
+        told = {} if header is None else _header(_member(archive, header, "U"))
+        return told, {name: _member(archive, name, _KINDS) for name in names}
+
+
+@contextmanager
+def _opened(
+    path: Path, error: type[RoadproofError], remedy: str, most_bytes: int
+) -> Generator[zipfile.ZipFile, None, None]:
+    """An archive to read from; whatever is wrong with it, there or while it is read, is an `error`."""
     try:
         with zipfile.ZipFile(path) as archive:
             _check(archive, most_bytes)
-            told = {} if header is None else _header(_member(archive, header, "U"))
-            return told, {name: _member(archive, name, _KINDS) for name in names}
+            yield archive
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None
     except _DAMAGE as reason:
