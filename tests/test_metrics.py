@@ -143,6 +143,35 @@ def test_leaving_the_road_over_the_sidewalk_is_one_fault():
     assert metrics.infraction_points([event("wrong-lane", 2.9), *way]) == 4.0
 
 
+def test_two_lights_count_twice_however_near_and_one_light_again_only_after_a_while():
+    near = [
+        event("red-light", 3.0, "traffic light at (1.0, 2.0)"),
+        event("red-light", 4.0, "traffic light at (9.0, 2.0)"),
+    ]
+    assert metrics.infraction_points(near) == 6.0
+    told_every_step = [event("red-light", 0.05 * k, "traffic light at (1.0, 2.0)") for k in range(60)]
+    assert metrics.infraction_points(told_every_step) == 3.0
+    assert metrics.infraction_points([*told_every_step, event("red-light", 9.0, "traffic light at (1.0, 2.0)")]) == 6.0
+    assert metrics.infraction_points([event("stop-sign", 1.0, "a"), event("stop-sign", 1.5, "b")]) == 4.0
+
+
+EVENTS = st.lists(
+    st.builds(
+        Event, st.sampled_from(EventKind), st.integers(0, 400).map(lambda k: 0.05 * k), st.sampled_from(["", "a", "b"])
+    )
+).map(lambda events: sorted(events, key=lambda one: one.time_s))
+
+
+@settings(derandomize=True, deadline=None)
+@given(EVENTS)
+def test_what_was_counted_can_be_counted_again(events):
+    kept = metrics.counted(events)
+    assert metrics.counted(kept) == kept
+    assert metrics.infraction_points(kept) == metrics.infraction_points(events)
+    assert metrics.leaderboard_factor(kept) == metrics.leaderboard_factor(events)
+    assert metrics.first_event_s(kept) == metrics.first_event_s(events)
+
+
 @pytest.mark.parametrize(
     ("freedom", "textbook"), [(1, 12.7062), (2, 4.30265), (4, 2.77645), (9, 2.26216), (30, 2.04227)]
 )

@@ -51,6 +51,7 @@ LEADERBOARD_FACTORS = {
 }
 
 _COLLISIONS = (EventKind.COLLISION_STATIC, EventKind.COLLISION_VEHICLE, EventKind.COLLISION_PEDESTRIAN)
+_SIGNALS = (EventKind.RED_LIGHT, EventKind.STOP_SIGN)
 _LEFT_THE_ROAD = (EventKind.SIDEWALK, EventKind.OFF_ROAD)
 
 
@@ -137,9 +138,10 @@ def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[n
 def counted(events: Sequence[Event]) -> tuple[Event, ...]:
     """The events that count: every fault once.
 
-    A thing that is named is hit once a drive, however often it is touched. A nameless contact, or being in the wrong
-    lane, counts again only when the last of its kind is more than `RECOUNT_S` ago. Sidewalk and off road are one
-    fault, having left the road, and whichever comes first counts.
+    A thing that is named is hit once a drive, however often it is touched. A nameless contact, being in the wrong
+    lane, or the same red light or stop sign counts again only when the last one is more than `RECOUNT_S` ago. Sidewalk
+    and off road are one fault, having left the road, and whichever comes first counts. Counting what was counted
+    changes nothing.
 
     Args:
         events: of one drive, in order.
@@ -148,7 +150,10 @@ def counted(events: Sequence[Event]) -> tuple[Event, ...]:
     last_s: dict[tuple[str, ...], float] = {}
     for event in events:
         named = event.kind in _COLLISIONS and event.detail
-        key = (event.kind, event.detail) if named else ("off",) if event.kind in _LEFT_THE_ROAD else (event.kind,)
+        if named or event.kind in _SIGNALS:
+            key = (event.kind, event.detail)
+        else:
+            key = ("off",) if event.kind in _LEFT_THE_ROAD else (event.kind,)
         before_s = last_s.get(key, -math.inf)
         last_s[key] = event.time_s
         if before_s == -math.inf or (not named and event.time_s - before_s > RECOUNT_S):

@@ -74,13 +74,19 @@ def slides():
 
 
 def test_a_slide_along_a_rail_costs_six_points_however_many_pieces_it_has(slides):
-    before, after = (
-        [event for event in counted(drive.events) if event.kind is EventKind.COLLISION_STATIC] for drive in slides
-    )
-    assert len({event.detail for event in before if event.detail.startswith("guard rail")}) > 1
-    assert [event.detail.rsplit(" ", 1)[0] for event in after] == ["guard rail"]
-    assert infraction_points(before) >= 12.0
-    assert infraction_points(after) == 6.0
+    before, after = (counted(drive.events) for drive in slides)
+    pieces, rail = ([event for event in each if event.kind is EventKind.COLLISION_STATIC] for each in (before, after))
+    assert len({event.detail for event in pieces if event.detail.startswith("guard rail")}) > 1
+    assert infraction_points(pieces) >= 12.0
+    assert infraction_points(rail) == 6.0
+    # The whole drive: over the other lane and the sidewalk into the rail. Being on the lawn afterwards is no new fault.
+    assert [(event.kind, event.detail.rsplit(" ", 1)[0]) for event in after] == [
+        (EventKind.WRONG_LANE, "1.8 m beside its lane on road"),
+        (EventKind.SIDEWALK, "a wheel on the"),
+        (EventKind.COLLISION_STATIC, "guard rail"),
+    ]
+    assert infraction_points(slides[1].events) == 2.0 + 2.0 + 6.0
+    assert infraction_points(slides[0].events) == 2.0 + 2.0 + 6.0 * len(pieces)
 
 
 def test_a_drive_that_ends_beside_the_route_says_so(slides):

@@ -53,6 +53,31 @@ def spawn_driven(session: Session, start: VehicleState) -> carla.Vehicle:
     return car
 
 
+def place_driven(session: Session, car: carla.Actor, start: VehicleState, back_m: float) -> None:
+    """Put the car, once it has settled, where a drive starts, at the height where it settled.
+
+    Args:
+        session: the connection.
+        car: that is driven.
+        start: place, direction and speed.
+        back_m: how far behind that place it is put.
+
+    Raises:
+        SimulatorError: the server refuses or does not answer.
+    """
+    settled = session.ask("where the car is", session.world.get_snapshot).find(car.id).get_transform()
+    forward = carla_transform(0.0, 0.0, 0.0, start.yaw_rad).get_forward_vector()
+    place = carla_transform(start.x_m, start.y_m, settled.location.z, start.yaw_rad)
+    place.location -= forward * back_m
+    session.batch(
+        "the start",
+        [
+            carla.command.ApplyTransform(car.id, place),
+            carla.command.ApplyTargetVelocity(car.id, forward * start.speed_mps),
+        ],
+    )
+
+
 class Crowd:
     """The town's traffic on a CARLA server: its cars and people are put where the town's traffic says, every step.
 

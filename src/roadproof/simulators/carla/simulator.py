@@ -13,23 +13,17 @@ import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import RoadproofError, SimulatorError
-from roadproof.geometry import (
-    CIL_CAMERA,
-    CIL_INPUT,
-    CameraModel,
-    CanvasPlacement,
-    CropResize,
-    Homography,
-)
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, Homography
 from roadproof.scenarios import Scenario
 from roadproof.simulators.arguments import check_crop, check_pattern
-from roadproof.simulators.carla.actors import Crowd, carla_transform, spawn_driven, vehicle_state
+from roadproof.simulators.carla.actors import Crowd, place_driven, spawn_driven, vehicle_state
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.collisions import Collisions
 from roadproof.simulators.carla.inject import Paint, Scene
 from roadproof.simulators.carla.native import Ground, SeveralPiecesError, find_ground, lay
 from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch
 from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.carla.signals import Signals
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import set_weather
@@ -61,6 +55,7 @@ class _Drive:
     crowd: Crowd | None
     cameras: dict[str, Camera]
     collisions: Collisions
+    signals: Signals
     paint: Paint | None
     full_pictures: Pictures
     state: VehicleState
@@ -292,6 +287,8 @@ class CarlaSimulator:
         set_weather(session, weather)
         ego = spawn_driven(session, scenario.start)
         crowd = None if traffic is None else Crowd(session, traffic)
+        # Lights would go on from where the last drive left them; each drive has to find them alike.
+        session.ask("its traffic lights anew", session.world.reset_all_traffic_lights)
         for _ in range(SETTLE_TICKS):
             self._order(session, ego, STOP)
             session.tick()
@@ -310,6 +307,7 @@ class CarlaSimulator:
             crowd=crowd,
             cameras=cameras,
             collisions=collisions,
+            signals=Signals(session, roads),
             paint=paint,
             full_pictures=full_pictures,
             state=scenario.start,
@@ -359,19 +357,9 @@ class CarlaSimulator:
 
     def _start(self, session: Session, drive: _Drive) -> int:
         """Put the settled car where the drive starts, as fast as it starts; the frame that shows it."""
-        start, dt = drive.scenario.start, self._dt_s
-        settled = session.ask("where the car is", session.world.get_snapshot).find(drive.ego.id).get_transform()
-        forward = carla_transform(0.0, 0.0, 0.0, start.yaw_rad).get_forward_vector()
+        start = drive.scenario.start
         # One tick is taken before the first picture.
-        place = carla_transform(start.x_m, start.y_m, settled.location.z, start.yaw_rad)
-        place.location -= forward * (start.speed_mps * dt)
-        session.batch(
-            "the start",
-            [
-                carla.command.ApplyTransform(drive.ego.id, place),
-                carla.command.ApplyTargetVelocity(drive.ego.id, forward * start.speed_mps),
-            ],
-        )
+        place_driven(session, drive.ego, start, start.speed_mps * self._dt_s)
         self._order(session, drive.ego, STOP if start.speed_mps == 0.0 else Control(0.0), drive.crowd)
         return session.tick()
 
@@ -396,6 +384,7 @@ class CarlaSimulator:
         drive.arclength_m = place.arclength_m
         people = np.column_stack([self.pedestrians.x_m, self.pedestrians.y_m])
         events = drive.judge.watch(state, time_s, drive.collisions.contacts(drive.crowd), people)
+        events += drive.signals.watch(state, time_s)
         ending = drive.endings.watch(state, place, time_s, events)
         return Observation(
             frame=self._input(picture),
