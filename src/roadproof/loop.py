@@ -34,6 +34,7 @@ from roadproof.attacks import (
 )
 from roadproof.calibration import Calibrated, Method, calibrate, replays_needed
 from roadproof.controllers import Controller
+from roadproof.controllers.checks import require_usable
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, Scheme, SteeringNoise, Swerve, Trajectories, Window, record
 from roadproof.errors import RoadproofError
@@ -233,6 +234,7 @@ def stress_test(
     Raises:
         RoadproofError: the folder holds a run of something else, another process works in it, or a stage refuses; the
             message says why.
+        ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     if processes < 1 or (processes > 1 and another is None):
         raise RoadproofError(
@@ -250,6 +252,8 @@ def stress_test(
         device=device,
         on_progress=on_progress,
     )
+    view = simulator.input
+    require_usable(controller, size=(view.height_px, view.width_px), device=device)
     with working_in(folder):
         return _stages(run, another if another and processes > 1 else simulator, processes)
 

@@ -72,6 +72,7 @@ def attack(
     from roadproof.attacks import attack as run
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
+    from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
     from roadproof.io.locks import hold
@@ -102,6 +103,7 @@ def attack(
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
     chosen = parse_groups(groups, drives)
+    require_usable(attacked, size=(drives.view.height_px, drives.view.width_px), device=device, drives=False)
     checkpoint = out / "search.safetensors"
     with progress("Searching", steps.steps) as on_step:
         result = run(
