@@ -1,8 +1,8 @@
 """Calls into code that is not ours: a user's module, factory, controller.
 
-Whatever it raises becomes one line with the user's file and line. A thread beside says when a call has not come back for
-`NOTICE_S`. The command line also ends such a call, after `LIMIT_S`: by the exception of Ctrl-C where that reaches it,
-else with the process. In Python nothing is ended: the process is its author's, and may stand in a debugger.
+Whatever it raises becomes one line with the user's file and line. A thread beside says when a call has not come back
+for `NOTICE_S`. The command line also ends such a call, after `LIMIT_S`: by the exception of Ctrl-C where that reaches
+it, else with the process. In Python nothing is ended: the process is its author's, and may stand in a debugger.
 """
 
 from __future__ import annotations

@@ -53,6 +53,7 @@ from roadproof.io.locks import working_in
 from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.patterns import Pattern, save_pattern
+from roadproof.processes import require_picklable
 from roadproof.recordings import Push, RecordingSet, pooled
 from roadproof.rounds import Rounds, search_on
 from roadproof.scenarios import Scenario
@@ -253,6 +254,8 @@ def stress_test(
         on_progress=on_progress,
     )
     view = simulator.input
+    if processes > 1:
+        require_picklable(controller)
     require_usable(controller, size=(view.height_px, view.width_px), device=device)
     with working_in(folder):
         return _stages(run, another if another and processes > 1 else simulator, processes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import sys
 import threading
 from collections.abc import Callable
@@ -11,6 +12,10 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from roadproof import foreign
+from roadproof.errors import ControllerError
+
+DIED = "a driving process died; is there memory for all of them? try with fewer processes"
+"""What is said of one that did not even raise an exception."""
 
 
 def processes_beside(count: int, begin: Callable[..., object] | None = None, *arguments: object) -> ProcessPoolExecutor:
@@ -29,6 +34,21 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
     return ProcessPoolExecutor(
         count, mp_context=context, initializer=_begin, initargs=(foreign.limit_s(), begin, arguments)
     )
+
+
+def require_picklable(driver: object) -> None:
+    """Refuse a controller, or another driver, that cannot travel to processes beside this one.
+
+    Raises:
+        ControllerError: pickling it raises; the message says why and what to do.
+    """
+    try:
+        foreign.call("pickling the controller", pickle.dumps, driver)
+    except ControllerError as error:
+        raise ControllerError(
+            f"{error}; several processes need a controller that can be pickled: define its class in a module, or "
+            "use one process"
+        ) from error.__cause__
 
 
 def _begin(limit_s: float, begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:

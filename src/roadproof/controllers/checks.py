@@ -121,15 +121,19 @@ def require_usable(controller: Controller, *, size: tuple[int, int], device: str
 
     Args:
         controller: is asked about two made-up frames, and for their gradient.
-        size: (height, width) of the frames for a controller that takes any.
+        size: (height, width) of the frames that it will be given.
         device: where the controller computes.
         drives: whether it will also be asked to act.
 
     Raises:
-        ControllerError: it raises, answers wrongly, or gives no finite gradient.
+        ControllerError: it takes frames of another size, raises, answers wrongly, or gives no finite gradient.
     """
-    made_up = _made_up_drive(frame_size_of(controller) or size, device, seed=0)
-    few = _Drive(*(values[:2] for values in made_up))
+    if (own := frame_size_of(controller)) not in (None, size):
+        raise ControllerError(
+            f"the controller takes frames of {own[1]}×{own[0]}, here they have {size[1]}×{size[0]} (width×height); "
+            "use a controller for these, or record for this one"
+        )
+    few = _Drive(*(values[:2] for values in _made_up_drive(size, device, seed=0)))
     leaf = few.frames.clone().requires_grad_()
     gradient = _gradient_of(steer_of(controller, leaf, few.speed_mps, few.command), leaf)
     if not bool(gradient.isfinite().all()):
