@@ -1,5 +1,7 @@
 """Controllers that do everything wrong that a stranger's may."""
 
+import multiprocessing
+import os
 import sys
 import time
 from types import SimpleNamespace
@@ -168,6 +170,23 @@ class Hanging(Honest):
 
 class Deaf(Hanging):
     deaf = True
+
+
+class FailingInWorkers(Honest):
+    """Acts well in the first process, where drives are named by what it answers."""
+
+    def act(self, frame, speed_mps, command):
+        if multiprocessing.parent_process() is not None:
+            self.fail()
+        return Honest.act(self, frame, speed_mps, command)
+
+    def fail(self):
+        return 1 / 0
+
+
+class DyingInWorkers(FailingInWorkers):
+    def fail(self):
+        os._exit(3)
 
 
 # For the command line: bad_drivers:steers.column and so on.

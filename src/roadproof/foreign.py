@@ -56,7 +56,7 @@ class _Call:
     thread: int = field(default_factory=threading.get_ident)
     since_s: float = field(default_factory=time.monotonic)
     notice_s: float = field(default_factory=lambda: NOTICE_S)
-    interrupted: bool = False
+    interrupted_s: float = math.inf
 
 
 _calls: dict[int, _Call] = {}
@@ -88,20 +88,19 @@ def call(what: str, function: Callable[Arguments, Answer], *args: Arguments.args
             raise
         raise ControllerError(f"{what} failed at {place}: {error}") from error
     except KeyboardInterrupt:
-        if this.interrupted:
+        if math.isfinite(this.interrupted_s):
             raise ControllerError(
                 f"{what} has not answered for {_limit_s:g} s and was ended; look for what it waits for"
             ) from None
         raise
     except (Exception, SystemExit) as error:
-        raise ControllerError(f"{what} raised {in_one_line(error)}") from error
+        raise ControllerError(f"{what} raised {in_one_line(error, place_of(error))}") from error
     finally:
         del _calls[id(this)]
 
 
-def in_one_line(error: BaseException) -> str:
-    """The type of an exception, the user's line that led to it, and its message."""
-    place = place_of(error)
+def in_one_line(error: BaseException, place: str | None = None) -> str:
+    """The type of an exception, the line that led to it where that is given, and its message."""
     try:
         message = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
     except Exception:  # a message is computed by its author's code
@@ -111,7 +110,7 @@ def in_one_line(error: BaseException) -> str:
 
 
 def place_of(error: BaseException) -> str | None:
-    """File and line of the last frame that is the user's own, as FILE:LINE; None where none is."""
+    """The user's line that led to an exception, as FILE:LINE; None where none did."""
     frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
     if isinstance(error, SyntaxError) and error.filename:
         frames.append((error.filename, error.lineno or 0))
@@ -174,11 +173,11 @@ def _judge(this: _Call, waited_s: float) -> None:
         ended = f"; it is ended after {_limit_s:g} s" if math.isfinite(_limit_s) else ""
         _log.warning("%s has not answered for %.0f s%s%s", this.what, waited_s, _where(this), ended)
         this.notice_s = 2 * waited_s
-    if waited_s >= _limit_s and not this.interrupted:
-        this.interrupted = True
+    if waited_s >= _limit_s and this.interrupted_s == math.inf:
+        this.interrupted_s = waited_s
         if this.thread == threading.main_thread().ident:
             _thread.interrupt_main()
-    if waited_s >= _limit_s + GRACE_S:
+    if waited_s >= this.interrupted_s + GRACE_S:
         _log.error("roadproof: %s has not answered for %.0f s%s; ended", this.what, waited_s, _where(this))
         os._exit(2)
 

@@ -17,7 +17,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -105,11 +105,16 @@ class TorchProgram(nn.Module):
             ControllerError: it cannot be computed, most often for inputs of other shapes than it was exported for.
         """
         try:
-            answer: Tensor | tuple[Tensor, ...] = self.program(*inputs)
+            answer: Any = self.program(*inputs)
         except (RuntimeError, ValueError, IndexError, KeyError, TypeError, AssertionError) as error:
             shapes = ", ".join(str(tuple(x.shape)) for x in inputs)
             raise ControllerError(f"{self.path} cannot take shapes {shapes}: {in_one_line(error)}") from error
-        return answer[0] if isinstance(answer, tuple) and len(answer) == 1 else cast("Tensor", answer)
+        if isinstance(answer, tuple) and len(cast("tuple[object, ...]", answer)) == 1:
+            answer = cast("tuple[object, ...]", answer)[0]
+        if not isinstance(answer, Tensor):
+            kind = type(cast("object", answer)).__name__
+            raise ControllerError(f"{self.path} answers with a {kind}, expected one output: the steering")
+        return answer
 
     def train(self, mode: bool = True) -> TorchProgram:  # noqa: ARG002
         """Nothing: an exported program stays as it was exported."""
