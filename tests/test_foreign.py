@@ -21,6 +21,9 @@ def hasty(monkeypatch):
     """Everything happens within a second or two."""
     monkeypatch.setattr(foreign, "NOTICE_S", 0.1)
     monkeypatch.setattr(foreign, "_LOOK_S", 0.05)
+    # The process is that of the tests, and is not to end.
+    monkeypatch.setattr(foreign, "GRACE_S", math.inf)
+    foreign.end_calls_after(math.inf)
     yield foreign.end_calls_after
     foreign.end_calls_after(math.inf)
 
@@ -121,15 +124,16 @@ def test_what_is_deaf_to_ctrl_c_ends_with_its_process(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_a_worker_ends_by_the_limit_of_the_process_that_began_it(tmp_path):
+def test_a_worker_that_hangs_ends(tmp_path):
     done = child(tmp_path, "processes_beside(1).submit(hang).result()")
     assert "roadproof: the driver has not answered for " in done.stderr
     assert "BrokenProcessPool" in done.stderr
 
 
-def test_a_library_sets_no_limit_for_its_workers():
+def test_workers_have_the_limit_of_the_process_that_began_them(hasty):
+    hasty(123.0)
     with processes_beside(1) as pool:
-        assert pool.submit(foreign.limit_s).result() == math.inf
+        assert pool.submit(foreign.limit_s).result() == 123.0
 
 
 def test_what_is_in_the_current_directory_travels_to_workers(tmp_path, monkeypatch):

@@ -137,6 +137,18 @@ def test_what_drives_alone_is_not_asked_to_act_by_a_search():
     )
 
 
+def test_a_gradient_that_reaches_weights_alone_is_refused():
+    class Trained(bad_drivers.Honest):
+        weight = torch.ones((), requires_grad=True)
+
+        def steer(self, frames, speed_mps, command):
+            return self.weight * super().steer(frames.detach(), speed_mps, command)
+
+    said = "no gradient of the controller's steer reaches the frames; compute it in torch"
+    refused(said, lambda: require_usable(Trained(), size=(88, 200)))
+    assert "gradients" in [check.name for check in check_controller(Trained()).failures]
+
+
 def test_answers_and_gradients_are_those_of_the_controller_itself():
     controller = pilotnet_controller(seed=1).eval()
     frames, speed, command = batch()

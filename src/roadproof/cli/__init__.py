@@ -73,7 +73,8 @@ def _root(  # pyright: ignore[reportUnusedFunction]
         bool | None, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = None,
     debug: Annotated[
-        bool, typer.Option(help="Show the traceback of what goes wrong, and wait for controllers without end.")
+        bool,
+        typer.Option("--debug", help="Show the traceback of what goes wrong, and wait for controllers without end."),
     ] = False,
 ) -> None:
     global _debug  # one command a process

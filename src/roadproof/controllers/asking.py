@@ -62,8 +62,8 @@ def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps:
     control = call("the controller's act", controller.act, frame, speed_mps, command)
     if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # controllers are the user's
         raise ControllerError(f"the controller's act answered {_in_words(control)}, expected a roadproof.Control")
-    values: tuple[object, ...] = (control.steer, control.throttle, control.brake)
-    if all(type(value) is float for value in values):
+    values = cast("tuple[object, ...]", (control.steer, control.throttle, control.brake))
+    if all(isinstance(value, float | int) for value in values):
         return control
     try:
         return Control(

@@ -136,6 +136,8 @@ def require_usable(controller: Controller, *, size: tuple[int, int], device: str
     few = _Drive(*(values[:2] for values in _made_up_drive(size, device, seed=0)))
     leaf = few.frames.clone().requires_grad_()
     gradient = _gradient_of(steer_of(controller, leaf, few.speed_mps, few.command), leaf)
+    if gradient is None:
+        raise ControllerError(f"no gradient of the controller's steer reaches the frames; {NO_GRADIENT}")
     if not bool(gradient.isfinite().all()):
         raise ControllerError(f"the controller's gradient is NaN or infinite; {_BROKEN_GRADIENT}")
     if isinstance(controller, PedalController):
@@ -199,6 +201,9 @@ def _gradient_checks(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"])
     except ControllerError as error:
         yield _failed("gradients", error, NO_GRADIENT)
         return
+    if gradient is None:
+        yield ControllerCheck("gradients", False, "none reach the frames", NO_GRADIENT)
+        return
     largest = gradient.flatten(1).abs().amax(dim=1)
     dead = int((largest == 0).sum())
     yield ControllerCheck("gradients", dead == 0, f"zero for {dead} of {len(largest)} frames", NO_GRADIENT)
@@ -207,18 +212,16 @@ def _gradient_checks(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"])
     yield ControllerCheck("finite gradients", broken == 0, found, _BROKEN_GRADIENT)
 
 
-def _gradient_of(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """The gradient of the summed steering to its frames.
+def _gradient_of(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"] | None:
+    """The gradient of the summed steering to its frames; None where none reaches them.
 
     Raises:
-        ControllerError: there is none, or computing it raises.
+        ControllerError: computing it raises.
     """
-    gradient: Tensor | None = None
-    if steer.requires_grad:
-        backward = functools.partial(torch.autograd.grad, steer.sum(), leaf, allow_unused=True)
-        (gradient,) = call("the gradient of the controller's steer", backward)
-    if gradient is None:
-        raise ControllerError("none reach the frames")
+    if not steer.requires_grad:
+        return None
+    backward = functools.partial(torch.autograd.grad, steer.sum(), leaf, allow_unused=True)
+    gradient: Tensor | None = call("the gradient of the controller's steer", backward)[0]
     return gradient
 
 
