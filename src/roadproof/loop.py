@@ -23,10 +23,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, attack, kept_attack
+from roadproof.attacks import AttackResult, BlackBox, attack, kept_attack
 from roadproof.budget import QUICK, Budget
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
+from roadproof.controllers.checks import require_usable
 from roadproof.drives import Drives, record
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import (
@@ -43,6 +44,7 @@ from roadproof.io.locks import working_in
 from roadproof.ledger import Ledger, StageCost
 from roadproof.objectives import Group, parse_groups
 from roadproof.patterns import Pattern, save_pattern
+from roadproof.processes import require_picklable
 from roadproof.recordings import Push, RecordingSet, pooled
 from roadproof.rounds import Rounds, search_on
 from roadproof.scenarios import Scenario
@@ -116,6 +118,7 @@ def stress_test(
     Raises:
         RoadproofError: the folder holds a run of something else, another process works in it, or a stage refuses; the
             message says why.
+        ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     if processes < 1 or (processes > 1 and another is None):
         raise RoadproofError(
@@ -133,6 +136,11 @@ def stress_test(
         device=device,
         on_progress=on_progress,
     )
+    view = simulator.input
+    if processes > 1:
+        require_picklable(controller)
+    climbs = not isinstance(budget.method, BlackBox)
+    require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=climbs)
     with working_in(folder):
         return _stages(run, another if another and processes > 1 else simulator, processes)
 
@@ -140,7 +148,7 @@ def stress_test(
 def _stages(run: _Run, simulator: Opening | Simulator, processes: int) -> StressTest:
     """All of them, one after another; the simulator, or what opens one for each process, is the evaluation's."""
     # What tells this run from another.
-    told = (asdict(run.scenario), asdict(run.budget), asdict(run.space), run.seed, run.controller_name)
+    told = (asdict(run.scenario), repr(run.budget), asdict(run.space), run.seed, run.controller_name)
     ledger = Ledger(run.folder, json.dumps(told, default=str), STAGES, paint=run.simulator.paint)
     on_progress = run.on_progress
 

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+from roadproof import foreign
+from roadproof.errors import ControllerError
+
+DIED = "a driving process died; is there memory for all of them? try with fewer processes"
+"""What is said of one that did not even raise an exception."""
 
 
 def processes_beside(count: int, begin: Callable[..., object] | None = None, *arguments: object) -> ProcessPoolExecutor:
     """A pool of fresh processes that end with this one, however it ends.
 
     Fresh, since graphics and torch's threads do not survive a fork. One that outlived its parent would go on writing to
-    the folder in which the next run goes on.
+    the folder in which the next run goes on. As in `load_controller` the current directory is importable, for
+    controllers that travel; foreign calls end as in this process.
 
     Args:
         count: how many.
@@ -21,11 +31,31 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
         arguments: of it.
     """
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(begin, arguments))
+    return ProcessPoolExecutor(
+        count, mp_context=context, initializer=_begin, initargs=(foreign.limit_s(), begin, arguments)
+    )
 
 
-def _begin(begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:
+def require_picklable(driver: object) -> None:
+    """Refuse a controller, or another driver, that cannot travel to processes beside this one.
+
+    Raises:
+        ControllerError: pickling it raises; the message says why and what to do.
+    """
+    try:
+        foreign.call("pickling the controller", pickle.dumps, driver)
+    except ControllerError as error:
+        raise ControllerError(
+            f"{error}; several processes need a controller that can be pickled: define its class in a module, or "
+            "use one process"
+        ) from error.__cause__
+
+
+def _begin(limit_s: float, begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    foreign.end_calls_after(limit_s)
+    # Last, so that nothing in the folder hides an installed module.
+    sys.path.append(str(Path.cwd()))
     if begin is not None:
         begin(*arguments)
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import act_of, frame_size_of
 from roadproof.datatypes import Control, Ending, Event, Observation, VehicleState, Weather
 from roadproof.errors import ControllerError, EpisodeError, SimulatorError
 from roadproof.io.arrays import read_record, write_archive
@@ -188,10 +189,11 @@ def rollout(
         until: stops the drive at the first observation it says yes to.
 
     Raises:
-        SimulatorError: the simulator is not open, an argument does not fit, or a control is not finite.
+        SimulatorError: the simulator is not open, an argument does not fit, or a driver's control is not finite.
         ScenarioError: the scenario does not fit its map.
         PatternError: the pattern is a batch.
-        ControllerError: the controller takes frames of another size, or answers with something that is no control.
+        ControllerError: the controller takes frames of another size, raises, or answers with something that is no
+            control; the message names its author's line.
     """
     if isinstance(driver, Controller):
         _check_size(driver, simulator)
@@ -261,13 +263,13 @@ def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) ->
     """What a driver does in a drive that has just begun."""
     if not isinstance(driver, Controller):
         return driver(simulator)
-    return lambda seen: driver.act(seen.frame, seen.state.speed_mps, int(seen.command))
+    return lambda seen: act_of(driver, seen.frame, seen.state.speed_mps, int(seen.command))
 
 
 def _check_size(controller: Controller, simulator: Simulator) -> None:
     """Before the town is built, and also for controllers that would not complain themselves."""
-    size, view = controller.input_size, simulator.input
-    if size is not None and tuple(size) != (view.height_px, view.width_px):
+    size, view = frame_size_of(controller), simulator.input
+    if size is not None and size != (view.height_px, view.width_px):
         raise ControllerError(
             f"the controller takes frames of {size[1]}×{size[0]}, the simulator gives {view.width_px}×{view.height_px} "
             "(width×height); give the simulator another `input`"

@@ -2,6 +2,8 @@
 
 import os
 import pickle
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -17,7 +19,7 @@ from roadproof.controllers import (
     check_controller,
     load_controller,
 )
-from roadproof.controllers.exported import _pickles_refused
+from roadproof.controllers.exported import TorchProgram, _pickles_refused
 from roadproof.errors import ControllerError, DeviceError
 
 CARD = ControllerCard(
@@ -126,6 +128,76 @@ def test_programs_that_cannot_serve_are_refused(program, tmp_path):
     (tmp_path / "net.json").write_text(wrong.to_json())
     with pytest.raises(ControllerError, match=r"says network_size \(66, 200\), the file \(16, 16\)"):
         load_controller(tmp_path / "net.pt2")
+
+
+DAMAGED = """
+import sys
+from roadproof.controllers import load_controller
+from roadproof.errors import ControllerError
+for spec in sys.argv[1:]:
+    try:
+        load_controller(spec)
+        print("loaded")
+    except ControllerError as error:
+        print(error)
+"""
+
+
+def test_damaged_files_are_one_line_each_and_nothing_on_the_side(program, tmp_path):
+    """In a process of its own, whose standard error is all that anybody says."""
+    whole = program.read_bytes()
+    torch.save(Net().state_dict(), tmp_path / "weights.pt2")
+    contents = {"empty": b"", "text": b"no network", "cut": whole[: len(whole) // 2], "other": whole}
+    messages = {"pt2": "is not a torch.export file", "onnx": "is not a valid ONNX file", "safetensors": "is damaged"}
+    expected = {tmp_path / "weights.pt2": messages["pt2"]}
+    for kind, message in messages.items():
+        (tmp_path / f"folder.{kind}").mkdir()
+        expected[tmp_path / f"folder.{kind}"] = "is a folder, expected a file"
+        for name, content in contents.items():
+            if (name, kind) != ("other", "pt2"):
+                (tmp_path / f"{name}.{kind}").write_bytes(content)
+                expected[tmp_path / f"{name}.{kind}"] = message
+    done = subprocess.run(
+        [sys.executable, "-c", DAMAGED, *map(str, expected)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(expected) == 15
+    for (path, message), line in zip(expected.items(), lines, strict=True):
+        assert str(path) in line
+        assert message in line or ("needs the ONNX reader" in line and path.suffix == ".onnx")
+
+
+class Several(nn.Module):
+    def forward(self, frames):
+        return frames.mean(dim=(1, 2, 3)), frames.sum(dim=(1, 2, 3))
+
+
+class Whole(nn.Module):
+    def forward(self, frames):
+        return frames.mean()
+
+
+def test_networks_that_answer_otherwise_are_named(tmp_path):
+    export(Several(), inputs()[:1], tmp_path / "several.pt2")
+    export(Whole(), inputs()[:1], tmp_path / "whole.pt2")
+    for name, message in (
+        ("several", r"several\.pt2 answers with a tuple, expected one output: the steering"),
+        ("whole", r"answers 3 frames with shape \(\)"),
+    ):
+        with pytest.raises(ControllerError, match=message):
+            load_controller(tmp_path / f"{name}.pt2").steer(*inputs())
+
+
+def test_frames_of_another_size_name_the_program(program):
+    controller = TorchProgram(program, torch.device("cpu"))
+    with pytest.raises(ControllerError, match=r"net\.pt2 cannot take shapes \(3, 3, 20, 16\), \(3,\), \(3,\)"):
+        controller(*inputs(3, 20, 16))
 
 
 def test_the_environment_is_as_before_after_loading(program, monkeypatch):

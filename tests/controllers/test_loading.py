@@ -122,8 +122,9 @@ def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
 def test_an_error_inside_a_factory_is_not_hidden(tmp_path, monkeypatch):
     (tmp_path / "my_broken_driver.py").write_text("def make():\n    return 1 / 0\n")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(ControllerError, match=r"^my_broken_driver:make raised ZeroDivisionError at my_broken") as told:
         load_controller("my_broken_driver:make")
+    assert isinstance(told.value.__cause__, ZeroDivisionError)
 
 
 def test_an_unknown_name_is_told_what_comes_with_the_package():

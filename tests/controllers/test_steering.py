@@ -67,3 +67,10 @@ def test_driving_reaches_and_holds_the_target_speed():
 def test_standing_still_is_no_target(target):
     with pytest.raises(ControllerError, match="target speed"):
         CruiseControl(target_mps=target)
+
+
+def test_a_network_that_answers_with_a_tuple_is_named():
+    controller = SteeringController(torch.nn.Identity(), preparation=FramePreparation(frame_size=(8, 8)))
+    controller.network.forward = lambda frames: (frames.mean((1, 2, 3)), None)
+    with pytest.raises(ControllerError, match="network answers with a tuple, expected one tensor"):
+        controller.steer(torch.rand(2, 3, 8, 8), torch.zeros(2), torch.full((2,), 2))

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+import bad_drivers
 import needs
 from paint_shy import PaintShy, just_before_the_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
-from roadproof.errors import EpisodeError, PatternError
+from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
 from roadproof.evaluation import Evaluation, StartRange, evaluate, random_patterns
 from roadproof.evaluation.episodes import load_episodes
 from roadproof.evaluation.result import load_paint, path_of
@@ -233,6 +234,33 @@ def test_starts_off_the_lane_are_refused(wrong):
     name, value = next(iter(wrong.items()))
     with pytest.raises(EpisodeError, match=f"{name} of the starts is {value}, expected 0 to"):
         StartRange(**wrong)
+
+
+def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(tmp_path):
+    class Local(bad_drivers.Honest):
+        pass
+
+    with pytest.raises(ControllerError, match=r"pickling the controller raised \w+: Can't.* its class in a module"):
+        evaluate(TownSimulator, Local(), SHORT, MAGENTA, folder=tmp_path, processes=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("driver", "error", "message"),
+    [
+        (bad_drivers.DyingInWorkers, SimulatorError, "a driving process died"),
+        (
+            bad_drivers.FailingInWorkers,
+            ControllerError,
+            r"act raised ZeroDivisionError at \S*bad_drivers\.py:\d+",
+        ),
+    ],
+)
+def test_what_fails_in_a_process_is_one_line_here(tmp_path, driver, error, message):
+    with pytest.raises(error, match=message) as told:
+        evaluate(TownSimulator, driver(), SHORT, MAGENTA, folder=tmp_path, weathers=WEATHERS, runs=0, processes=2)
+    assert "\n" not in str(told.value)
 
 
 def test_a_pattern_that_paints_nothing_is_refused(town, tmp_path):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import steer_of
 from roadproof.errors import ControllerError
 from roadproof.objectives import Group, divergence
 from roadproof.patterns import Pattern
@@ -161,7 +162,7 @@ class Surrogate:
 
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
         self.frames_evaluated += len(frames)
-        return self.controller.steer(frames, speed, command).float()
+        return steer_of(self.controller, frames, speed, command).float()
 
 
 def _patterns(space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> list[Pattern]:

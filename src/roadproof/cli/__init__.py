@@ -1,11 +1,13 @@
 """The command line: thin verbs over the public functions, one file a verb.
 
-A `RoadproofError` is one line on standard error and exit code 2, never a traceback.
+A `RoadproofError` is one line on standard error and exit code 2, a traceback only with `--debug`.
 """
 
 from __future__ import annotations
 
+import math
 import sys
+import traceback
 from typing import Annotated
 
 import typer
@@ -28,6 +30,7 @@ from roadproof.cli.select import select
 from roadproof.cli.study import study
 from roadproof.cli.train import train
 from roadproof.errors import RoadproofError
+from roadproof.foreign import LIMIT_S, end_calls_after
 from roadproof.memory import keep_freed_memory
 
 app = typer.Typer(
@@ -57,6 +60,9 @@ app.add_typer(carla, name="carla")
 app.add_typer(study, name="study")
 
 
+_debug = False
+
+
 def _version(wanted: bool | None) -> None:
     if wanted:
         typer.echo(f"roadproof {__version__}")
@@ -68,8 +74,15 @@ def _root(  # pyright: ignore[reportUnusedFunction]
     version: Annotated[
         bool | None, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = None,
+    debug: Annotated[
+        bool,
+        typer.Option("--debug", help="Show the traceback of what goes wrong, and wait for controllers without end."),
+    ] = False,
 ) -> None:
+    global _debug  # one command a process
     del version
+    _debug = debug
+    end_calls_after(math.inf if debug else LIMIT_S)
 
 
 def main() -> None:
@@ -79,6 +92,8 @@ def main() -> None:
     try:
         app()
     except RoadproofError as error:
+        if _debug:
+            traceback.print_exc()
         complain(f"roadproof: {error!s:.1000}")  # what a message quotes may be long
         sys.exit(2)
     except KeyboardInterrupt:

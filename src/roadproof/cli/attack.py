@@ -82,10 +82,11 @@ def attack(
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import OBJECTIVES, method_of, show_pattern
+    from roadproof.attacks import OBJECTIVES, BlackBox, method_of, show_pattern
     from roadproof.attacks import attack as run
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
+    from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
     from roadproof.io.locks import hold
@@ -112,6 +113,13 @@ def attack(
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
     chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
+    require_usable(
+        attacked,
+        size=(drives.view.height_px, drives.view.width_px),
+        device=device,
+        drives=False,
+        gradients=not isinstance(searched, BlackBox),
+    )
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(OBJECTIVES[word])) as on_step:
         result = run(

@@ -28,6 +28,7 @@ def check_controller(
     from roadproof.cli.progress import progress
     from roadproof.controllers import check_controller as check
     from roadproof.controllers import load_controller
+    from roadproof.controllers.checks import DRIVES
     from roadproof.datatypes import Weather
     from roadproof.scenarios import BUILTIN_FILE, load_scenarios
 
@@ -36,7 +37,10 @@ def check_controller(
     controller = load_controller(spec)
     report = check(controller, size=controller.input_size or (88, 200))
     _say_promises(report)
-    if not drive:
+    acts = any(check.name == DRIVES and check.passed for check in report.checks)
+    if drive and not acts:
+        typer.echo("not driven: act does not answer as a drive needs it", err=True)
+    if not drive or not acts:
         raise typer.Exit(0 if report.passed else 1)
 
     # Panda3D is an extra.

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from roadproof.controllers.protocol import Controller
-from roadproof.datatypes import Command, Control
+from roadproof.controllers.asking import NO_GRADIENT, act_of, answer_of, controls_of, frame_size_of, steer_of
+from roadproof.controllers.protocol import Controller, PedalController, missing_members
+from roadproof.datatypes import Command
 from roadproof.errors import ControllerError
+from roadproof.foreign import call
+
+DRIVES = "drives"
+"""The check without which nothing can be driven."""
+
+_INTERFACE = "give the object the members of roadproof.controllers.Controller"
+_BROKEN_GRADIENT = "look for square roots and norms at zero, whose derivative is infinite"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +45,7 @@ class ControllerCheck:
 
 @dataclass(frozen=True, slots=True)
 class ControllerReport:
-    """All checks, in the order they were made. After one that leaves nothing to measure there are no more."""
+    """All checks, in the order they were made; those that an earlier one leaves nothing to measure for are not."""
 
     checks: tuple[ControllerCheck, ...]
 
@@ -93,79 +102,163 @@ def check_controller(
     Raises:
         ControllerError: the controller takes any size and none was given.
     """
-    if not isinstance(controller, Controller):
-        missing = [name for name in ("input_size", "steer", "act") if not hasattr(controller, name)]
-        advice = "give the object the members of roadproof.controllers.Controller"
-        return ControllerReport((ControllerCheck("interface", False, f"lacks {', '.join(missing)}", advice),))
-    size = size or controller.input_size
+    try:
+        missing = call("the controller's interface", missing_members, controller)
+        own_size = None if missing else frame_size_of(cast("Controller", controller))
+    except ControllerError as error:
+        return ControllerReport((_failed("interface", error, _INTERFACE),))
+    if missing:
+        return ControllerReport((ControllerCheck("interface", False, f"lacks {', '.join(missing)}", _INTERFACE),))
+    size = size or own_size
     if size is None:
         raise ControllerError("the controller takes frames of any size; say at which size to check it: size=(h, w)")
-    return ControllerReport(tuple(_checks(controller, _made_up_drive(size, device, seed), tolerance)))
+    drive = _made_up_drive(size, device, seed)
+    return ControllerReport(tuple(_checks(cast("Controller", controller), drive, tolerance)))
+
+
+def require_usable(
+    controller: Controller, *, size: tuple[int, int], device: str = "cpu", drives: bool = True, gradients: bool = True
+) -> None:
+    """Refuse a controller with which nothing can begin: the part of `check_controller` that takes no time.
+
+    Args:
+        controller: is asked about two made-up frames, and for their gradient.
+        size: (height, width) of the frames that it will be given.
+        device: where the controller computes.
+        drives: whether it will also be asked to act.
+        gradients: whether they are needed.
+
+    Raises:
+        ControllerError: it takes frames of another size, raises, answers wrongly, or gives no finite gradient.
+    """
+    if (own := frame_size_of(controller)) not in (None, size):
+        raise ControllerError(
+            f"the controller takes frames of {own[1]}×{own[0]}, here they have {size[1]}×{size[0]} (width×height); "
+            "use a controller for these, or record for this one"
+        )
+    few = _Drive(*(values[:2] for values in _made_up_drive(size, device, seed=0)))
+    leaf = few.frames.clone().requires_grad_()
+    steer = steer_of(controller, leaf, few.speed_mps, few.command)
+    gradient = _gradient_of(steer, leaf) if gradients else leaf
+    if gradient is None:
+        raise ControllerError(f"no gradient of the controller's steer reaches the frames; {NO_GRADIENT}")
+    if not bool(gradient.isfinite().all()):
+        raise ControllerError(f"the controller's gradient is NaN or infinite; {_BROKEN_GRADIENT}")
+    if isinstance(controller, PedalController):
+        controls_of(controller, leaf, few.speed_mps, few.command)
+    if drives:
+        act_of(controller, _picture(few), float(few.speed_mps[0]), int(few.command[0]))
 
 
 def _checks(controller: Controller, drive: _Drive, tolerance: float) -> Iterator[ControllerCheck]:
-    count, before = len(drive.frames), drive.frames.clone()
     leaf = drive.frames.clone().requires_grad_()
     try:
-        steer = controller.steer(leaf, drive.speed_mps, drive.command)
-    except Exception as error:  # whatever a stranger's controller raises is its answer
-        found = f"{type(error).__name__}: {error}"
-        yield ControllerCheck(
-            "answers", False, found, "make steer accept (b, 3, h, w) frames, (b,) speeds and commands"
-        )
-        return
-    shaped = steer.shape == (count,) and steer.is_floating_point()
-    advice = "return one floating-point steering value a frame"
-    yield ControllerCheck("answers", shaped, f"shape {tuple(steer.shape)}, {steer.dtype}", advice)
-    if not shaped:
-        return
-
-    answer = steer.detach()
-    broken = int((~answer.isfinite()).sum())
-    advice = "look for divisions by zero and logarithms, and for NaN in the weights"
-    yield ControllerCheck("finite answers", broken == 0, f"{broken} of {count} NaN or infinite", advice)
-
-    with torch.no_grad():
-        again = controller.steer(drive.frames, drive.speed_mps, drive.command)
-        alone = torch.cat([controller.steer(*(x[i : i + 1] for x in drive)) for i in range(count)])
-    advice = "switch dropout and noise off (eval mode), and keep no state from call to call"
-    yield _equal("determinism", answer, again, tolerance, advice)
-    advice = "answer each frame by itself: batch normalisation in eval mode, no statistics over the batch"
-    yield _equal("batch consistency", answer, alone, tolerance, advice)
-    advice = "work on a copy: steer must not write into the frames it is given"
-    yield ControllerCheck("frames untouched", torch.equal(before, drive.frames), "frames compared", advice)
-
-    yield from _gradient_checks(steer, leaf)
+        steer = answer_of(controller, "steer", leaf, drive.speed_mps, drive.command)
+    except ControllerError as error:
+        advice = "make steer accept (b, 3, h, w) frames, (b,) speeds and commands, and answer one value a frame"
+        yield _failed("answers", error, advice)
+    else:
+        yield ControllerCheck("answers", True, f"shape {tuple(steer.shape)}, {steer.dtype}", "")
+        yield from _steer_checks(controller, drive, steer, tolerance)
+        yield from _gradient_checks(steer, leaf)
+    if isinstance(controller, PedalController):
+        yield _pedal_check(controller, drive)
     yield _act_check(controller, drive)
 
 
+def _steer_checks(
+    controller: Controller, drive: _Drive, steer: Float[Tensor, " b"], tolerance: float
+) -> Iterator[ControllerCheck]:
+    count, before, answer = len(drive.frames), drive.frames.clone(), steer.detach()
+    broken = int((~answer.isfinite()).sum())
+    advice = "look for divisions by zero and logarithms, and for NaN in the weights"
+    yield ControllerCheck("finite answers", broken == 0, f"{broken} of {count} NaN or infinite", advice)
+    parts = [_Drive(*(values[i : i + 1] for values in drive)) for i in range(count)]
+    advice = "switch dropout and noise off (eval mode), and keep no state from call to call"
+    yield _repeated("determinism", controller, [drive], answer, tolerance, advice)
+    advice = "answer each frame by itself: batch normalisation in eval mode, no statistics over the batch"
+    yield _repeated("batch consistency", controller, parts, answer, tolerance, advice)
+    advice = "work on a copy: steer must not write into the frames it is given"
+    yield ControllerCheck("frames untouched", torch.equal(before, drive.frames), "frames compared", advice)
+
+
+def _repeated(
+    name: str,
+    controller: Controller,
+    parts: Sequence[_Drive],
+    first: Float[Tensor, " b"],
+    tolerance: float,
+    advice: str,
+) -> ControllerCheck:
+    """Whether the same frames, a part at a time, are answered as they were at first."""
+    try:
+        with torch.no_grad():
+            again = torch.cat([answer_of(controller, "steer", *part) for part in parts])
+    except ControllerError as error:
+        return _failed(name, error, advice)
+    return _equal(name, first, again, tolerance, advice)
+
+
 def _gradient_checks(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Iterator[ControllerCheck]:
-    gradient = None
-    if steer.requires_grad:
-        (gradient,) = torch.autograd.grad(steer.sum(), leaf, allow_unused=True)
-    advice = "compute steer in torch from the frames on: no detach, no_grad, numpy or rounding on the way"
+    try:
+        gradient = _gradient_of(steer, leaf)
+    except ControllerError as error:
+        yield _failed("gradients", error, NO_GRADIENT)
+        return
     if gradient is None:
-        yield ControllerCheck("gradients", False, "none reach the frames", advice)
+        yield ControllerCheck("gradients", False, "none reach the frames", NO_GRADIENT)
         return
     largest = gradient.flatten(1).abs().amax(dim=1)
     dead = int((largest == 0).sum())
-    yield ControllerCheck("gradients", dead == 0, f"zero for {dead} of {len(largest)} frames", advice)
+    yield ControllerCheck("gradients", dead == 0, f"zero for {dead} of {len(largest)} frames", NO_GRADIENT)
     broken = int((~gradient.flatten(1).isfinite().all(dim=1)).sum())
-    advice = "look for square roots and norms at zero, whose derivative is infinite"
     found = f"NaN or infinite for {broken} of {len(largest)} frames"
-    yield ControllerCheck("finite gradients", broken == 0, found, advice)
+    yield ControllerCheck("finite gradients", broken == 0, found, _BROKEN_GRADIENT)
+
+
+def _gradient_of(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"] | None:
+    """The gradient of the summed steering to its frames; None where none reaches them.
+
+    Raises:
+        ControllerError: computing it raises.
+    """
+    if not steer.requires_grad:
+        return None
+    backward = functools.partial(torch.autograd.grad, steer.sum(), leaf, allow_unused=True)
+    gradient: Tensor | None = call("the gradient of the controller's steer", backward)[0]
+    return gradient
+
+
+def _pedal_check(controller: PedalController, drive: _Drive) -> ControllerCheck:
+    advice = "answer finite steer, throttle and brake of each frame inside their ranges, differentiable in the frames"
+    try:
+        controls = controls_of(controller, drive.frames.clone().requires_grad_(), drive.speed_mps, drive.command)
+    except ControllerError as error:
+        return _failed("pedals", error, advice)
+    least = controls.new_tensor([-1.0, 0.0, 0.0])
+    outside = int(((controls < least) | (controls > 1)).any(1).sum())
+    return ControllerCheck(
+        "pedals", outside == 0, f"outside their ranges for {outside} of {len(controls)} frames", advice
+    )
 
 
 def _act_check(controller: Controller, drive: _Drive) -> ControllerCheck:
-    frame = (drive.frames[0].permute(1, 2, 0) * 255).round().to(torch.uint8).cpu().numpy()
     advice = "return a finite Control inside its ranges (Control.clipped) for one uint8 frame"
     try:
-        act = cast("Callable[..., object]", controller.act)
-        control = act(np.ascontiguousarray(frame), float(drive.speed_mps[0]), int(drive.command[0]))
-    except Exception as error:  # as above
-        return ControllerCheck("drives", False, f"{type(error).__name__}: {error}", advice)
-    inside = isinstance(control, Control) and control == control.clipped()
-    return ControllerCheck("drives", inside, f"{control}", advice)
+        control = act_of(controller, _picture(drive), float(drive.speed_mps[0]), int(drive.command[0]))
+    except ControllerError as error:
+        return _failed(DRIVES, error, advice)
+    return ControllerCheck(DRIVES, control == control.clipped(), f"{control}", advice)
+
+
+def _failed(name: str, error: ControllerError, advice: str) -> ControllerCheck:
+    return ControllerCheck(name, False, str(error), advice)
+
+
+def _picture(drive: _Drive) -> UInt8[np.ndarray, "h w 3"]:
+    """The first frame as a camera gives it."""
+    levels = (drive.frames[0].permute(1, 2, 0) * 255).round().to(torch.uint8)
+    return np.ascontiguousarray(levels.cpu().numpy())
 
 
 def _equal(

@@ -10,12 +10,14 @@ Convention:
 
 from __future__ import annotations
 
+import logging
 import os
+import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +27,7 @@ from roadproof.controllers.frames import FramePreparation
 from roadproof.controllers.onnx_graph import OnnxGraph
 from roadproof.controllers.steering import CruiseControl, SteeringController
 from roadproof.errors import ControllerError, DeviceError
+from roadproof.foreign import in_one_line
 
 InputShapes = dict[str, tuple[int | None, ...]]
 
@@ -71,31 +74,47 @@ class TorchProgram(nn.Module):
         super().__init__()
         from torch.export.passes import move_to_device_pass
 
-        try:
-            with _pickles_refused():
-                program = torch.export.load(path)
-            program = move_to_device_pass(program, device)
-        except Exception as error:  # whatever the archive's contents make the reader raise
-            line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise ControllerError(f"{path} is not a torch.export file that this torch reads: {line}") from error
+        self.path = path
         self.inputs: InputShapes = {}
-        wanted = program.graph_signature.user_inputs
-        for node in program.graph.nodes:
-            if node.op == "placeholder" and node.name in wanted:
-                shape = cast("tuple[int | torch.SymInt, ...]", node.meta["val"].shape)
-                self.inputs[node.name] = tuple(size if isinstance(size, int) else None for size in shape)
+        try:
+            with _pickles_refused(), _quiet():
+                program = torch.export.load(path)
+                program = move_to_device_pass(program, device)
+                wanted = program.graph_signature.user_inputs
+                for node in program.graph.nodes:
+                    if node.op == "placeholder" and node.name in wanted:
+                        shape = cast("tuple[int | torch.SymInt, ...]", node.meta["val"].shape)
+                        self.inputs[node.name] = tuple(size if isinstance(size, int) else None for size in shape)
+                self.program = program.module()
+        except Exception as error:  # whatever the archive's contents make the reader raise
+            raise ControllerError(
+                f"{path} is not a torch.export file that this torch, {torch.__version__}, reads: "
+                f"{_first_sentence(error)}"
+            ) from error
         for name, shape in self.inputs.items():
             if shape and shape[0] is not None:
                 raise ControllerError(
                     f"{path}: input {name} was exported for batches of exactly {shape[0]}; export it with "
                     'dynamic_shapes={0: torch.export.Dim("batch")} for every input'
                 )
-        self.program = program.module()
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """The program's output for its inputs, in order."""
-        answer: Tensor | tuple[Tensor, ...] = self.program(*inputs)
-        return answer[0] if isinstance(answer, tuple) and len(answer) == 1 else cast("Tensor", answer)
+        """The program's output for its inputs, in order.
+
+        Raises:
+            ControllerError: it cannot be computed, most often for inputs of other shapes than it was exported for.
+        """
+        try:
+            answer: Any = self.program(*inputs)
+        except (RuntimeError, ValueError, IndexError, KeyError, TypeError, AssertionError) as error:
+            shapes = ", ".join(str(tuple(x.shape)) for x in inputs)
+            raise ControllerError(f"{self.path} cannot take shapes {shapes}: {in_one_line(error)}") from error
+        if isinstance(answer, tuple) and len(cast("tuple[object, ...]", answer)) == 1:
+            answer = cast("tuple[object, ...]", answer)[0]
+        if not isinstance(answer, Tensor):
+            kind = type(cast("object", answer)).__name__
+            raise ControllerError(f"{self.path} answers with a {kind}, expected one output: the steering")
+        return answer
 
     def train(self, mode: bool = True) -> TorchProgram:  # noqa: ARG002
         """Nothing: an exported program stays as it was exported."""
@@ -125,6 +144,26 @@ def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple
         frame_size = preparation.frame_size or (fixed if whole else None)
         preparation = replace(preparation, network_size=fixed, frame_size=frame_size)
     return tuple("frames" if name in pictures else name for name in names), preparation
+
+
+def _first_sentence(error: Exception) -> str:
+    """What torch says first; what follows points to logs and stack traces."""
+    lines = str(error).strip().splitlines()
+    return lines[0].split(". ")[0] if lines else type(error).__name__
+
+
+@contextmanager
+def _quiet() -> Generator[None, None, None]:
+    """Keep torch from telling on the side, at length, what its exceptions say."""
+    log = logging.getLogger("torch.export")
+    before = log.disabled
+    log.disabled = True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.disabled = before
 
 
 @contextmanager

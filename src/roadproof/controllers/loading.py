@@ -16,14 +16,16 @@ from jaxtyping import Shaped
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from roadproof.controllers.asking import frame_size_of
 from roadproof.controllers.cards import ControllerCard, read_card
 from roadproof.controllers.cil import CIL
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
-from roadproof.controllers.protocol import Controller
+from roadproof.controllers.protocol import Controller, missing_members
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.steering import CruiseControl, SteeringController
 from roadproof.errors import ControllerError, DeviceError
+from roadproof.foreign import call
 from roadproof.io.files import write_tensors
 
 ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet")
@@ -97,7 +99,7 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
         controller = _from_python(head, tail)
     else:
         raise ControllerError(f"unknown controller {text!r}, expected {SPECS}")
-    return _placed(controller, place, precision)
+    return call(f"moving the controller to {place} in {dtype}", _placed, controller, place, precision)
 
 
 def save_controller(
@@ -194,23 +196,29 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
 
 
 def _from_python(module_name: str, factory_name: str) -> Controller:
+    spec = f"{module_name}:{factory_name}"
     with _current_directory_importable():
         try:
-            factory: object = importlib.import_module(module_name)
+            factory: object = call(f"the import of {module_name}", importlib.import_module, module_name)
             for part in factory_name.split("."):
                 factory = getattr(factory, part)
-        except (ImportError, AttributeError) as error:
-            raise ControllerError(f"cannot import {module_name}:{factory_name}: {error}; or give {SPECS}") from error
+        except (ControllerError, AttributeError) as error:
+            reason = error.__cause__ or error
+            # What a module of the user's lacks itself is told with its line.
+            absent = isinstance(reason, ModuleNotFoundError) and f"{module_name}.".startswith(f"{reason.name}.")
+            if not absent and isinstance(error, ControllerError):
+                raise
+            raise ControllerError(f"cannot import {spec}: {reason}; or give {SPECS}") from reason
         if not callable(factory):
-            raise ControllerError(f"{module_name}:{factory_name} is {factory!r}, expected a function without arguments")
-        controller: object = factory()
-    if not isinstance(controller, Controller):
-        missing = [name for name in ("input_size", "steer", "act") if not hasattr(controller, name)]
+            raise ControllerError(f"{spec} is {factory!r:.100}, expected a function without arguments")
+        controller: object = call(spec, factory)
+        missing = call(spec, missing_members, controller)
+    if missing:
         raise ControllerError(
-            f"{module_name}:{factory_name} returned a {type(controller).__name__} without {', '.join(missing)}, "
-            "expected a Controller"
+            f"{spec} returned a {type(controller).__name__} without {', '.join(missing)}, expected a Controller"
         )
-    return controller
+    frame_size_of(made := cast("Controller", controller))
+    return made
 
 
 @contextmanager
@@ -244,6 +252,8 @@ def _card_beside(path: Path) -> ControllerCard | None:
 
 
 def _existing(path: Path) -> Path:
+    if path.is_dir():
+        raise ControllerError(f"controller file {path} is a folder, expected a file of weights or an exported network")
     if not path.is_file():
         raise ControllerError(f"controller file {path} does not exist; check the path")
     return path

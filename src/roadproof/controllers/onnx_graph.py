@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from roadproof.controllers.onnx_operators import OPERATORS
 from roadproof.errors import ControllerError
+from roadproof.foreign import in_one_line
 
 _OLDEST_OPERATOR_SET = 13
 
@@ -42,9 +43,19 @@ class OnnxGraph(nn.Module):
     def __init__(self, path: Path) -> None:
         super().__init__()
         model = _read(path)
+        self.path = path
+        self._buffer_of: dict[str, str] = {}
+        try:
+            self._build(model)
+        except ControllerError:
+            raise
+        except Exception as error:  # whatever a damaged file makes the reader of its tensors raise
+            raise ControllerError(f"{path} holds an ONNX graph that cannot be read: {in_one_line(error)}") from error
+
+    def _build(self, model: Any) -> None:  # noqa: ANN401
         from onnx import helper, numpy_helper
 
-        graph = model.graph
+        path, graph = self.path, model.graph
         versions = [opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")]
         if not versions or versions[0] < _OLDEST_OPERATOR_SET:
             raise ControllerError(
@@ -53,9 +64,7 @@ class OnnxGraph(nn.Module):
             )
         if len(graph.output) != 1:
             raise ControllerError(f"{path} has {len(graph.output)} outputs, expected one: the steering")
-        self.path = path
         self.output: str = graph.output[0].name
-        self._buffer_of: dict[str, str] = {}
         for constant in graph.initializer:
             self._keep(constant.name, torch.tensor(numpy_helper.to_array(constant)))
         self.inputs = {
@@ -129,8 +138,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401
         model = onnx.load(path)
         onnx.checker.check_model(model)
     except Exception as error:  # the reader raises its own, protobuf's and the system's
-        line = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise ControllerError(f"{path} is not a valid ONNX file: {line}") from error
+        raise ControllerError(f"{path} is not a valid ONNX file: {in_one_line(error)}") from error
     return model
 
 

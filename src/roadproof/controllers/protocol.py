@@ -66,3 +66,8 @@ class PedalController(Controller, Protocol):
             command: what the route asks at each frame.
         """
         ...
+
+
+def missing_members(candidate: object) -> tuple[str, ...]:
+    """What an object lacks to be a `Controller`; properties are asked, and may raise."""
+    return tuple(name for name in ("input_size", "steer", "act") if not hasattr(candidate, name))

@@ -92,7 +92,11 @@ class SteeringController(nn.Module):
             "speed_mps": speed_mps.to(dtype),
             "command": command.to(torch.int64),
         }
-        answer: Tensor = self.network(*(values[name] for name in self.inputs))
+        answer: object = self.network(*(values[name] for name in self.inputs))
+        if not isinstance(answer, Tensor):
+            raise ControllerError(
+                f"network answers with a {type(answer).__name__}, expected one tensor: a steering value a frame"
+            )
         if answer.shape not in ((len(frames),), (len(frames), 1)):
             raise ControllerError(
                 f"network answers {len(frames)} frames with shape {tuple(answer.shape)}, "

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from roadproof.compositing.view import canvas_pixels
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import act_of
 from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
 from roadproof.drives.drives import Drive, Drives, Settings, read_drive, write_drive, write_settings
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
@@ -141,7 +142,7 @@ def record_along(
     steps, frames, which = chosen
     answers = np.zeros(len(again))
     for step, frame in zip(steps.tolist(), frames, strict=True):
-        answers[step] = controller.act(frame, float(again.speed_mps[step]), int(again.command[step])).steer
+        answers[step] = act_of(controller, frame, float(again.speed_mps[step]), int(again.command[step])).steer
     right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in which])
     push = Push.RIGHT if right_m[np.abs(right_m).argmax()] > 0 else Push.LEFT
     drive = _drive(Plan(name, push, 0.0, 0), again, chosen, answers, right_m)

@@ -19,6 +19,7 @@ import numpy as np
 
 import roadproof
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import act_of, frame_size_of
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError
 from roadproof.evaluation.result import Trial, judge
@@ -171,11 +172,11 @@ def _identity(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> st
     answers: list[tuple[float, ...]] = []
     if isinstance(driver, Controller):
         rng = np.random.default_rng(0)
-        size = driver.input_size or (view.height_px, view.width_px)
+        size = frame_size_of(driver) or (view.height_px, view.width_px)
         for _ in range(4):
             coarse = rng.integers(0, 256, (6, 8, 3), np.uint8)
             frame = np.repeat(np.repeat(coarse, -(-size[0] // 6), 0), -(-size[1] // 8), 1)[: size[0], : size[1]]
-            control = driver.act(np.ascontiguousarray(frame), 6.0, 2)
+            control = act_of(driver, np.ascontiguousarray(frame), 6.0, 2)
             answers.append(tuple(round(value, 4) for value in (control.steer, control.throttle, control.brake)))
     parts: dict[str, object] = {
         "version": roadproof.__version__,

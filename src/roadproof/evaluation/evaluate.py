@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from itertools import cycle
@@ -17,12 +18,12 @@ from typing import TypeAlias
 import torch
 
 from roadproof.datatypes import Weather
-from roadproof.errors import EpisodeError, PatternError
+from roadproof.errors import EpisodeError, PatternError, SimulatorError
 from roadproof.evaluation.episodes import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
 from roadproof.evaluation.result import ATTACK, Evaluation
 from roadproof.evaluation.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import processes_beside
+from roadproof.processes import DIED, processes_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -80,7 +81,8 @@ def evaluate(
     Raises:
         EpisodeError: there is nothing to drive, several processes are asked for with an open simulator, or a drive in
             the folder is damaged.
-        SimulatorError: the simulator refuses the conditions.
+        ControllerError: the driver raises, answers wrongly, or cannot travel to several processes.
+        SimulatorError: the simulator refuses the conditions, or a process died.
         OutputError: the folder cannot be written.
     """
     if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
@@ -93,6 +95,8 @@ def evaluate(
         raise EpisodeError(f"{runs} runs with traffic but no cars and no pedestrians; ask for some, or for 0 runs")
     if processes > 1 and not callable(simulator):
         raise EpisodeError(f"{processes} processes need a simulator each; give a function that makes one")
+    if processes > 1:
+        require_picklable(driver)
     paints = {ATTACK: _raster(pattern)} | {f"random-{k + 1}": raster(each) for k, each in enumerate(baseline)}
     started = time.perf_counter()
     with ExitStack() as stack:
@@ -177,12 +181,15 @@ def _make_together(
     shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
     with processes_beside(len(shares)) as pool:
         running = [pool.submit(_make_share, opening, episodes, share) for share in shares]
-        while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
-            on_done(sum(episodes.has(drive) for drive in drives))
-            for future in waiting.done:
+        try:
+            while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
+                on_done(sum(episodes.has(drive) for drive in drives))
+                for future in waiting.done:
+                    future.result()
+            for future in running:
                 future.result()
-        for future in running:
-            future.result()
+        except BrokenProcessPool:
+            raise SimulatorError(DIED) from None
     on_done(len(drives))
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from roadproof.attacks import show_pattern
 from roadproof.compositing import composite, view_canvas
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import steer_of
 from roadproof.datatypes import Control, Observation
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.arrays import read_record, write_archive
@@ -118,7 +119,7 @@ def compare_with_rendered(
         frames = torch.as_tensor(rendered, device=device).permute(0, 3, 1, 2).float() / 255
         speed = torch.as_tensor(recorded.speed_mps, device=device, dtype=torch.float32)
         command = torch.as_tensor(recorded.command, device=device, dtype=torch.int64)
-        rendered_steer = controller.steer(frames, speed, command).float().cpu().numpy()
+        rendered_steer = steer_of(controller, frames, speed, command).float().cpu().numpy()
     return Fidelity(
         drive=drive,
         frame_number=recorded.frame_number,

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from roadproof.compositing.composite import composite_own
 from roadproof.controllers import Controller, PedalController
-from roadproof.errors import ControllerError, RecordingError
+from roadproof.controllers.asking import controls_of, steer_of
+from roadproof.errors import RecordingError
 from roadproof.metrics import deviation_m
 from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
@@ -109,17 +110,19 @@ class RecordedWorld:
         self.device = self.bank.device
 
     def fit(self, controller: Controller) -> None:
-        """Ask a controller about all recorded frames, for the bare road's law of its steering."""
+        """Ask a controller about all recorded frames, for the bare road's law of its steering.
+
+        Raises:
+            ControllerError: it raises, or answers wrongly.
+        """
         frames = (self.bank.levels, self.bank.speed_mps, self.bank.command)
         with torch.no_grad():
             answers = torch.cat(
                 [
-                    controller.steer(levels / 255, speed, command).float()
+                    steer_of(controller, levels / 255, speed, command).float()
                     for levels, speed, command in zip(*map(_in_parts, frames), strict=True)
                 ]
             )
-        if not bool(answers.isfinite().all()):
-            raise ControllerError("the controller answers NaN or infinity to clean frames; check its weights")
         self.course.fit_law(self.bank.poses, answers)
 
     def roll(
@@ -229,8 +232,8 @@ class RecordedWorld:
             frames = composite_own(pattern, frames, views.canvas)
         speed, command = car.speed_mps.float(), self.bank.command[gap.frame]
         if isinstance(controller, PedalController):
-            return controller.controls(frames, speed, command).double()
-        return controller.steer(frames, speed, command).double()[:, None]
+            return controls_of(controller, frames, speed, command).double()
+        return steer_of(controller, frames, speed, command).double()[:, None]
 
     def _recorded_pedals(self, place: Place, car: Motion) -> Float[Tensor, "r 2"]:
         """What brings a car to the clean drive's speed a little way ahead; of its place alone, a stand has no end."""

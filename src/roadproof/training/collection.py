@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import act_of
 from roadproof.datatypes import Command, Control, Event, Observation, Weather
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
@@ -182,7 +183,7 @@ def _random_paint(generator: np.random.Generator) -> PatternImage:
 
 
 def _acting(controller: Controller) -> Policy:
-    return lambda seen: controller.act(seen.frame, seen.state.speed_mps, int(seen.command))
+    return lambda seen: act_of(controller, seen.frame, seen.state.speed_mps, int(seen.command))
 
 
 def _collided(event: Event) -> bool:

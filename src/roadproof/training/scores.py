@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadproof.controllers import Controller
+from roadproof.controllers.asking import act_of
 from roadproof.datatypes import Event, Observation, Weather
 from roadproof.rollout import Policy
 from roadproof.scenarios import Scenario
@@ -141,7 +142,7 @@ def _score(seat: Seat, trial: Trial) -> DrivingScore:
 
 
 def _acting(controller: Controller) -> Policy:
-    return lambda seen: controller.act(seen.frame, seen.state.speed_mps, int(seen.command))
+    return lambda seen: act_of(controller, seen.frame, seen.state.speed_mps, int(seen.command))
 
 
 def _taken(crossing: Crossing, at: np.ndarray, aside: np.ndarray, arrived: bool) -> bool:

@@ -12,7 +12,7 @@ import torch
 
 from roadproof.controllers import Controller, load_controller
 from roadproof.errors import SimulatorError
-from roadproof.processes import processes_beside
+from roadproof.processes import DIED, processes_beside
 from roadproof.simulators.town.simulator import TownSimulator
 
 Work = TypeVar("Work")
@@ -78,9 +78,7 @@ def spread(
             for future in as_completed(waiting):
                 yield waiting[future], future.result()
         except BrokenProcessPool:
-            raise SimulatorError(
-                "a driving process died; is there memory for all of them? try with fewer processes"
-            ) from None
+            raise SimulatorError(DIED) from None
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 

@@ -1,0 +1,153 @@
+"""Asking a controller, whoever wrote it: what it raises or answers wrongly becomes one line.
+
+Everything that searches or drives asks through these functions, so that a controller needs no wrapper: it is pickled,
+compiled and told from others as it is.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from roadproof.controllers.protocol import Controller, PedalController
+from roadproof.datatypes import Control
+from roadproof.errors import ControllerError
+from roadproof.foreign import call
+
+NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy, argmax or rounding on the way"
+
+
+def steer_of(
+    controller: Controller, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+) -> Float[Tensor, " b"]:
+    """What `Controller.steer` answers.
+
+    Raises:
+        ControllerError: it raises, or answers with anything but one finite number a frame, differentiable in the
+            frames where they carry gradients; the message names what came.
+    """
+    answer = answer_of(controller, "steer", frames, speed_mps, command)
+    require_finite(answer, "steer")
+    require_gradient(answer, frames, "steer")
+    return answer
+
+
+def controls_of(
+    controller: PedalController,
+    frames: Float[Tensor, "b 3 h w"],
+    speed_mps: Float[Tensor, " b"],
+    command: Int[Tensor, " b"],
+) -> Float[Tensor, "b 3"]:
+    """What `PedalController.controls` answers.
+
+    Raises:
+        ControllerError: as `steer_of`, of three numbers a frame.
+    """
+    answer = answer_of(controller, "controls", frames, speed_mps, command)
+    require_finite(answer, "controls")
+    require_gradient(answer, frames, "controls")
+    return answer
+
+
+def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
+    """What `Controller.act` answers, in plain numbers.
+
+    Raises:
+        ControllerError: it raises, or answers with something that is no `Control` of numbers.
+    """
+    control = call("the controller's act", controller.act, frame, speed_mps, command)
+    if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # controllers are the user's
+        raise ControllerError(f"the controller's act answered {_in_words(control)}, expected a roadproof.Control")
+    values = cast("tuple[object, ...]", (control.steer, control.throttle, control.brake))
+    if all(isinstance(value, float | int) for value in values):
+        return control
+    try:
+        return Control(
+            *(float(value.detach() if isinstance(value, Tensor) else cast("float", value)) for value in values)
+        )
+    except (TypeError, ValueError, RuntimeError) as error:
+        words = ", ".join(_in_words(value) for value in values)
+        raise ControllerError(f"the controller's act answered a Control of {words}; expected three numbers") from error
+
+
+def frame_size_of(controller: Controller) -> tuple[int, int] | None:
+    """`Controller.input_size`: (height, width) of the frames it takes, or None when it takes any size.
+
+    Raises:
+        ControllerError: it raises, or is something else.
+    """
+    size: object = call("the controller's input_size", getattr, controller, "input_size")
+    if size is None:
+        return None
+    pair = cast("tuple[object, ...]", size) if isinstance(size, tuple) else ()
+    if len(pair) != 2 or not all(isinstance(side, int) and side > 0 for side in pair):
+        raise ControllerError(
+            f"the controller's input_size is {size!r:.100}, expected a tuple (height, width) of whole numbers above 0, "
+            "or None for any size"
+        )
+    return cast("tuple[int, int]", size)
+
+
+def answer_of(
+    controller: Controller,
+    member: str,
+    frames: Float[Tensor, "b 3 h w"],
+    speed_mps: Float[Tensor, " b"],
+    command: Int[Tensor, " b"],
+) -> Float[Tensor, "b ..."]:
+    """What `steer` or `controls` answers, whatever its values.
+
+    Raises:
+        ControllerError: it raises, or answers with something that has not the promised shape, dtype and device.
+    """
+    what = f"the controller's {member}"
+    answer: object = call(what, getattr(controller, member), frames, speed_mps, command)
+    shape = (len(frames),) if member == "steer" else (len(frames), 3)
+    meant = "one value a frame" if member == "steer" else "steer, throttle and brake a frame"
+    expected = f"expected a floating-point tensor of shape {shape}, {meant}"
+    if not isinstance(answer, Tensor):
+        raise ControllerError(f"{what} answered {_in_words(answer)}, {expected}")
+    if answer.shape != shape or not answer.is_floating_point():
+        raise ControllerError(f"{what} answered shape {tuple(answer.shape)}, {answer.dtype}, {expected}")
+    if answer.device != frames.device:
+        raise ControllerError(f"{what} answered on {answer.device}, expected {frames.device}, where the frames are")
+    return answer
+
+
+def require_finite(answer: Float[Tensor, "b ..."], member: str) -> None:
+    """Refuse NaN and infinity.
+
+    Raises:
+        ControllerError: some are there; the message says for how many frames.
+    """
+    finite = answer.detach().isfinite()
+    if not bool(finite.all()):
+        broken = int((~finite.reshape(len(answer), -1).all(1)).sum())
+        raise ControllerError(
+            f"the controller's {member} answered NaN or infinity for {broken} of {len(answer)} frames; check its "
+            "weights, divisions by zero and logarithms"
+        )
+
+
+def require_gradient(answer: Float[Tensor, "b ..."], frames: Float[Tensor, "b 3 h w"], member: str) -> None:
+    """Refuse an answer without gradients to frames that carry them.
+
+    Raises:
+        ControllerError: it has none.
+    """
+    if torch.is_grad_enabled() and frames.requires_grad and not answer.requires_grad:
+        raise ControllerError(f"the controller's {member} answered without a gradient to the frames; {NO_GRADIENT}")
+
+
+def _in_words(value: object) -> str:
+    """The type of what came instead, and its shape or value, shortly."""
+    if isinstance(value, np.ndarray | Tensor):
+        kind = "a numpy array" if isinstance(value, np.ndarray) else "a tensor"
+        return f"{kind} of shape {tuple(cast('tuple[int, ...]', value.shape))}, {value.dtype}"
+    if value is None:
+        return "None"
+    return f"a {type(value).__name__}"
