@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import select
 import socket
 import subprocess
@@ -48,20 +49,21 @@ def free_port():
 
 @contextlib.contextmanager
 def serving(*arguments, program="from roadproof.cli import main; main()"):
-    """Serve; yields the process and its port, once it listens."""
-    port = free_port()
-    command = [sys.executable, "-c", program, "carla", "serve", "--port", str(port), *map(str, arguments)]
+    """Serve; yields the process and its port, once it answers."""
+    command = [sys.executable, "-c", program, "carla", "serve", "--port", "0", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment) as process:
         try:
             said = b""
             until = time.monotonic() + START_S
-            while b"Serving" not in said:
+            while not (found := re.search(rb"Serving .*:(\d+) and (\d+);", said)):
                 ready, _, _ = select.select([process.stdout], [], [], max(until - time.monotonic(), 0.0))
                 chunk = os.read(process.stdout.fileno(), 4096) if ready else b""
                 if not chunk:
                     raise RuntimeError(f"the server did not start: {said.decode()}")
                 said += chunk
+            port, streams = map(int, found.groups())
+            assert streams == port + 1
             yield process, port
         finally:
             process.kill()

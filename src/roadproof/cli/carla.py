@@ -20,8 +20,18 @@ Port = Annotated[int, number("Port of its calls; sensor data goes through the ne
 
 @carla.command()
 def serve(
-    port: Port = 2000,
+    port: Annotated[
+        int, number("Port of its calls; sensor data goes through the next. 0 takes any two that are free.", 0, 65534)
+    ] = 2000,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    allow_remote: Annotated[
+        bool,
+        typer.Option(
+            "--allow-remote",
+            help="Listen on other addresses than this machine's loopback. There is no password: anyone who reaches the "
+            "ports can drive, spawn and destroy actors, and load maps.",
+        ),
+    ] = False,
     map_file: Annotated[
         list[Path] | None, typer.Option("--map", help="OpenDRIVE file to offer besides town and second.")
     ] = None,
@@ -41,8 +51,12 @@ def serve(
         port=port,
         maps=maps,
         first=chosen,
-        ready=lambda: typer.echo(f"Serving CARLA's protocol on {host}:{port} and {port + 1}; end with Ctrl+C"),
+        allow_remote=allow_remote,
+        ready=lambda opened: typer.echo(
+            f"Serving CARLA's protocol on {host}:{opened} and {opened + 1}; end with Ctrl+C"
+        ),
     )
+    typer.echo("Ended; all connections and the town are closed")
 
 
 @carla.command()

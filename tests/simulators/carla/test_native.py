@@ -39,8 +39,8 @@ STREET = Scenario(
 )
 # A server on which no texture ever changes, as where a road's material has no parameter of the right name.
 DEAF = """
-from roadproof.simulators.carla_server import calls, wire
-calls.Calls.call_apply_color_texture_to_objects = lambda self, names, material, texture: wire.DONE
+from roadproof.simulators.carla_server import world
+world.World.paint = lambda self, names, picture: None
 from roadproof.cli import main
 main()
 """

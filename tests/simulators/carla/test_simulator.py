@@ -205,9 +205,9 @@ from roadproof.cli import main
 class Unsteady(server.Server):
     count = 0
 
-    def send(self, stream, message):
+    def send(self, stream, message, *, once=True):
         if stream == wire.WORLD_STREAM:
-            return super().send(stream, message)
+            return super().send(stream, message, once=once)
         # Every picture comes twice, and late.
         Unsteady.count += 1
         loop, send = asyncio.get_running_loop(), super().send

@@ -284,6 +284,23 @@ def test_a_call_it_does_not_know_is_refused(world):
         world.cast_ray(carla.Location(), carla.Location(1.0, 0.0, 0.0))
 
 
+def test_what_is_no_number_or_too_large_is_refused_and_the_client_told(world):
+    blueprint = world.get_blueprint_library().find("vehicle.ford.mustang")
+    with pytest.raises(RuntimeError, match=r"pose of spawn_actor is \[\[nan, 1.75"):
+        world.spawn_actor(blueprint, carla.Transform(carla.Location(float("nan"), 1.75, 0.3)))
+    name = world.get_names_of_all_objects()[0]
+    with pytest.raises(RuntimeError, match="a message is larger than 16777216 bytes"):
+        world.apply_color_texture_to_object(name, carla.MaterialParameter.Diffuse, carla.TextureColor(2048, 2048))
+
+
+def test_a_control_that_is_no_number_leaves_the_one_before(world):
+    ego = car(world)
+    ego.apply_control(carla.VehicleControl(throttle=0.5))
+    ego.apply_control(carla.VehicleControl(throttle=float("nan")))
+    world.tick()
+    assert ego.get_control().throttle == 0.5
+
+
 def test_a_free_running_world_goes_on_by_itself(client):
     world = client.get_world()
     ego = car(world)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
+from roadproof.errors import SimulatorError
 from roadproof.simulators.carla_server.wire import Value
 from roadproof.simulators.town.models import PAINTS, Body
 
@@ -34,6 +37,24 @@ class Attribute:
         """As the client takes it."""
         return [self.name, int(self.kind), self.default, list(self.recommended), self.settable, False]
 
+    def takes(self, value: str) -> bool:
+        """Whether a value is of its kind."""
+        try:
+            match self.kind:
+                case Kind.BOOL:
+                    return value.lower() in ("true", "false", "1", "0")
+                case Kind.INT:
+                    return abs(int(value)) < 2**31
+                case Kind.FLOAT:
+                    return math.isfinite(float(value))
+                case Kind.COLOUR:
+                    levels = [int(level) for level in value.split(",")]
+                    return len(levels) == 3 and all(0 <= level <= 255 for level in levels)
+                case Kind.TEXT:
+                    return True
+        except ValueError:
+            return False
+
 
 @dataclass(frozen=True, slots=True)
 class Blueprint:
@@ -46,6 +67,24 @@ class Blueprint:
         """As the client takes it."""
         tags = ",".join(reversed(self.name.split(".")))
         return [uid, self.name, tags, [attribute.wire for attribute in self.attributes]]
+
+    def filled(self, given: Sequence[tuple[str, int, str]]) -> list[Value]:
+        """All its attributes as (name, kind, value), from what a client gave; the others have their defaults.
+
+        Raises:
+            SimulatorError: it has no such attribute, or the value is of another kind.
+        """
+        values = {name: value for name, _, value in given}
+        own = {attribute.name: attribute for attribute in self.attributes}
+        for name, value in values.items():
+            if name not in own:
+                raise SimulatorError(f"{self.name} has no attribute {name!r:.80}, expected one of {', '.join(own)}")
+            if not own[name].takes(value):
+                kind = own[name].kind.name.lower()
+                raise SimulatorError(
+                    f"attribute {name} of {self.name} is {value!r:.80}, expected a value of type {kind}"
+                )
+        return [[name, int(each.kind), values.get(name, each.default)] for name, each in own.items()]
 
 
 VEHICLES = {
@@ -114,6 +153,9 @@ LIBRARY = (
     Blueprint(COLLISION_SENSOR, (_role("front"),)),
     Blueprint(LANE_SENSOR, (_role("front"),)),
 )
+
+NUMBERS = {blueprint.name: number for number, blueprint in enumerate(LIBRARY, 1)}
+"""The number of each blueprint by its name."""
 
 
 def look_of(name: str, attributes: dict[str, str]) -> int:

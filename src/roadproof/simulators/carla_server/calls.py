@@ -3,35 +3,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import cast
+import logging
+from collections.abc import Callable, Sequence
 
+import msgspec
 import numpy as np
+from msgspec import Raw
+from msgspec.msgpack import Decoder
 
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.simulators.carla_server import blueprints, wire
 from roadproof.simulators.carla_server.actors import Actor
+from roadproof.simulators.carla_server.arguments import (
+    Byte,
+    Commands,
+    Description,
+    Id,
+    Ids,
+    Mps,
+    Place,
+    Port,
+    Settings,
+    Signature,
+    SpawnCommand,
+    Text,
+    Texts,
+    Texture,
+    VehicleControl,
+    Velocity,
+    WalkerControl,
+    Weather,
+    WirePose,
+    read,
+)
+from roadproof.simulators.carla_server.places import spawn_points
+from roadproof.simulators.carla_server.requests import Request
 from roadproof.simulators.carla_server.sensors import check_camera
 from roadproof.simulators.carla_server.wire import DONE, ORIGIN, WORLD_STREAM, Value, granted, refused
 from roadproof.simulators.carla_server.world import SETTINGS, World
 
-SPAWN, DESTROY, CONTROL, WALK, TRANSFORM, WALKER_STATE, VELOCITY, PHYSICS = 0, 1, 2, 4, 6, 7, 8, 14
+SPAWN, LAST_COMMAND = 0, 19
+COMMANDS = {
+    1: "destroy_actor",
+    2: "apply_control_to_vehicle",
+    4: "apply_control_to_walker",
+    6: "set_actor_transform",
+    7: "set_walker_state",
+    8: "set_actor_target_velocity",
+    14: "set_actor_simulate_physics",
+}
+"""The calls that commands of a batch stand for; the other numbers, as of autopilot and lights, change nothing here."""
+
 DIFFUSE = 2
 
-NOT_THERE: dict[str, Value] = {
-    "freeze_all_traffic_lights": DONE,
-    "get_all_level_BBs": granted([]),
-    "get_environment_objects": granted([]),
-    "get_navigation_mesh": granted(b""),
-    "get_required_files": granted([]),
-    "get_vehicle_light_states": granted([]),
-    "query_lights_state": granted([]),
-    "reset_all_traffic_lights": DONE,
-    "set_actor_autopilot": DONE,  # the client's own traffic manager drives
-    "set_actor_collisions": DONE,
-    "update_lights_state": DONE,
+NOT_THERE: dict[str, tuple[Signature, Value]] = {
+    "freeze_all_traffic_lights": (Signature.taking(frozen=bool), DONE),
+    "get_all_level_BBs": (Signature.taking(label=Byte), granted([])),
+    "get_environment_objects": (Signature.taking(label=Byte), granted([])),
+    "get_navigation_mesh": (Signature.taking(), granted(b"")),
+    "get_required_files": (Signature.taking(folder=Text), granted([])),
+    "get_vehicle_light_states": (Signature.taking(), granted([])),
+    "query_lights_state": (Signature.taking(client=Text), granted([])),
+    "reset_all_traffic_lights": (Signature.taking(), DONE),
+    "update_lights_state": (Signature.taking(client=Text, lights=Raw, discard=bool), DONE),
 }
 """What clients call though there is nothing of the kind here, and what they are told."""
+
+_FIELDS: Decoder[list[Raw]] = Decoder(list[Raw])
+_ID: Decoder[int] = Decoder(Id)
+_SPAWN: Decoder[SpawnCommand] = Decoder(SpawnCommand)
 
 
 class Calls:
@@ -46,20 +86,34 @@ class Calls:
     def __init__(self, world: World, port: int, advance: Callable[[], None]) -> None:
         self._world, self._port, self._advance = world, port, advance
         self._managers: dict[int, Value] = {}
+        methods: dict[str, Callable[..., Value]] = {
+            name.removeprefix("call_"): getattr(self, name) for name in dir(self) if name.startswith("call_")
+        }
+        self._methods = {name: (Signature.of(method), method) for name, method in methods.items()}
 
-    def answer(self, name: str, args: list[Value]) -> Value:
-        """The result of a call on the wire."""
-        if name in NOT_THERE:
-            return NOT_THERE[name]
-        method = cast("Callable[..., Value] | None", getattr(self, f"call_{name}", None))
-        if method is None:
-            return refused(f"this server does not know {name}")
+    def answer(self, request: Request) -> bytes:
+        """The answer to a call on the wire."""
         try:
-            return method(*args)
+            return wire.request_answer(request.id, self._result(request.name, request.arguments))
         except RoadproofError as error:
-            return refused(str(error))
-        except KeyError as error:
-            return refused(f"there is no actor {error}")
+            text = f"{error!s:.1000}"
+        except Exception as error:
+            # A mistake of this server; the other clients are not to suffer for it.
+            logging.getLogger(__name__).exception("%s failed", request.name)
+            text = f"{request.name} failed in the server: {type(error).__name__}"
+        if request.name == "apply_batch":  # a list of answers, which would hide the error
+            return wire.request_error(request.id, text)
+        return wire.request_answer(request.id, refused(text))
+
+    def _result(self, name: str, arguments: Sequence[Raw]) -> Value:
+        if name in NOT_THERE:
+            signature, result = NOT_THERE[name]
+            signature.read(name, arguments)
+            return result
+        if name not in self._methods:
+            raise SimulatorError(f"this server does not know {name!r:.80}")
+        signature, method = self._methods[name]
+        return method(*signature.read(name, arguments))
 
     # The session
 
@@ -72,26 +126,29 @@ class Calls:
     def call_get_episode_info(self) -> Value:
         return granted([self._world.episode, [wire.token(WORLD_STREAM, self._port + 1)]])
 
-    def call_get_sensor_token(self, stream: int) -> Value:
+    def call_get_sensor_token(self, stream: Id) -> Value:
+        if not self._world.has_stream(stream):
+            raise SimulatorError(f"there is no stream {stream}")
         return granted([wire.token(stream, self._port + 1)])
 
     def call_get_episode_settings(self) -> Value:
         return granted(self._world.settings)
 
-    def call_set_episode_settings(self, settings: Value) -> Value:
+    def call_set_episode_settings(self, settings: Settings) -> Value:
         self._world.set_settings(settings)
         return granted(self._world.frame)
 
-    def call_load_new_episode(self, name: str, reset_settings: bool, _layers: int) -> Value:
+    def call_load_new_episode(self, name: Text, reset_settings: bool, layers: Id) -> Value:
+        del layers
         here = self._world.town.name if self._world.town is not None else ""
         self._world.load(name.rsplit("/", 1)[-1] or here)
         if reset_settings:
-            self._world.set_settings(list(SETTINGS))
+            self._world.set_settings(SETTINGS)
         return DONE
 
     def call_get_map_info(self) -> Value:
         assert self._world.town is not None
-        places = [wire.transform(pose) for pose in self._world.spawn_points()]
+        places = [wire.transform(pose) for pose in spawn_points(self._world.town.roads)]
         return granted([f"Carla/Maps/{self._world.town.name}", places])
 
     def call_get_map_data(self) -> Value:
@@ -107,7 +164,7 @@ class Calls:
     def call_get_weather_parameters(self) -> Value:
         return granted(list(self._world.weather))
 
-    def call_set_weather_parameters(self, parameters: list[float]) -> Value:
+    def call_set_weather_parameters(self, parameters: Weather) -> Value:
         self._world.set_weather(parameters)
         return DONE
 
@@ -117,7 +174,7 @@ class Calls:
     def call_get_spectator(self) -> Value:
         return granted(Actor(1, 0, "spectator", [], ORIGIN).wire(self._port + 1))
 
-    def call_get_actors_by_id(self, ids: list[int]) -> Value:
+    def call_get_actors_by_id(self, ids: Ids) -> Value:
         actors = self._world.actors
         return granted([actors[i].wire(self._port + 1) for i in ids if i in actors])
 
@@ -125,7 +182,7 @@ class Calls:
         assert self._world.town is not None
         return granted(list(self._world.town.pieces))
 
-    def call_apply_color_texture_to_objects(self, names: list[str], material: int, texture: Value) -> Value:
+    def call_apply_color_texture_to_objects(self, names: Texts, material: Byte, texture: Texture) -> Value:
         width, height, colours = texture
         # As in CARLA, what cannot be painted is no error.
         if material == DIFFUSE and width * height == len(colours) > 0:
@@ -135,107 +192,122 @@ class Calls:
 
     # Actors
 
-    def call_spawn_actor(self, description: Value, pose: Value) -> Value:
+    def call_spawn_actor(self, description: Description, pose: WirePose) -> Value:
         return granted(self._spawned(description, pose).wire(self._port + 1))
 
-    def call_spawn_actor_with_parent(self, description: Value, pose: Value, parent: int, *_: Value) -> Value:
+    def call_spawn_actor_with_parent(
+        self, description: Description, pose: WirePose, parent: Id, attachment: int, bone: Text
+    ) -> Value:
+        del attachment, bone
         return granted(self._spawned(description, pose, parent).wire(self._port + 1))
 
-    def _spawned(self, description: Value, pose: Value, parent: int = 0) -> Actor:
-        actor = self._world.spawn(description, wire.pose_of(pose), parent)
+    def _spawned(self, description: Description, pose: WirePose, parent: int | None = None) -> Actor:
+        _, name, attributes = description
+        actor = self._world.spawn(name, attributes, wire.pose_of(pose), parent)
         if actor.name in blueprints.CAMERAS:
             try:
-                check_camera(actor)
+                check_camera(self._world, actor)
             except SimulatorError:
                 self._world.destroy(actor.id)
                 raise
         return actor
 
-    def call_destroy_actor(self, key: int) -> Value:
+    def call_destroy_actor(self, key: Id) -> Value:
         return granted(True) if self._world.destroy(key) else refused(f"there is no actor {key}")
 
-    def call_get_actor_bounding_box(self, key: int) -> Value:
-        return granted([*self._world.actors[key].box, [0.0, 0.0, 0.0]])
+    def call_get_actor_bounding_box(self, key: Id) -> Value:
+        return granted([*self._world.actor(key).box, [0.0, 0.0, 0.0]])
 
-    def call_apply_control_to_vehicle(self, key: int, control: Value) -> Value:
-        self._world.actors[key].control = tuple(control)
+    def call_apply_control_to_vehicle(self, key: Id, control: VehicleControl) -> Value:
+        self._world.actor(key, "vehicle").control = control
         return DONE
 
-    def call_apply_control_to_walker(self, key: int, control: Value) -> Value:
-        (x, y, z), speed = control[:2]
-        self._world.actors[key].walk = (x, y, z, speed)
+    def call_apply_control_to_walker(self, key: Id, control: WalkerControl) -> Value:
+        (x, y, z), speed, _ = control
+        self._world.actor(key, "walker").walk = (x, y, z, speed)
         return DONE
 
-    def call_set_actor_transform(self, key: int, pose: Value) -> Value:
+    def call_set_actor_transform(self, key: Id, pose: WirePose) -> Value:
+        actor = self._world.actor(key)
+        before = actor.pose
         self._world.move(key, wire.pose_of(pose))
+        if actor.name in blueprints.CAMERAS:
+            try:
+                check_camera(self._world, actor)
+            except SimulatorError:
+                actor.pose = before
+                raise
         return DONE
 
-    def call_set_actor_location(self, key: int, place: Value) -> Value:
-        x, y, z = place
-        self._world.move(key, (x, y, z, *self._world.actors[key].pose[3:]))
+    def call_set_walker_state(self, key: Id, pose: WirePose, speed: Mps) -> Value:
+        del speed
+        return self.call_set_actor_transform(key, pose)
+
+    def call_set_actor_location(self, key: Id, place: Place) -> Value:
+        self._world.move(key, (*place, *self._world.actor(key).pose[3:]))
         return DONE
 
-    def call_set_actor_target_velocity(self, key: int, velocity: Value) -> Value:
+    def call_set_actor_target_velocity(self, key: Id, velocity: Velocity) -> Value:
         self._world.push(key, velocity)
         return DONE
 
-    def call_set_actor_simulate_physics(self, key: int, enabled: bool) -> Value:
+    def call_set_actor_simulate_physics(self, key: Id, enabled: bool) -> Value:
         self._world.set_physics(key, enabled)
+        return DONE
+
+    def call_set_actor_autopilot(self, key: Id, enabled: bool) -> Value:
+        del enabled  # the client's own traffic manager drives
+        self._world.actor(key, "vehicle")
+        return DONE
+
+    def call_set_actor_collisions(self, key: Id, enabled: bool) -> Value:
+        del enabled  # all actors always collide
+        self._world.actor(key)
         return DONE
 
     # Batches, and the registry of traffic managers
 
-    def call_apply_batch(self, commands: list[Value], then_tick: bool) -> Value:
+    def call_apply_batch(self, commands: Commands, then_tick: bool) -> Value:
         results: list[Value] = []
-        for (command,) in commands:
+        for ((which, fields),) in commands:
             try:
-                results.append(granted(self._command(*command)))
+                results.append(granted(self._command(which, fields)))
             except RoadproofError as error:
                 results.append(refused(str(error)))
-            except KeyError as error:
-                results.append(refused(f"there is no actor {error}"))
         if then_tick:
             self._advance()
         return results
 
-    def _command(self, which: int, body: list[Value]) -> int:
+    def _command(self, which: int, fields: Raw, spawned: int | None = None) -> int:
+        """Follow one command; the id of its actor, which is `spawned` where the command follows a spawn."""
+        if which > LAST_COMMAND or (which == SPAWN and spawned is not None):
+            raise SimulatorError(f"a batch has a command of type {which} where there can be none")
         if which == SPAWN:
-            return self._spawn_command(body)
-        key = int(body[0])
-        if key not in self._world.actors:
-            raise KeyError(key)
-        if which == DESTROY:
-            self._world.destroy(key)
-        elif which == CONTROL:
-            self.call_apply_control_to_vehicle(key, body[1])
-        elif which == WALK:
-            self.call_apply_control_to_walker(key, body[1])
-        elif which in (TRANSFORM, WALKER_STATE):
-            self._world.move(key, wire.pose_of(body[1]))
-        elif which == VELOCITY:
-            self._world.push(key, body[1])
-        elif which == PHYSICS:
-            self._world.set_physics(key, body[1])
+            return self._spawn_command(read("a command to spawn", _SPAWN, fields))
+        own, *arguments = read("a command", _FIELDS, fields) or [Raw()]
+        key = read("the actor of a command", _ID, own) if spawned is None else spawned
+        self._world.actor(key)
+        if which in COMMANDS:
+            self._result(COMMANDS[which], [Raw(msgspec.msgpack.encode(key)), *arguments])
         return key
 
-    def _spawn_command(self, body: list[Value]) -> int:
-        """`body` holds blueprint, pose, perhaps a parent, and at last the commands for the new actor."""
-        parent = int(body[2][1]) if len(body[2]) == 2 else 0
-        key = self._spawned(body[0], body[1], parent).id
-        for ((which, arguments),) in body[-1]:
-            self._command(which, [key, *arguments[1:]])
+    def _spawn_command(self, command: SpawnCommand) -> int:
+        description, pose, parent, _, _, afterwards = command
+        key = self._spawned(description, pose, parent[1] if len(parent) == 2 else None).id
+        for ((which, fields),) in afterwards:
+            self._command(which, fields, key)
         return key
 
-    def call_is_traffic_manager_running(self, port: int) -> Value:
+    def call_is_traffic_manager_running(self, port: Port) -> Value:
         return granted(port in self._managers)
 
-    def call_get_traffic_manager_running(self, port: int) -> Value:
+    def call_get_traffic_manager_running(self, port: Port) -> Value:
         return granted(list(self._managers.get(port, ("", 0))))
 
-    def call_add_traffic_manager_running(self, manager: Value) -> Value:
+    def call_add_traffic_manager_running(self, manager: tuple[Text, Port]) -> Value:
         self._managers[manager[1]] = manager
         return granted(True)
 
-    def call_destroy_traffic_manager(self, port: int) -> Value:
+    def call_destroy_traffic_manager(self, port: Port) -> Value:
         self._managers.pop(port, None)
         return DONE

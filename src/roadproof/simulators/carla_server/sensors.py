@@ -10,8 +10,9 @@ from jaxtyping import Float, UInt8
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
-from roadproof.simulators.carla_server import wire
+from roadproof.simulators.carla_server import limits, wire
 from roadproof.simulators.carla_server.actors import Actor, attached
+from roadproof.simulators.carla_server.blueprints import CAMERAS
 from roadproof.simulators.carla_server.world import Collision, Town, World
 from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.labels import FAR_M, Label, LabelledPicture
@@ -34,11 +35,11 @@ CARLA_LABELS = {
 """CARLA's numbers since 0.9.14."""
 
 
-def check_camera(sensor: Actor) -> None:
+def check_camera(world: World, sensor: Actor) -> None:
     """Refuse a camera that cannot be served.
 
     Raises:
-        SimulatorError: its size, field of view or roll is out of range.
+        SimulatorError: its size, field of view or roll is out of range, or all cameras together are too large.
     """
     width, height, fov = _optics(sensor)
     if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX and 1.0 <= fov <= 115.0):
@@ -47,6 +48,13 @@ def check_camera(sensor: Actor) -> None:
         )
     if abs(sensor.pose[5]) > MAX_ROLL_DEG:
         raise SimulatorError(f"a camera rolled by {sensor.pose[5]:.1f}° cannot be served, expected 0")
+    sizes = [_optics(actor)[:2] for actor in world.actors.values() if actor.name in CAMERAS]
+    pixels = sum(width * height for width, height in sizes)
+    if pixels > limits.CAMERA_PIXELS:
+        raise SimulatorError(
+            f"all cameras together would have {pixels} pixels, expected at most {limits.CAMERA_PIXELS}; destroy some, "
+            "or make them smaller"
+        )
 
 
 def _optics(sensor: Actor) -> tuple[int, int, float]:

@@ -36,7 +36,6 @@ except ImportError as error:  # pragma: no cover - the extra is installed where 
 
 VERSION = "0.9.16"
 WORLD_STREAM = 1
-MAX_MESSAGE_BYTES = 64 << 20
 
 # Places in the client's registry of sensors.
 COLLISION, IMAGE, WORLD_OBSERVER = 0, 13, 17
@@ -69,9 +68,9 @@ def request_answer(call_id: int, result: Value) -> bytes:
     return msgpack.packb([1, call_id, None, result])
 
 
-def unpacker() -> Value:
-    """Takes bytes as they come in and gives requests."""
-    return msgpack.Unpacker(raw=False, strict_map_key=False, max_buffer_size=MAX_MESSAGE_BYTES)
+def request_error(call_id: int, text: str) -> bytes:
+    """The answer to what cannot be taken as a call: msgpack-rpc's own error, of which the client shows no text."""
+    return msgpack.packb([1, call_id, text, None])
 
 
 def token(stream: int, port: int) -> bytes:
@@ -92,7 +91,7 @@ def transform(pose: Pose6) -> Value:
 def pose_of(value: Value) -> Pose6:
     """The pose in a call's argument."""
     (x, y, z), (pitch, yaw, roll) = value
-    return float(x), float(y), float(z), float(pitch), float(yaw), float(roll)
+    return x, y, z, pitch, yaw, roll
 
 
 def header(kind: int, frame: int, time_s: float, pose: Pose6) -> bytes:

@@ -17,10 +17,10 @@ from jaxtyping import UInt8
 from roadproof.datatypes import Control, VehicleState, Weather
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
-from roadproof.simulators.carla_server import blueprints, weather
+from roadproof.simulators.carla_server import blueprints, limits, weather
 from roadproof.simulators.carla_server.actors import Actor
 from roadproof.simulators.carla_server.pieces import Piece, road_pieces
-from roadproof.simulators.carla_server.wire import ORIGIN, Pose6, Value
+from roadproof.simulators.carla_server.wire import ORIGIN, WORLD_STREAM, Pose6, Value
 from roadproof.simulators.town.judge import people_hit
 from roadproof.simulators.town.labels import LabelledPicture, LabelScene
 from roadproof.simulators.town.maps import BUILTIN_MAPS, builtin_map_file, load_map
@@ -31,8 +31,6 @@ from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.scenery import Scenery, build_scenery
 
 FREE_RUN_S = 0.05
-SPAWN_EVERY_M = 15.0
-SPAWN_UP_M = 0.3
 CAR_LENGTH_M = 4.5
 SYNCHRONOUS, NO_RENDERING, FIXED_DT = 0, 1, 2
 SETTINGS: Value = [False, False, [False], True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
@@ -62,6 +60,13 @@ class Town:
         if self.labelled is None:
             self.labelled = LabelScene(self.roads, self.scenery)
         return self.labelled
+
+    def forget_views(self) -> None:
+        """Give the memory of what was seen back."""
+        self.last_look = None
+        self.renderer.forget_views()
+        if self.labelled is not None:
+            self.labelled.forget_views()
 
     def close(self) -> None:
         """Give everything back."""
@@ -140,6 +145,7 @@ class World:
                 self.town.close()
             pieces = {piece.name: piece for piece in road_pieces(name, roads)}
             self.town = Town(name, file, roads, scenery, Renderer(roads, scenery, CIL_CAMERA, CIL_INPUT), pieces)
+        self.town.forget_views()
         self.town.renderer.paint_road({})
         self._painted.clear()
         self.weather = weather.CLEAR
@@ -178,33 +184,68 @@ class World:
         """Take CARLA's settings.
 
         Raises:
-            SimulatorError: the fixed step is not a multiple of the physics' own.
+            SimulatorError: the fixed step is not a multiple of the physics' own, or too long.
         """
         fixed = settings[FIXED_DT]
         if len(fixed) == 2 and fixed[1]:
             steps = fixed[1] / SUBSTEP_S
-            if round(steps) < 1 or abs(steps - round(steps)) > 1e-4:
-                raise SimulatorError(f"fixed_delta_seconds is {fixed[1]}, expected a multiple of {SUBSTEP_S}")
+            if not SUBSTEP_S / 2 < fixed[1] <= limits.STEP_S or abs(steps - round(steps)) > 1e-4:
+                raise SimulatorError(
+                    f"fixed_delta_seconds is {fixed[1]}, expected a multiple of {SUBSTEP_S} up to {limits.STEP_S}"
+                )
         self.settings = settings
 
-    def spawn(self, description: Value, pose: Pose6, parent: int = 0) -> Actor:
-        """Make an actor.
+    def actor(self, key: int, *kinds: str) -> Actor:
+        """An actor by its number.
 
         Raises:
-            SimulatorError: another vehicle is in the place, the blueprint is unknown, or the parent is not there.
+            SimulatorError: it is not there, or of none of these kinds.
         """
-        uid, name, attributes = description
-        if name not in {blueprint.name for blueprint in blueprints.LIBRARY}:
-            raise SimulatorError(f"there is no blueprint {name!r}")
-        if parent and parent not in self.actors:
-            raise SimulatorError(f"there is no actor {parent} to attach to")
-        actor = Actor(self._next_actor, uid, name, attributes, pose, parent)
+        if key not in self.actors:
+            raise SimulatorError(f"there is no actor {key}")
+        found = self.actors[key]
+        if kinds and found.kind not in kinds:
+            raise SimulatorError(f"actor {key} is a {found.kind}, expected a {' or '.join(kinds)}")
+        return found
+
+    def has_stream(self, stream: int) -> bool:
+        """Whether the world or a sensor sends through a stream."""
+        return stream == WORLD_STREAM or stream in {actor.stream for actor in self.actors.values() if actor.stream}
+
+    def spawn(
+        self, name: str, attributes: Sequence[tuple[str, int, str]], pose: Pose6, parent: int | None = None
+    ) -> Actor:
+        """Make an actor.
+
+        Args:
+            name: of its blueprint.
+            attributes: as (name, type, value); others have their defaults.
+            pose: in the world, or relative to the parent.
+            parent: a vehicle or walker that carries a sensor.
+
+        Raises:
+            SimulatorError: another vehicle is in the place, the blueprint is unknown, an attribute does not fit it, the
+                parent is not there or carries none, or there are too many actors.
+        """
+        if name not in blueprints.NUMBERS:
+            raise SimulatorError(f"there is no blueprint {name!r:.80}")
+        if len(self.actors) >= limits.ACTORS:
+            raise SimulatorError(f"there are {limits.ACTORS} actors, the most there may be; destroy some")
+        uid = blueprints.NUMBERS[name]
+        attributes = blueprints.LIBRARY[uid - 1].filled(attributes)
+        actor = Actor(self._next_actor, uid, name, attributes, pose, parent or 0)
+        if parent is not None:
+            self.actor(parent, "vehicle", "walker")
+            if actor.kind != "sensor":
+                raise SimulatorError(f"{name} cannot be attached to an actor, expected a sensor")
         if actor.kind == "vehicle" and any(self._overlap(actor, other) for other in self._all("vehicle")):
             raise SimulatorError("Spawn failed because of collision at spawn position")
         if actor.kind == "sensor" and name != blueprints.LANE_SENSOR:
             actor.stream = self._next_stream
             self._next_stream += 1
+        _stand_up(actor)
         if actor.kind == "vehicle":
+            self._check_traffic([*self._all("vehicle"), actor])
             actor.stand(replace(actor.state, z_m=0.0, speed_mps=0.0))
         self._next_actor += 1
         self.actors[actor.id] = actor
@@ -214,31 +255,43 @@ class World:
         """Take an actor away, and the sensors on it; whether it was there."""
         if self.actors.pop(key, None) is None:
             return False
-        if key in self._physics:
-            self._physics.pop(key).close()
+        self._stop_physics(key)
+        self._crowd.pop(key, None)
         for sensor in [actor for actor in self.actors.values() if actor.parent == key]:
             self.destroy(sensor.id)
         return True
 
     def move(self, key: int, pose: Pose6) -> None:
         """Put an actor elsewhere; a vehicle keeps its speed along its new heading."""
-        actor = self.actors[key]
+        actor = self.actor(key)
         speed = math.hypot(*actor.velocity)
         actor.pose = pose
+        _stand_up(actor)
         if actor.kind == "vehicle":
             actor.stand(replace(actor.state, z_m=0.0, speed_mps=speed))
         self._stop_physics(key)
 
     def push(self, key: int, velocity: Sequence[float]) -> None:
         """Give an actor a velocity of CARLA's world, m/s."""
-        self.actors[key].velocity = (velocity[0], -velocity[1], velocity[2])
+        self.actor(key).velocity = (velocity[0], -velocity[1], velocity[2])
         self._stop_physics(key)
 
     def set_physics(self, key: int, enabled: bool) -> None:
-        """Let a vehicle move by itself, or only as it is told to."""
-        self.actors[key].physics = enabled
+        """Let a vehicle move by itself, or only as it is told to.
+
+        Raises:
+            SimulatorError: it is not there, or too many would move.
+        """
+        actor = self.actor(key)
+        before, actor.physics = actor.physics, enabled
+        if enabled and not before and actor.kind == "vehicle":
+            try:
+                self._check_traffic(self._all("vehicle"))
+            except SimulatorError:
+                actor.physics = before
+                raise
         if not enabled:
-            self.actors[key].velocity = (0.0, 0.0, 0.0)
+            actor.velocity = (0.0, 0.0, 0.0)
             self._stop_physics(key)
 
     def step(self) -> list[Collision]:
@@ -255,22 +308,16 @@ class World:
         watched = {actor.parent for actor in self.actors.values() if actor.name == blueprints.COLLISION_SENSOR}
         return [hit for vehicle in vehicles if vehicle.id in watched for hit in self._collisions(vehicle)]
 
-    def spawn_points(self) -> list[Pose6]:
-        """Places along the driving lanes, outside of junctions."""
-        assert self.town is not None
-        places: list[Pose6] = []
-        for lane in self.town.roads.lanes:
-            if lane.kind != "driving" or lane.junction is not None:
-                continue
-            for k in range(int(lane.length_m // SPAWN_EVERY_M)):
-                s = (k + 0.5) * SPAWN_EVERY_M
-                x, y, z = (float(np.interp(s, lane.stations_m, lane.centre[:, axis])) for axis in range(3))
-                heading = float(np.interp(s, lane.stations_m, lane.headings_rad))
-                places.append((x, -y, z + SPAWN_UP_M, 0.0, -math.degrees(heading), 0.0))
-        return places
-
     def _all(self, kind: str) -> list[Actor]:
         return [actor for actor in self.actors.values() if actor.kind == kind]
+
+    def _check_traffic(self, vehicles: Sequence[Actor]) -> None:
+        moving = sum(vehicle.physics for vehicle in vehicles)
+        if moving * len(vehicles) > limits.VEHICLE_PAIRS:
+            raise SimulatorError(
+                f"{moving} of {len(vehicles)} vehicles would move by themselves, expected at most "
+                f"{limits.VEHICLE_PAIRS // len(vehicles)}; switch off the physics of some, or destroy them"
+            )
 
     def _overlap(self, one: Actor, other: Actor) -> bool:
         away = math.dist(one.pose[:2], other.pose[:2])
@@ -296,8 +343,9 @@ class World:
             physics.move_cars(np.array([(pose.x_m, pose.y_m, pose.yaw_rad) for pose in others]).reshape(-1, 3))
         self._crowd[vehicle.id] = len(others)
         throttle, steer, brake, hand, reverse = vehicle.control[:5]
-        push = -float(throttle) if reverse else float(throttle)
-        physics.step(Control(float(steer), push, 1.0 if hand else float(brake)), self.dt_s)
+        given = Control(steer, throttle, 1.0 if hand else brake).clipped()
+        push = -given.throttle if reverse else given.throttle
+        physics.step(Control(given.steer, push, given.brake), self.dt_s)
         before, after = vehicle.state, physics.state()
         vehicle.walked_m += math.dist((before.x_m, before.y_m), (after.x_m, after.y_m))
         vehicle.stand(after)
@@ -327,6 +375,12 @@ class World:
         walkers = self._all("walker")
         places = np.array([(walker.state.x_m, walker.state.y_m) for walker in walkers]).reshape(-1, 2)
         return hits + [Collision(vehicle, walkers[i]) for i in people_hit(vehicle.state, places)]
+
+
+def _stand_up(actor: Actor) -> None:
+    """A walker turns about the vertical only."""
+    if actor.kind == "walker":
+        actor.pose = (*actor.pose[:3], 0.0, actor.pose[4], 0.0)
 
 
 def _pose(state: VehicleState) -> Pose:

@@ -73,6 +73,11 @@ class CanvasNode:
         for texture, copy in zip(self._textures, made, strict=True):
             fill_texture(texture, copy)
 
+    def close(self) -> None:
+        """Take it out of the world."""
+        for path in self._paths:
+            path.remove_node()
+
     def hide(self) -> None:
         """Not to be seen until the next `see`."""
         self._shown = [False] * len(self._paths)

@@ -161,10 +161,23 @@ class Screen:
         camera: the pinhole.
         crop: what is seen of its picture, and the size of what comes out.
         magnified: pixels rendered per pixel that comes out, along each side.
+        anywhere: whether the camera may be so high that sky and ground leave pixels free; these are black.
+
+    Attributes:
+        camera: may be replaced by one of the same size and field of view that looks from elsewhere.
     """
 
-    def __init__(self, pipe: Pipe, root: Path, camera: CameraModel, crop: CropResize, magnified: int) -> None:
-        self._camera, self._magnified = camera, magnified
+    def __init__(
+        self,
+        pipe: Pipe,
+        root: Path,
+        camera: CameraModel,
+        crop: CropResize,
+        magnified: int,
+        *,
+        anywhere: bool = False,
+    ) -> None:
+        self.camera, self._magnified = camera, magnified
         self._size = (crop.width_px * magnified, crop.height_px * magnified)
         self._engine = core.GraphicsEngine.get_global_ptr()
         properties = core.FrameBufferProperties()
@@ -172,7 +185,8 @@ class Screen:
         properties.set_rgba_bits(8, 8, 8, 8)
         properties.set_depth_bits(24)
         size = core.WindowProperties.size(*self._size)
-        self._buffer = self._engine.make_output(pipe, "screen", 0, properties, size, core.GraphicsPipe.BF_refuse_window)
+        flags = core.GraphicsPipe.BF_refuse_window | core.GraphicsPipe.BF_resizeable
+        self._buffer = self._engine.make_output(pipe, "screen", 0, properties, size, flags)
         if self._buffer is None:
             raise SimulatorError(f"Panda3D gave no offscreen buffer of {self._size[0]}×{self._size[1]} pixels")
         lens = core.PerspectiveLens()
@@ -186,15 +200,16 @@ class Screen:
         region = self._buffer.make_display_region()
         region.set_camera(self._eye)
         region.set_clear_depth_active(True)
-        # The sky covers every pixel, so no colour need be cleared.
-        self._buffer.set_clear_color_active(False)
+        # Where the sky covers every pixel no colour need be cleared.
+        self._buffer.set_clear_color_active(anywhere)
+        self._buffer.set_clear_color(core.Vec4(0, 0, 0, 0))
         self._pixels = core.Texture()
         self._buffer.add_render_texture(self._pixels, core.GraphicsOutput.RTM_copy_ram)
         self._buffer.set_active(False)
 
     def look_from(self, state: VehicleState) -> tuple[float, float, float]:
         """Put the eye where the camera of a vehicle is; returns its world position in metres."""
-        camera, yaw = self._camera, state.yaw_rad
+        camera, yaw = self.camera, state.yaw_rad
         x = state.x_m + camera.forward_m * math.cos(yaw) - camera.left_m * math.sin(yaw)
         y = state.y_m + camera.forward_m * math.sin(yaw) + camera.left_m * math.cos(yaw)
         z = state.z_m + camera.up_m
@@ -215,6 +230,11 @@ class Screen:
 
     def close(self) -> None:
         """Give the buffer and its memory back."""
+        # Panda3D 1.10 keeps the pixels of a buffer that is taken away, but not of one that has become smaller.
+        self._buffer.remove_all_display_regions()
+        self._buffer.set_size(1, 1)
+        self._buffer.set_active(True)
+        self._engine.render_frame()
         self._engine.remove_window(self._buffer)
         self._eye.remove_node()
         self._pixels.clear()

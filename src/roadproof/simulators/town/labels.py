@@ -38,6 +38,7 @@ from roadproof.simulators.town.models import PAINTS, Body, car, person
 from roadproof.simulators.town.renderer import CULL_M, whole
 from roadproof.simulators.town.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.town.scenery import TREES, Scenery
+from roadproof.simulators.town.screens import Screens
 from roadproof.simulators.town.streets import KERB_M, build_streets
 
 # Six bits of the number in each channel, in the middle of four levels: rounding does not reach the next number.
@@ -103,7 +104,7 @@ class LabelScene:
         self._roads, self._plan = roads, _Plan(roads)
         self._pipe = make_pipe()
         self._root = core.NodePath("labels")
-        self._screens: dict[CameraModel, Screen] = {}
+        self._screens = Screens(lambda camera: Screen(self._pipe, self._root, camera, whole(camera), 1, anywhere=True))
         self._planes: list[Float[np.ndarray, "t 4"]] = [np.array([[0.0, 0.0, 1.0, 0.0]])]
         self._labels: list[UInt8[np.ndarray, " t"]] = [np.array([Label.TERRAIN], np.uint8)]
         self._count = 1
@@ -128,10 +129,12 @@ class LabelScene:
 
     def close(self) -> None:
         """Give everything back."""
-        for screen in self._screens.values():
-            screen.close()
-        self._screens.clear()
+        self._screens.close()
         self._root.remove_node()
+
+    def forget_views(self) -> None:
+        """Give the memory of `look` back, until it is called again."""
+        self._screens.close()
 
     def set_agents(self, cars: Agents, people: Agents) -> None:
         """Replace all cars and people; afterwards `move_agents` moves as many."""
@@ -175,9 +178,7 @@ class LabelScene:
 
     def look(self, camera: CameraModel, state: VehicleState) -> LabelledPicture:
         """What the camera of a vehicle sees."""
-        if camera not in self._screens:
-            self._screens[camera] = Screen(self._pipe, self._root, camera, whole(camera), 1)
-        screen = self._screens[camera]
+        screen = self._screens.of(camera)
         x, y, z = screen.look_from(state)
         self._heaven.set_pos(x, y, z)
         self._ground.set_pos(x, y, 0.0)

@@ -29,6 +29,7 @@ from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.materials import split_by_atlas, static_textures
 from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.scenery import Scenery
+from roadproof.simulators.town.screens import Screens
 from roadproof.simulators.town.shading import mesh_node, shaded
 from roadproof.simulators.town.streets import build_streets
 from roadproof.simulators.town.weather import SKIES, Sky, sky_picture
@@ -39,6 +40,7 @@ NEAR_GRID_M = 4.0
 HIDDEN_DEPTH = 4.0
 FRAME, PICTURE = 0, 1
 RAIN_VARIANTS = 6
+KEPT_PATCHES = 16
 NEAR_LAYERS = (Layer.PAINT, Layer.PAVEMENT, Layer.SMALL)
 
 
@@ -58,7 +60,7 @@ class Renderer:
         self._land = Land(self._ground, self._streets, self._textures)
         self._stage = ground_stage()
         self._screens: dict[int, Screen] = {}
-        self._views: dict[CameraModel, Screen] = {}
+        self._views = Screens(lambda camera: Screen(self._pipe, self._root, camera, whole(camera), 2, anywhere=True))
         self._painted: dict[CanvasPlacement, UInt8[np.ndarray, "400 400 4"]] = {}
         self._patches: dict[tuple[CameraModel, CanvasPlacement], CanvasNode] = {}
         self._laid: dict[tuple[CameraModel, CanvasPlacement], UInt8[np.ndarray, "400 400 4"]] = {}
@@ -123,9 +125,7 @@ class Renderer:
 
     def view(self, camera: CameraModel, state: VehicleState, tick: int = 0) -> UInt8[np.ndarray, "h w 3"]:
         """The picture of any camera, with the places of `paint_road` instead of a canvas."""
-        if camera not in self._views:
-            self._views[camera] = Screen(self._pipe, self._root, camera, whole(camera), 2)
-        screen = self._views[camera]
+        screen = self._views.of(camera)
         self._aim(screen, state, tick)
         self._agents.see(state, everybody=True)
         self._see_patches(camera, state)
@@ -133,11 +133,19 @@ class Renderer:
 
     def close(self) -> None:
         """Give everything back."""
-        for screen in (*self._screens.values(), *self._views.values()):
+        for screen in self._screens.values():
             screen.close()
         self._screens.clear()
-        self._views.clear()
+        self._views.close()
         self._root.remove_node()
+
+    def forget_views(self) -> None:
+        """Give the memory of `view` back, until it is called again."""
+        self._views.close()
+        for patch in self._patches.values():
+            patch.close()
+        self._patches.clear()
+        self._laid.clear()
 
     def _shoot(self, which: int, state: VehicleState, tick: int) -> UInt8[np.ndarray, "h w 3"]:
         crop, magnified = self._crops[which]
@@ -157,17 +165,23 @@ class Renderer:
         up_m = max(round(camera.up_m + state.z_m, 1), 0.1)
         raised = replace(camera, up_m=up_m)
         below = replace(state, z_m=camera.up_m + state.z_m - up_m)
+        seen = 0
         for place, pattern in self._painted.items():
             if math.hypot(place.x_m - state.x_m, place.y_m - state.y_m) > NEAR_SEEN_M + place.length_m:
                 continue
             key = (raised, place)
-            if key not in self._patches:
-                self._patches[key] = CanvasNode(self._root, raised, ((whole(raised), 2),))
+            # Taken out and put back, so that the first are those unused for longest.
+            patch = self._patches.pop(key, None)
+            self._patches[key] = patch or CanvasNode(self._root, raised, ((whole(raised), 2),))
+            seen += 1
             if self._laid.get(key) is not pattern:
                 self._patches[key].lay(place, partial(road_patch, self._lit, place, self._grain, self._streets.paint))
                 self._patches[key].paint(pattern)
                 self._laid[key] = pattern
             self._patches[key].see(below, 0)
+        for key in list(self._patches)[: -max(seen, KEPT_PATCHES)]:
+            self._patches.pop(key).close()
+            self._laid.pop(key, None)
 
     def _aim(self, screen: Screen, state: VehicleState, tick: int) -> None:
         x, y, z = screen.look_from(state)
