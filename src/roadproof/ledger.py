@@ -43,14 +43,18 @@ class Ledger:
         identity: tells this run from another.
         stages: there are.
         paint: how the simulator puts paint on the road, see `simulators.protocol.PaintKind`.
+        controller: which one is tested (`controllers.identity`), whatever it is called.
 
     Raises:
         RoadproofError: the folder is another run's, or one painted in another way.
         OutputError: it cannot be written.
     """
 
-    def __init__(self, folder: Path, identity: str, stages: Sequence[str], *, paint: str = "rendered") -> None:
+    def __init__(
+        self, folder: Path, identity: str, stages: Sequence[str], *, paint: str = "rendered", controller: str = ""
+    ) -> None:
         self._path, self._identity, self._paint = folder / FILE, identity, paint
+        self._controller = controller
         self._current, self._since = "", 0.0
         self.cost = {stage: StageCost() for stage in stages}
         if not self._path.exists():
@@ -59,6 +63,11 @@ class Ledger:
         stored = read_json(self._path, FORMAT, FORMAT_VERSION, RoadproofError)
         if stored.get("identity") != self._identity:
             raise RoadproofError(f"{folder} holds a run with other settings; choose another folder, or remove it")
+        if stored.get("controller", controller) != controller:
+            raise RoadproofError(
+                f"{folder} holds a run of another controller, which answers otherwise, as before a training; choose "
+                "another folder, or remove it"
+            )
         before = stored.get("paint", "rendered")
         if before != paint:
             raise RoadproofError(
@@ -95,7 +104,7 @@ class Ledger:
     def _write(self) -> None:
         cost = {stage: asdict(cost) for stage, cost in self.cost.items()}
         content = {"format": FORMAT, "version": FORMAT_VERSION, "identity": self._identity, "cost": cost}
-        content["paint"] = self._paint
+        content |= {"paint": self._paint, "controller": self._controller}
         write_atomically(self._path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
 
 

@@ -28,6 +28,7 @@ from roadproof.budget import QUICK, Budget
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
+from roadproof.controllers.identity import identity_of
 from roadproof.drives import Drives, record
 from roadproof.errors import RoadproofError
 from roadproof.evaluation import (
@@ -149,7 +150,8 @@ def _stages(run: _Run, simulator: Opening | Simulator, processes: int) -> Stress
     """All of them, one after another; the simulator, or what opens one for each process, is the evaluation's."""
     # What tells this run from another.
     told = (asdict(run.scenario), repr(run.budget), asdict(run.space), run.seed, run.controller_name)
-    ledger = Ledger(run.folder, json.dumps(told, default=str), STAGES, paint=run.simulator.paint)
+    who = identity_of(run.controller, (run.simulator.input.height_px, run.simulator.input.width_px))
+    ledger = Ledger(run.folder, json.dumps(told, default=str), STAGES, paint=run.simulator.paint, controller=who)
     on_progress = run.on_progress
 
     def tell(stage: str, done: int, total: int, word: str) -> None:

@@ -9,6 +9,7 @@ import needs
 from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
+from roadproof.drives.drives import write_settings
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
 from roadproof.recordings import Push
@@ -43,6 +44,12 @@ def test_the_drives_go_as_far_astray_as_was_asked_and_to_their_side(drives):
     # Measured without the recorder's own path: least distance to the clean positions.
     apart = np.hypot(*(getattr(right.episode, n)[:, None] - getattr(clean.episode, n) for n in ("x_m", "y_m")))
     assert 1.0 < apart.min(1).max() < 1.35
+
+
+def test_a_recording_of_a_driver_that_answered_otherwise_is_not_taken(drives, folder):
+    with pytest.raises(RecordingError, match="a recording of another driver, which answers otherwise"):
+        write_settings(dataclasses.replace(drives.settings, answers="0123456789abcdef"), folder)
+    write_settings(drives.settings, folder)
 
 
 def test_the_kept_frames_show_the_canvas(drives):

@@ -99,6 +99,17 @@ def test_other_weights_in_the_same_file_are_other_jobs(tmp_path):
     assert not {*nothing, *first} & {job.key for job in study.jobs}
 
 
+def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    study = dataclasses.replace(load_study(written(tmp_path, TEXT)), controller="own_driver_of_mine:make")
+    source = tmp_path / "own_driver_of_mine.py"
+    keys = []
+    for text in ("raise SystemExit('never imported')", "make = None", "make = None"):
+        source.write_text(text)
+        keys.append(study.jobs[0].key)
+    assert keys[0] != keys[1] == keys[2]
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [

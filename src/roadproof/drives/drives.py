@@ -102,6 +102,7 @@ class Settings:
         window: which frames are kept.
         seed: of the perturbations.
         driver: who drove, in words.
+        answers: which controller that is (`controllers.identity`); empty in recordings older than the word.
         camera: on the car.
         view: how the controller's input is made from its picture.
         dt_s: seconds a step.
@@ -116,6 +117,7 @@ class Settings:
     camera: CameraModel
     view: CropResize
     dt_s: float
+    answers: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -153,6 +155,12 @@ def write_settings(settings: Settings, folder: Path) -> None:
     path, content = folder / "record.json", _to_json(settings)
     if path.exists():
         before = read_json(path, FORMAT, FORMAT_VERSION, RecordingError)
+        same = before.get("driver") == settings.driver
+        if same and before.setdefault("answers", settings.answers) != settings.answers:
+            raise RecordingError(
+                f"{folder} holds a recording of another {settings.driver or 'driver'}, which answers otherwise, as "
+                "before a training; choose another folder, or remove it"
+            )
         for key, value in content.items():
             if before.get(key) != value:
                 raise RecordingError(

@@ -15,11 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
-import numpy as np
-
 import roadproof
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import act_of, frame_size_of
+from roadproof.controllers.identity import answers_of
 from roadproof.datatypes import Weather
 from roadproof.errors import EpisodeError
 from roadproof.evaluation.result import Trial, judge
@@ -169,15 +167,7 @@ def driver_in_words(driver: AnyDriver) -> str:
 def _identity(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> str:
     """Everything that all drives depend on, as text. A controller is known by what it answers."""
     view = simulator.input
-    answers: list[tuple[float, ...]] = []
-    if isinstance(driver, Controller):
-        rng = np.random.default_rng(0)
-        size = frame_size_of(driver) or (view.height_px, view.width_px)
-        for _ in range(4):
-            coarse = rng.integers(0, 256, (6, 8, 3), np.uint8)
-            frame = np.repeat(np.repeat(coarse, -(-size[0] // 6), 0), -(-size[1] // 8), 1)[: size[0], : size[1]]
-            control = act_of(driver, np.ascontiguousarray(frame), 6.0, 2)
-            answers.append(tuple(round(value, 4) for value in (control.steer, control.throttle, control.brake)))
+    answers = answers_of(driver, (view.height_px, view.width_px)) if isinstance(driver, Controller) else []
     parts: dict[str, object] = {
         "version": roadproof.__version__,
         "simulator": f"{type(simulator).__module__}.{type(simulator).__qualname__}",

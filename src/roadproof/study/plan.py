@@ -37,7 +37,9 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
+import importlib.util
 import json
+import sys
 import tomllib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
@@ -123,8 +125,8 @@ class Job:
         traffic: of the evaluation, or None.
         starts: of the evaluation.
         simulator: its spec, see `simulators.loading`.
-        weights: digest of the file that the controller's spec names; empty for one that comes with the package, and for
-            a function of yours, whose weights a study does not see.
+        weights: digest of the file that the controller's spec names, or of the source of a function of yours; empty
+            for one that comes with the package.
     """
 
     controller: str
@@ -314,6 +316,21 @@ def _chosen(patterns: Iterable[str], scenarios: tuple[Scenario, ...]) -> tuple[S
 
 
 def _digest(controller: str) -> str:
-    """Of the file that a spec names, as `cil:FILE.safetensors` does; empty where it names none."""
-    path = Path(controller.partition(":")[2] or controller)
+    """Of the file that a spec names, `cil:FILE.safetensors`, or that the module of a function is written in."""
+    module, _, name = controller.partition(":")
+    path = Path(name or controller)
+    if not path.suffix and name.isidentifier() and (found := _source(module)):
+        path = found
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.suffix and path.is_file() else ""
+
+
+def _source(module: str) -> Path | None:
+    """The file of a module, here or installed, without importing it; of one in a package, its parents are."""
+    try:
+        sys.path.insert(0, "")  # as when it is loaded: modules may lie in the folder where the command is given
+        found = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    finally:
+        sys.path.remove("")
+    return Path(found.origin) if found and found.origin else None

@@ -1,0 +1,53 @@
+"""Which controller it is: known by what it answers, not by what it is called.
+
+A controller that is trained again and keeps its name answers otherwise; so does a function whose author changed it.
+Drives, recordings and runs that were made with the one are not taken for those of the other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+
+from roadproof.controllers.asking import act_of, frame_size_of
+from roadproof.controllers.protocol import Controller
+
+Answers = list[tuple[float, ...]]
+
+
+def answers_of(controller: Controller, size: tuple[int, int]) -> Answers:
+    """Steer, throttle and brake for four made-up pictures, to four digits: the same for the same controller.
+
+    Args:
+        controller: is asked to act at 6 m/s, following the lane.
+        size: (height, width) of the pictures, where the controller does not say its own.
+
+    Raises:
+        ControllerError: it raises, or answers with something that is no control.
+    """
+    rng = np.random.default_rng(0)
+    height, width = frame_size_of(controller) or size
+    answers: Answers = []
+    for _ in range(4):
+        coarse = rng.integers(0, 256, (6, 8, 3), np.uint8)
+        frame = np.repeat(np.repeat(coarse, -(-height // 6), 0), -(-width // 8), 1)[:height, :width]
+        control = act_of(controller, np.ascontiguousarray(frame), 6.0, 2)
+        answers.append(tuple(round(value, 4) for value in (control.steer, control.throttle, control.brake)))
+    return answers
+
+
+def identity_of(driver: object, size: tuple[int, int]) -> str:
+    """A short digest of a controller's answers; the name of a function that is none.
+
+    Args:
+        driver: a controller, or a function that drives, such as `training.expert.expert`.
+        size: see `answers_of`.
+
+    Raises:
+        ControllerError: as `answers_of`.
+    """
+    if not isinstance(driver, Controller):
+        return str(getattr(driver, "__qualname__", type(driver).__qualname__))
+    return hashlib.sha256(json.dumps(answers_of(driver, size)).encode()).hexdigest()[:16]
