@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -47,12 +48,18 @@ def free_port():
     raise RuntimeError("no two ports beside each other are free")
 
 
+def interruptible():
+    """For a child process: SIGINT ends it, also where the tests run in the background and ignore it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextlib.contextmanager
 def serving(*arguments, program="from roadproof.cli import main; main()"):
     """Serve; yields the process and its port, once it answers."""
     command = [sys.executable, "-c", program, "carla", "serve", "--port", "0", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, env=environment, preexec_fn=interruptible, **pipes) as process:
         try:
             said = b""
             until = time.monotonic() + START_S

@@ -14,7 +14,7 @@ import time
 import pytest
 
 import needs
-from carla_serving import serving, straight_map
+from carla_serving import interruptible, serving, straight_map
 
 needs.town()
 msgpack = pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
@@ -577,7 +577,8 @@ def test_a_signal_ends_it_in_one_line_with_clients_there(street, number):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_the_town_is_built_ends_it_too(number):
     command = [sys.executable, "-c", "from roadproof.cli import main; main()", "carla", "serve", "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, preexec_fn=interruptible, **pipes) as process:
         assert process.stdout.readline().startswith(b"Building town")
         time.sleep(0.5)
         process.send_signal(number)
