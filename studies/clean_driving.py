@@ -27,8 +27,8 @@ from roadproof.controllers import shipped_names
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.datatypes import Command, Weather
 from roadproof.io.files import write_atomically
+from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario, builtin_scenarios
-from roadproof.simulators.town.maps import load_map
 from roadproof.training.scores import DrivingScore, Trial, score_drives
 from roadproof.training.ways import random_scenario
 

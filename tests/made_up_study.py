@@ -9,8 +9,8 @@ from PIL import Image
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.patterns import Pattern, save_pattern
+from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import builtin_scenarios
-from roadproof.simulators.town.maps import load_map, scenario_route
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan
 from roadproof.study.plan import Study, TrafficPlan
 from roadproof.study.rows import JobResult, failed, job_columns, write_result, write_table

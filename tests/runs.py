@@ -22,10 +22,10 @@ from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Push, save_recordings
 from roadproof.report.film import Strip
+from roadproof.roads.maps import load_map, scenario_route
 from roadproof.rollout import Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.town.maps import load_map, scenario_route
 from scenes import recording_set
 
 PATTERN = Pattern(

@@ -14,10 +14,10 @@ from pathlib import Path
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.maps import check_canvas, load_map, scenario_route
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route
 from roadproof.scenarios import BUILTIN_FILE, Kind, Scenario, save_scenarios
-from roadproof.simulators.town.maps import check_canvas, load_map, scenario_route
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
 
 WIDTHS_M = (7.6, 7.2, 6.8, 6.4, 6.0)
 SHIFTS_M = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6)

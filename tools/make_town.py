@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from scenariogeneration import xodr
 
-from roadproof.simulators.town.road_records import Clothoid
+from roadproof.roads.records import Clothoid
 
-ASSETS = Path(__file__).parents[1] / "src" / "roadproof" / "simulators" / "town" / "assets"
+ASSETS = Path(__file__).parents[1] / "src" / "roadproof" / "roads" / "assets"
 SHOULDER_M, SIDEWALK_M, MARK_M = 0.4, 2.6, 0.15
 
 

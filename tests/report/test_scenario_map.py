@@ -8,8 +8,8 @@ from PIL import Image
 
 from roadproof.errors import OutputError, ScenarioError
 from roadproof.report.scenario_map import COLOURS, draw_scenarios
+from roadproof.roads.maps import load_map
 from roadproof.scenarios import builtin_scenarios
-from roadproof.simulators.town.maps import load_map
 
 
 def count_of(path: Path, colour: str) -> int:

@@ -11,7 +11,7 @@ pytest.importorskip("av", reason="films need the extra roadproof[video]")
 import av
 
 from roadproof.report.video import ABOVE_PX, DriveVideo
-from roadproof.simulators.town.maps import load_map, scenario_route
+from roadproof.roads.maps import load_map, scenario_route
 
 SCENARIO = builtin_scenarios()[0]
 

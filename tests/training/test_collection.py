@@ -83,7 +83,7 @@ def test_a_folder_is_filled_up_and_processes_agree(tmp_path):
 
 
 def test_scenarios_are_not_what_is_driven():
-    from roadproof.simulators.town.maps import load_map
+    from roadproof.roads.maps import load_map
     from roadproof.training.ways import random_scenario
 
     built_in = {(s.start.x_m, s.start.y_m, s.goal_m) for s in builtin_scenarios()}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from roadproof.datatypes import Control, VehicleState
+from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
-from roadproof.simulators.town.agents import NOBODY, Agents
-from roadproof.simulators.town.maps import load_map, scenario_route
-from roadproof.simulators.town.traffic import Traffic
+from roadproof.traffic.agents import NOBODY, Agents
+from roadproof.traffic.traffic import Traffic
 from roadproof.training.expert import Expert, Manner, pedals, speed_limits
 
 SCENARIOS = builtin_scenarios()

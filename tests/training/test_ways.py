@@ -8,8 +8,8 @@ import pytest
 
 from roadproof.datatypes import Command, Control
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.maps import load_map, scenario_route
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.maps import load_map, scenario_route
+from roadproof.roads.roadmap import RoadMap
 from roadproof.training.ways import LENGTHS_M, Displacement, Knocks, random_scenario
 
 

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from roadproof.evaluation.episodes import AnyDriver
     from roadproof.recorded.simulator import RecordedSimulator
     from roadproof.report.video import DriveVideo
+    from roadproof.roads.roadmap import RoadMap
     from roadproof.rollout import Episode, OnStep
     from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
-    from roadproof.simulators.town.roadmap import RoadMap
 
 
 def drive(
@@ -110,7 +110,7 @@ def _map_of(
 ) -> tuple[RoadMap | None, Float[np.ndarray, "n 2"]]:
     """The roads, where they are known, and world x, y of the way from start to goal."""
     from roadproof.recorded.simulator import RecordedSimulator
-    from roadproof.simulators.town.maps import scenario_route
+    from roadproof.roads.maps import scenario_route
 
     if isinstance(world, RecordedSimulator):
         return None, world.way

@@ -22,8 +22,8 @@ def scenarios(
     from rich.text import Text
 
     from roadproof.errors import ScenarioError
+    from roadproof.roads.maps import load_map, scenario_route
     from roadproof.scenarios import BUILTIN_FILE, load_scenarios
-    from roadproof.simulators.town.maps import load_map, scenario_route
 
     listed = load_scenarios(file or BUILTIN_FILE)
     table = Table("name", "kind", "map", box=box.SIMPLE)

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from roadproof.errors import OutputError, ScenarioError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.io.files import write_atomically
+from roadproof.roads.maps import scenario_route
+from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
-from roadproof.simulators.town.maps import scenario_route
-from roadproof.simulators.town.roadmap import RoadMap
 
 COLOURS = {"straight": "#2166ac", "left": "#b2182b", "right": "#1b7837"}
 PAVEMENT = {"sidewalk": "#d8d2c6", "shoulder": "#9a9a96", "driving": "#6f7175"}

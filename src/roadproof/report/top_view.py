@@ -21,11 +21,11 @@ from roadproof.evaluation.result import path_of
 from roadproof.geometry import CanvasPlacement
 from roadproof.metrics import counted, passage
 from roadproof.report.charts import CLEAN, INK, PAINTED, VARIABLES, Chart, svg_of
+from roadproof.roads.maps import load_map
+from roadproof.roads.roadmap import RoadMap
 from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage
-from roadproof.simulators.town.maps import load_map
-from roadproof.simulators.town.roadmap import RoadMap
 
 MARGIN_M = 6.0
 BEFORE_M, AFTER_S = 10.0, 3.0

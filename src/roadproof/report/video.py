@@ -18,8 +18,8 @@ from PIL import Image, ImageDraw, ImageFont
 from roadproof.datatypes import Control, Event, Observation
 from roadproof.errors import OutputError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.protocol import PatternImage
-from roadproof.simulators.town.roadmap import RoadMap
 
 SIZE = (1280, 720)
 VIEW = (0, 0, 800, 600)

@@ -11,10 +11,10 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from roadproof.errors import SimulatorError
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route
 from roadproof.simulators.protocol import PaintChoice, Simulator
-from roadproof.simulators.town.agents import Agents
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
+from roadproof.traffic.agents import Agents
 
 SPECS = "town or carla://HOST:PORT"
 CARLA_PORT = 2000

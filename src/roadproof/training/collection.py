@@ -18,11 +18,11 @@ from roadproof.controllers.asking import act_of
 from roadproof.datatypes import Command, Control, Event, Observation, Weather
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
+from roadproof.roads.maps import load_map
 from roadproof.rollout import Policy
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage
-from roadproof.simulators.town.maps import load_map
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import Expert
 from roadproof.training.shards import Shard

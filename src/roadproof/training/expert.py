@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Control, Observation, VehicleState
-from roadproof.simulators.town.agents import (
+from roadproof.roads.routes import Route
+from roadproof.traffic.agents import (
     CAR_LENGTH_M,
     CAR_WIDTH_M,
     NOBODY,
@@ -27,7 +28,6 @@ from roadproof.simulators.town.agents import (
     idm_acceleration,
     obstacles,
 )
-from roadproof.simulators.town.routes import Route
 
 WHEELBASE_M = 2.8
 MAX_STEER_RAD = 0.65

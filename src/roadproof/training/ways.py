@@ -15,10 +15,10 @@ from jaxtyping import Float
 from roadproof.datatypes import Command, Control, VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.maps import check_canvas, scenario_route
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route
 from roadproof.scenarios import Kind, Scenario
-from roadproof.simulators.town.maps import check_canvas, scenario_route
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
 
 TRIES = 400
 LENGTHS_M = (60.0, 150.0)

@@ -14,6 +14,7 @@ pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]"
 from roadproof.datatypes import Control, VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
+from roadproof.roads.maps import load_map
 from roadproof.rollout import Episode, rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL
@@ -24,7 +25,6 @@ from roadproof.simulators.carla_server.pieces import road_pieces
 from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import PaintKind
-from roadproof.simulators.town.maps import load_map
 
 CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)

@@ -14,7 +14,7 @@ needs.town()
 
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel
-from roadproof.simulators.town.maps import load_map
+from roadproof.roads.maps import load_map
 from roadproof.simulators.town.renderer import Renderer
 from roadproof.simulators.town.scenery import build_scenery
 from roadproof.simulators.town.screens import KEPT

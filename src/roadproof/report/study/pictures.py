@@ -20,9 +20,9 @@ from roadproof.report.study.folder import Found
 from roadproof.report.study.results import JobId, Results
 from roadproof.report.top_view import Ground, around_canvas, draw_road
 from roadproof.report.words import in_words
+from roadproof.roads.maps import load_map
+from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import KINDS
-from roadproof.simulators.town.maps import load_map
-from roadproof.simulators.town.roadmap import RoadMap
 
 PANELS = 6
 ROWS, COLUMNS = 8, 12

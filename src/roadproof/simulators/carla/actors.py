@@ -11,8 +11,8 @@ import math
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.simulators.carla.session import Session, carla
-from roadproof.simulators.town.agents import Agents
-from roadproof.simulators.town.traffic import Traffic
+from roadproof.traffic.agents import Agents
+from roadproof.traffic.traffic import Traffic
 
 DRIVEN = ("vehicle.ford.mustang", "vehicle.lincoln.mkz_2017", "vehicle.lincoln.mkz_2020", "vehicle.tesla.model3")
 SPAWN_UP_M = 0.3

@@ -7,11 +7,11 @@ import math
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.maps import check_canvas
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route
 from roadproof.scenarios import Kind, Scenario
 from roadproof.simulators.carla.session import Session, carla
-from roadproof.simulators.town.maps import check_canvas
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
 
 CANVAS_LENGTH_M = 9.5
 EDGE_M = 0.2

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.errors import ScenarioError, SimulatorError
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.roadmap import RoadMap
 
 try:
     import carla

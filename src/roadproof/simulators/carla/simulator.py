@@ -12,8 +12,13 @@ from types import TracebackType
 import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
+from roadproof.driving.endings import Endings
+from roadproof.driving.judge import Judge
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, Homography
+from roadproof.roads.maps import scenario_route
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
 from roadproof.simulators.arguments import check_crop, check_pattern
 from roadproof.simulators.carla.actors import Crowd, place_driven, spawn_driven, vehicle_state
@@ -27,14 +32,9 @@ from roadproof.simulators.carla.signals import Signals
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import set_weather
-from roadproof.simulators.endings import Endings
 from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage, Pictures
-from roadproof.simulators.town.agents import NOBODY, Agents
-from roadproof.simulators.town.judge import Judge
-from roadproof.simulators.town.maps import scenario_route
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
-from roadproof.simulators.town.traffic import Traffic
+from roadproof.traffic.agents import NOBODY, Agents
+from roadproof.traffic.traffic import Traffic
 
 SETTLE_TICKS = 10
 STOP = Control(0.0, brake=1.0)

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.roadmap import RoadMap
 
 PIECE_M = 20.0
 STRAIGHT_RAD = 0.02

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.carla_server.wire import Pose6
-from roadproof.simulators.town.roadmap import RoadMap
 
 EVERY_M = 15.0
 UP_M = 0.3

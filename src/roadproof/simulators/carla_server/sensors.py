@@ -14,8 +14,8 @@ from roadproof.simulators.carla_server import limits, wire
 from roadproof.simulators.carla_server.actors import Actor, attached
 from roadproof.simulators.carla_server.blueprints import CAMERAS
 from roadproof.simulators.carla_server.world import Collision, Town, World
-from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.labels import FAR_M, Label, LabelledPicture
+from roadproof.traffic.agents import Agents
 
 MAX_SIDE_PX = 4096
 MAX_ROLL_DEG = 0.1

@@ -15,19 +15,19 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, VehicleState, Weather
+from roadproof.driving.judge import people_hit
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
+from roadproof.roads.maps import BUILTIN_MAPS, builtin_map_file, load_map
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.carla_server import blueprints, limits, weather
 from roadproof.simulators.carla_server.actors import Actor
 from roadproof.simulators.carla_server.pieces import Piece, road_pieces
 from roadproof.simulators.carla_server.wire import ORIGIN, WORLD_STREAM, Pose6, Value
-from roadproof.simulators.town.judge import people_hit
 from roadproof.simulators.town.labels import LabelledPicture, LabelScene
-from roadproof.simulators.town.maps import BUILTIN_MAPS, builtin_map_file, load_map
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
-from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.scenery import Scenery, build_scenery
 
 FREE_RUN_S = 0.05

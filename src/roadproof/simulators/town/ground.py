@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageChops, ImageDraw, ImageFilter
 
-from roadproof.simulators.town.lanes import Lane
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.lanes import Lane
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.scenery import Scenery, Tree
 from roadproof.simulators.town.textures import fractal_noise
 from roadproof.simulators.town.weather import Sky

@@ -17,9 +17,9 @@ from PIL import Image, ImageDraw
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
+from roadproof.roads.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.town import textures
 from roadproof.simulators.town.agent_nodes import PERSON_LOOKS, STEPS_M, STRIDE_OF_STEP, STRIDES
-from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.air import dome
 from roadproof.simulators.town.engine import (
     VERTEX,
@@ -36,10 +36,10 @@ from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
 from roadproof.simulators.town.models import PAINTS, Body, car, person
 from roadproof.simulators.town.renderer import CULL_M, whole
-from roadproof.simulators.town.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.town.scenery import TREES, Scenery
 from roadproof.simulators.town.screens import Screens
 from roadproof.simulators.town.streets import KERB_M, build_streets
+from roadproof.traffic.agents import Agents
 
 # Six bits of the number in each channel, in the middle of four levels: rounding does not reach the next number.
 BITS = 6

@@ -16,9 +16,9 @@ from jaxtyping import UInt8
 
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town import textures
 from roadproof.simulators.town.agent_nodes import AgentNodes
-from roadproof.simulators.town.agents import Agents
 from roadproof.simulators.town.air import dome, haze_cards, rain_card
 from roadproof.simulators.town.canvas import road_patch
 from roadproof.simulators.town.canvas_node import CanvasNode
@@ -27,12 +27,12 @@ from roadproof.simulators.town.ground import LitGround, build_ground, light_grou
 from roadproof.simulators.town.land import CELL_M, Land
 from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.materials import split_by_atlas, static_textures
-from roadproof.simulators.town.roadmap import RoadMap
 from roadproof.simulators.town.scenery import Scenery
 from roadproof.simulators.town.screens import Screens
 from roadproof.simulators.town.shading import mesh_node, shaded
 from roadproof.simulators.town.streets import build_streets
 from roadproof.simulators.town.weather import SKIES, Sky, sky_picture
+from roadproof.traffic.agents import Agents
 
 CULL_M = 60.0
 NEAR_SEEN_M = 65.0

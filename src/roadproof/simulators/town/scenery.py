@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
-from roadproof.simulators.town.lanes import Lane
+from roadproof.roads.lanes import Lane
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder, Pose, Rgb
 from roadproof.simulators.town.models import PAINTS, Body, car
-from roadproof.simulators.town.roadmap import RoadMap
 
 MARGIN_M = 45.0
 GRID_M = 0.5

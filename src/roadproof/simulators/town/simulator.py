@@ -9,6 +9,8 @@ from types import TracebackType
 import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
+from roadproof.driving.endings import Endings
+from roadproof.driving.judge import Judge
 from roadproof.errors import SimulatorError
 from roadproof.geometry import (
     CIL_CAMERA,
@@ -18,21 +20,19 @@ from roadproof.geometry import (
     Homography,
     homography_from_pose,
 )
+from roadproof.roads.maps import load_map, scenario_route
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
 from roadproof.simulators.arguments import check_crop, check_pattern
-from roadproof.simulators.endings import Endings
 from roadproof.simulators.protocol import PaintKind, PatternImage, Pictures
-from roadproof.simulators.town.agents import NOBODY, Agents
 from roadproof.simulators.town.engine import make_pipe
-from roadproof.simulators.town.judge import Judge
-from roadproof.simulators.town.maps import load_map, scenario_route
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.routes import Route
 from roadproof.simulators.town.scenery import Scenery, build_scenery
-from roadproof.simulators.town.traffic import Traffic
+from roadproof.traffic.agents import NOBODY, Agents
+from roadproof.traffic.traffic import Traffic
 
 
 @dataclass(slots=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.simulators.town.lanes import Lane, MarkLine
+from roadproof.roads.lanes import Lane, MarkLine
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
-from roadproof.simulators.town.roadmap import RoadMap
 
 KERB_M = 0.13
 KERB_STONE_M = 0.22

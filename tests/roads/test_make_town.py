@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from roadproof.simulators.town.roadmap import RoadMap, Surface
+from roadproof.roads.roadmap import RoadMap, Surface
 
-ROOT = Path(__file__).parents[3]
-ASSETS = ROOT / "src" / "roadproof" / "simulators" / "town" / "assets"
+ROOT = Path(__file__).parents[2]
+ASSETS = ROOT / "src" / "roadproof" / "roads" / "assets"
 
 
 @pytest.fixture(scope="module")

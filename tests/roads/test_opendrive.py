@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.opendrive import read_opendrive
-from roadproof.simulators.town.road_records import Clothoid, Cubics, ParamCubic
+from roadproof.roads.opendrive import read_opendrive
+from roadproof.roads.records import Clothoid, Cubics, ParamCubic
 
 WIDTH = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
 LANES = f"""<lanes><laneSection s="0">

@@ -11,8 +11,8 @@ import pytest
 
 from roadproof.datatypes import Command
 from roadproof.errors import ScenarioError
+from roadproof.roads.maps import canvas_points, load_map, scenario_route
 from roadproof.scenarios import BUILTIN_FILE, Scenario, builtin_scenarios, find_scenario, load_scenarios, save_scenarios
-from roadproof.simulators.town.maps import canvas_points, load_map, scenario_route
 
 SCENARIOS = builtin_scenarios()
 
@@ -59,7 +59,7 @@ def test_canvas_points_reach_its_corners() -> None:
 
 
 def test_the_committed_list_is_what_the_script_writes(tmp_path: Path) -> None:
-    path = Path(__file__).parents[3] / "tools" / "make_scenarios.py"
+    path = Path(__file__).parents[2] / "tools" / "make_scenarios.py"
     spec = importlib.util.spec_from_file_location("make_scenarios", path)
     assert spec is not None
     assert spec.loader is not None
@@ -97,7 +97,7 @@ def test_unknown_maps_are_refused() -> None:
 
 
 def test_the_example_of_the_docs_is_valid(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text(encoding="utf-8")
     path = tmp_path / "list.toml"
     path.write_text(text.split("```toml\n")[1].split("```")[0], encoding="utf-8")
     (scenario,) = load_scenarios(path)

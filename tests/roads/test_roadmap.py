@@ -11,10 +11,10 @@ import pytest
 
 from roadproof.datatypes import Command, VehicleState
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.junctions import triangulated
-from roadproof.simulators.town.roadmap import RoadMap, Surface, lane_triangles
+from roadproof.roads.junctions import triangulated
+from roadproof.roads.roadmap import RoadMap, Surface, lane_triangles
 
-SECOND = Path(__file__).parents[3] / "src" / "roadproof" / "simulators" / "town" / "assets" / "second.xodr"
+SECOND = Path(__file__).parents[2] / "src" / "roadproof" / "roads" / "assets" / "second.xodr"
 
 
 def street(number: int, x: float, *, link: str = "", junction: str = "-1", width: float = 3.5) -> str:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.roadmap import RoadMap
 
 SPACING_M = 0.5
 SIDE_FORCE_MPS2 = 2.2

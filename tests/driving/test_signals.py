@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from carla_serving import straight_map
 from roadproof.datatypes import EventKind, VehicleState
-from roadproof.simulators.signals import RedLights, StopLine, StopSigns, TriggerVolume, places_ahead, stop_line
-from roadproof.simulators.town.maps import load_map
+from roadproof.driving.signals import RedLights, StopLine, StopSigns, TriggerVolume, places_ahead, stop_line
+from roadproof.roads.maps import load_map
 
 ROADS = load_map("town")
 APPROACHES = [

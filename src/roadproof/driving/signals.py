@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from roadproof.datatypes import Event, EventKind, VehicleState
-from roadproof.simulators.town.lanes import Lane
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.lanes import Lane
+from roadproof.roads.roadmap import RoadMap
 
 LIGHT_REACH_M = 10.0
 LINE_SHARE = 0.9

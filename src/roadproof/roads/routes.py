@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from roadproof.datatypes import Command
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.lanes import Lane, Line, polyline_stations
+from roadproof.roads.lanes import Lane, Line, polyline_stations
 
 SPACING_M = 0.5
 COMMAND_LEAD_M = 20.0

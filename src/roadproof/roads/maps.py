@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.roads.roadmap import RoadMap, Surface
+from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
-from roadproof.simulators.town.roadmap import RoadMap, Surface
-from roadproof.simulators.town.routes import Route
 
 BUILTIN_MAPS = ("town", "second")
 CANVAS_NEAR_ROUTE_M = 4.0

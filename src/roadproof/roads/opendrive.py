@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.road_records import (
+from roadproof.roads.records import (
     Clothoid,
     Connection,
     Cubics,

@@ -6,11 +6,11 @@ import pytest
 
 import needs
 from roadproof.datatypes import Control, Ending, Event, EventKind, VehicleState
+from roadproof.driving.endings import BLOCKED_S, STANDS_S, Endings
 from roadproof.metrics import counted, infraction_points
+from roadproof.roads.maps import load_map, scenario_route
 from roadproof.rollout import rollout
 from roadproof.scenarios import builtin_scenarios, find_scenario
-from roadproof.simulators.endings import BLOCKED_S, STANDS_S, Endings
-from roadproof.simulators.town.maps import load_map, scenario_route
 
 SCENARIO = find_scenario("left-03", builtin_scenarios())
 ROUTE = scenario_route(SCENARIO, load_map(SCENARIO.map_name))

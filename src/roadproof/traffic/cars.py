@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
-from roadproof.simulators.town.agents import (
+from roadproof.roads.roadmap import RoadMap
+from roadproof.traffic.agents import (
     CAR_LENGTH_M,
     CAR_WIDTH_M,
     NOBODY,
@@ -23,8 +24,7 @@ from roadproof.simulators.town.agents import (
     idm_acceleration,
     obstacles,
 )
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.tracks import Tracks
+from roadproof.traffic.tracks import Tracks
 
 PLAN = 4
 AHEAD_M = np.arange(2.5, 32.0, 1.5)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from roadproof.datatypes import Ending, Event, EventKind, VehicleState
-from roadproof.simulators.town.routes import Route, RoutePosition
+from roadproof.roads.routes import Route, RoutePosition
 
 GOAL_M = 2.0
 OFF_ROUTE_M = 15.0

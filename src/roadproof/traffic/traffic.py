@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
-from roadproof.simulators.town.agents import Agents
-from roadproof.simulators.town.cars import Cars
-from roadproof.simulators.town.pedestrians import Pedestrians
-from roadproof.simulators.town.roadmap import RoadMap
+from roadproof.roads.roadmap import RoadMap
+from roadproof.traffic.agents import Agents
+from roadproof.traffic.cars import Cars
+from roadproof.traffic.pedestrians import Pedestrians
 
 
 class Traffic:

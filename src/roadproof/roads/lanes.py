@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.opendrive import MAX_WIDTH_M
-from roadproof.simulators.town.road_records import LaneRecord, OpenDrive, Road, Section
+from roadproof.roads.opendrive import MAX_WIDTH_M
+from roadproof.roads.records import LaneRecord, OpenDrive, Road, Section
 
 Line = Float[np.ndarray, "n 3"]
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Event, EventKind, VehicleState
-from roadproof.simulators.town.body import LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
-from roadproof.simulators.town.roadmap import RoadMap, Surface
+from roadproof.driving.body import LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
+from roadproof.roads.roadmap import RoadMap, Surface
 
 PERSON_RADIUS_M = 0.3
 REARM_S = 1.0

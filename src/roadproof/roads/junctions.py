@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.simulators.town.lanes import Lane, Line, lane_from_borders
+from roadproof.roads.lanes import Lane, Line, lane_from_borders
 
 
 @dataclass(frozen=True, slots=True, eq=False)

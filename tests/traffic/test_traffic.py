@@ -12,7 +12,9 @@ import pytest
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
-from roadproof.simulators.town.agents import (
+from roadproof.roads.maps import load_map
+from roadproof.roads.roadmap import RoadMap, Surface
+from roadproof.traffic.agents import (
     CAR_LENGTH_M,
     CAR_WIDTH_M,
     NOBODY,
@@ -21,10 +23,8 @@ from roadproof.simulators.town.agents import (
     idm_acceleration,
     obstacles,
 )
-from roadproof.simulators.town.maps import load_map
-from roadproof.simulators.town.roadmap import RoadMap, Surface
-from roadproof.simulators.town.tracks import Tracks
-from roadproof.simulators.town.traffic import Traffic
+from roadproof.traffic.tracks import Tracks
+from roadproof.traffic.traffic import Traffic
 
 PARKED = VehicleState(150.0, -1.75, 0.0, 0.0, 0.0)
 AWAY = VehicleState(0.0, -60.0, 0.0, 0.0, 0.0)
@@ -114,8 +114,8 @@ def test_the_same_seed_gives_the_same_traffic_and_another_seed_another() -> None
 def test_another_process_gives_the_same_traffic() -> None:
     script = (
         "from roadproof.datatypes import VehicleState\n"
-        "from roadproof.simulators.town.maps import load_map\n"
-        "from roadproof.simulators.town.traffic import Traffic\n"
+        "from roadproof.roads.maps import load_map\n"
+        "from roadproof.traffic.traffic import Traffic\n"
         "ego = VehicleState(150.0, -1.75, 0.0, 0.0, 0.0)\n"
         "traffic = Traffic(load_map('town'), cars=20, pedestrians=20, seed=5, ego=ego)\n"
         "for _ in range(200): traffic.step(0.05, ego)\n"

@@ -17,11 +17,11 @@ from jaxtyping import Float, Int
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
-from roadproof.simulators.town.junctions import Corner, JunctionArea, junction_areas, triangulated
-from roadproof.simulators.town.lanes import Lane, MarkLine, build_lanes
-from roadproof.simulators.town.opendrive import read_opendrive
-from roadproof.simulators.town.routes import Route, route_along, shortest_way
-from roadproof.simulators.town.spatial import SegmentIndex, TriangleIndex
+from roadproof.roads.junctions import Corner, JunctionArea, junction_areas, triangulated
+from roadproof.roads.lanes import Lane, MarkLine, build_lanes
+from roadproof.roads.opendrive import read_opendrive
+from roadproof.roads.routes import Route, route_along, shortest_way
+from roadproof.roads.spatial import SegmentIndex, TriangleIndex
 
 REACH_M = 6.0
 MAX_EXTENT_M = 5000.0

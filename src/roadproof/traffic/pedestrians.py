@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
-from roadproof.simulators.town.agents import NOBODY, Agents
-from roadproof.simulators.town.roadmap import RoadMap
-from roadproof.simulators.town.tracks import Tracks
+from roadproof.roads.roadmap import RoadMap
+from roadproof.traffic.agents import NOBODY, Agents
+from roadproof.traffic.tracks import Tracks
 
 CROSSINGS_PER_S = 1.0 / 40.0
 FROM_JUNCTION_M = 7.0

@@ -1,0 +1,1 @@
+"""Roads from OpenDRIVE: lanes, junctions, routes, and what lies under a point."""
