@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -112,13 +112,13 @@ def scenario_asked(recorded: Recorded | None, name: str | None, file: Path | Non
 
 
 def stretch_of(world: Simulator, scenario: Scenario | None) -> Scenario:
-    """A scenario, or where none was asked for, that of the recordings."""
+    """A scenario, or where none was asked for, that of the recordings; in these it begins where they do."""
     from roadproof.recorded.simulator import RecordedSimulator
 
-    if scenario is not None:
-        return scenario
-    assert isinstance(world, RecordedSimulator)
-    return world.scenario
+    if isinstance(world, RecordedSimulator):
+        return world.scenario if scenario is None else replace(scenario, start=world.scenario.start)
+    assert scenario is not None
+    return scenario
 
 
 def check_driver(controller: str) -> None:
