@@ -1,5 +1,6 @@
 """`roadproof attack` as its users call it: results, pictures, and one clear line for every mistake."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -11,7 +12,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from roadproof.attacks import AttackResult
+from roadproof.attacks import AttackResult, Published, methods
+from roadproof.attacks.gradopt import Rung
 from roadproof.cli import app
 from roadproof.patterns import load_pattern
 from roadproof.recordings import save_recordings
@@ -94,7 +96,10 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke
     ],
     ids=" ".join,
 )
-def test_every_kind_of_search_runs(here, tmp_path, options):
+def test_every_kind_of_search_runs(here, tmp_path, options, monkeypatch):
+    few = tuple(dataclasses.replace(rung, iterations=2) for rung in Published().ladder)
+    monkeypatch.setattr(Published, "ladder", few)
+    monkeypatch.setattr(methods, "SHIFT_RUNGS", (Rung(4, 2, every=2),))
     small = " ".join(command("--out", str(tmp_path), *options))
     if "--method" in options:
         small = small.replace("--iterations 4", "")

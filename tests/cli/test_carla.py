@@ -72,7 +72,7 @@ def test_record_calibrate_attack_evaluate_drive_and_report(call, tmp_path, impat
         call("calibrate", "runs", *there)
         run = tmp_path / "runs" / "street"
         few = ["--figures", "1", "--iterations", "3", "--restarts", "1", "--random-patterns", "0", "--groups", "all"]
-        call("attack", str(run / "recordings"), *SHY, *few, "--schedule", "published", "--out", str(run / "attack"))
+        call("attack", str(run / "recordings"), *SHY, *few, "--objective", "steering", "--out", str(run / "attack"))
         once = ["--weathers", "clear-noon", "--runs", "0", "--scenario", "street", *OWN, *SHY]
         told = call(
             "evaluate", str(run / "attack" / "pattern.json"), *once, *there,

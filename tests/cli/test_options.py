@@ -18,8 +18,8 @@ REFUSED = [
     (("demo", "--rounds", "-1"), "--rounds is -1, expected 0 to"),
     (("record", "left-03", "--frames", "0"), "--frames is 0, expected 1 to"),
     (("record", "left-03", "--horizon-m", "inf"), "--horizon-m is inf, expected 1.0 to"),
-    (("carla", "serve", "--port", "-1"), "--port is -1, expected 1 to 65,534"),
-    (("carla", "serve", "--port", "65535"), "--port is 65535, expected 1 to 65,534"),
+    (("carla", "serve", "--port", "-1"), "--port is -1, expected 0 to 65,534"),
+    (("carla", "serve", "--port", "65535"), "--port is 65535, expected 0 to 65,534"),
     (("train", "--learning-rate", "nan"), "--learning-rate is nan, expected 1e-09 to"),
     (("study", "run", "nowhere.toml", "--workers", "0"), "--workers is 0, expected 1 to 256"),
 ]

@@ -25,8 +25,8 @@ def test_one_that_answers_otherwise_is_another_whatever_it_is_called():
     assert len(set(named)) == 3
 
 
-def test_a_function_is_known_by_its_name():
-    assert identity_of(expert, SIZE) == "expert"
+def test_a_function_is_known_by_the_name_that_its_user_gives_it():
+    assert identity_of(expert, SIZE) == ""
 
 
 def test_answers_are_few_and_plain():

@@ -50,8 +50,6 @@ def test_real_recordings_and_a_real_network_are_attacked(imported, pilotnet_data
     weights = pilotnet_data / "pilotnet.safetensors"
     arguments = ["attack", str(imported), "--controller", f"pilotnet:{weights}", "--out", str(tmp_path)]
     few = [
-        "--schedule",
-        "published",
         "--iterations",
         "4",
         "--restarts",

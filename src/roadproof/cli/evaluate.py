@@ -185,28 +185,28 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: Reco
     console = Console(soft_wrap=True, highlight=False, markup=False)
     foreseen = evaluation.predicted
     title = "Predicted: composited into recorded frames, nothing was driven for real" if foreseen else None
-    table = Table("pattern", "weather", "with", box=box.SIMPLE, title=title, title_justify="left")
-    driven = ("deviation m", "median", "least", "most", "furthest m", "leave lane", "points", "clean points")
-    predicted = (
-        "predicted deviation m",
-        "median",
-        "least",
-        "most",
-        "predicted furthest m",
-        "leave lane",
-        "infractions",
+    table = Table(
+        "pattern",
+        "weather",
+        "with",
+        box=box.SIMPLE,
+        title=title,
+        title_justify="left",
+        caption="deviation: median (least–most); aside: furthest; clean: points on the bare road",
+        caption_justify="left",
     )
+    driven = ("deviation m", "aside m", "left lane", "points", "clean")
+    predicted = ("predicted m", "aside m", "left lane", "infractions")
     for column in ("drives", *(predicted if foreseen else driven)):
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", no_wrap=True)
     for row in evaluation.rows():
-        traffic = f"{evaluation.cars} cars, {evaluation.pedestrians} people" if row.traffic else "nobody"
+        traffic = "traffic" if row.traffic else "nobody"
         table.add_row(
             row.pattern,
             row.weather or "all",
             traffic,
             str(row.count),
-            mean_in_words(row.deviation_m, 2),
-            *(f"{value:.2f}" for value in (row.median_m, row.least_m, row.most_m)),
+            f"{row.median_m:.2f} ({row.least_m:.2f}–{row.most_m:.2f})",
             mean_in_words(row.lateral_m, 2),
             f"{row.left_lane:.0%}",
             *([UNKNOWN] if row.failed is None else _infractions(row)),

@@ -39,7 +39,7 @@ def answers_of(controller: Controller, size: tuple[int, int]) -> Answers:
 
 
 def identity_of(driver: object, size: tuple[int, int]) -> str:
-    """A short digest of a controller's answers; the name of a function that is none.
+    """A short digest of a controller's answers; empty for a function, which its user names.
 
     Args:
         driver: a controller, or a function that drives, such as `training.expert.expert`.
@@ -49,5 +49,5 @@ def identity_of(driver: object, size: tuple[int, int]) -> str:
         ControllerError: as `answers_of`.
     """
     if not isinstance(driver, Controller):
-        return str(getattr(driver, "__qualname__", type(driver).__qualname__))
+        return ""
     return hashlib.sha256(json.dumps(answers_of(driver, size)).encode()).hexdigest()[:16]

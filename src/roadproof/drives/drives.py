@@ -102,7 +102,8 @@ class Settings:
         window: which frames are kept.
         seed: of the perturbations.
         driver: who drove, in words.
-        answers: which controller that is (`controllers.identity`); empty in recordings older than the word.
+        answers: which controller that is (`controllers.identity`); empty for a function, and in recordings older than
+            the word.
         camera: on the car.
         view: how the controller's input is made from its picture.
         dt_s: seconds a step.

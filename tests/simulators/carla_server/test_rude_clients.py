@@ -260,7 +260,8 @@ def test_a_message_that_is_too_large_is_refused_and_takes_no_more_memory_the_nex
             assert "larger than 16777216 bytes" in rude.answer()[3][0][1][0]
         check_served(port)
         sizes.append(memory_mb(process))
-    assert sizes[-1] < sizes[1] + 5
+    # Kept, the four would be 80 MiB.
+    assert sizes[-1] < sizes[1] + 40
 
 
 @LINUX
