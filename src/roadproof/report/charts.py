@@ -124,15 +124,18 @@ def steering(clean: Episode, painted: Episode, fidelity: Fidelity | None, canvas
 
 
 def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacement) -> Chart:
-    """How far beside the clean path the car was over the paint, for every weather."""
+    """How far beside the clean path the car was over the paint: a colour a weather, a line a start."""
     figure, axes = _axes("metres past the canvas’ near edge", "metres right of the clean path")
     _mark_canvas(axes, canvas)
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
-    for k, (name, clean, painted) in enumerate(drives):
+    names = list(dict.fromkeys(name for name, _, _ in drives))
+    width = 1.8 if len(drives) == len(names) else 1.1
+    labels = {name: in_words(name) for name in names}
+    for name, clean, painted in drives:
         beside = -lateral_m(path_of(clean), path_of(painted))
-        label, colour = in_words(name), SERIES[k % len(SERIES)]
-        where = metres_past(painted, canvas)
-        axes.plot(where, beside, color=colour, linestyle=_STYLES[k % 4], linewidth=1.8, label=label)
+        k, label = names.index(name), labels.pop(name, None)
+        where, colour = metres_past(painted, canvas), SERIES[k % len(SERIES)]
+        axes.plot(where, beside, color=colour, linestyle=_STYLES[k % 4], linewidth=width, label=label)
     axes.set_xlim(-HORIZON_M - 2, None)
     _legend(axes, columns=2)
     predicted = any(painted.paint.predicted for _, _, painted in drives)
