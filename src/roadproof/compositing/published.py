@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.compositing.composite import blend
 from roadproof.compositing.view import CanvasView
 from roadproof.coverage import Shape, coverage, polygon_vertices
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
@@ -47,8 +46,10 @@ class MaskedView(Protocol):
         """How much of each pixel a rectangle covers."""
         ...
 
-    def pixels(self, visibility: Float[Tensor, "*b k p"], colours: Float[Tensor, "k 3"]) -> Float[Tensor, "*b p 3"]:
-        """Colours of the canvas' pixels, differentiable in the paint's colours."""
+    def pixels(
+        self, visibility: Float[Tensor, "*b k q"], colours: Float[Tensor, "k 3"], among: Int[Tensor, " q"] | None = None
+    ) -> Float[Tensor, "*b q 3"]:
+        """Colours of the canvas' pixels, or of some among them, differentiable in the paint's colours."""
         ...
 
 
@@ -72,12 +73,14 @@ class BinaryView:
         """0 or 1 for each pixel."""
         return canvas_mask(boxes).to(self.frames.dtype).flatten(-2)[..., self.lookup]
 
-    def pixels(self, visibility: Float[Tensor, "*b k p"], colours: Float[Tensor, "k 3"]) -> Float[Tensor, "*b p 3"]:
+    def pixels(
+        self, visibility: Float[Tensor, "*b k q"], colours: Float[Tensor, "k 3"], among: Int[Tensor, " q"] | None = None
+    ) -> Float[Tensor, "*b q 3"]:
         """Colours of the canvas' pixels; gradients ignore clipping and rounding, as the released code does."""
         seen = colours if self.colour is None else self.colour.response(colours)
         cut = seen.detach().clamp(0, 1).mul(255).floor() / 255
         seen = seen + (cut - seen).detach()
-        clean = self.frames.reshape(-1, 3)[self.index]
+        clean = self.frames.reshape(-1, 3)[self.index if among is None else self.index[among]]
         return visibility.mT @ seen + (1 - visibility.sum(-2))[..., None] * clean
 
 
@@ -105,10 +108,14 @@ class AntialiasedView:
         """The share of each pixel."""
         return coverage(Shape.RECTANGLE, boxes[..., None, :], self.view.footprints)[..., 0, :]
 
-    def pixels(self, visibility: Float[Tensor, "*b k p"], colours: Float[Tensor, "k 3"]) -> Float[Tensor, "*b p 3"]:
+    def pixels(
+        self, visibility: Float[Tensor, "*b k q"], colours: Float[Tensor, "k 3"], among: Int[Tensor, " q"] | None = None
+    ) -> Float[Tensor, "*b q 3"]:
         """Colours of the canvas' pixels (eq. composite)."""
-        seen = self.view.response(colours).expand(*visibility.shape[:-1], -1)
-        return blend(visibility, seen, self.view)
+        view, which = self.view, slice(None) if among is None else among
+        share, seen = visibility.sum(-2)[..., None], view.response(colours)
+        painted = view.gain[which] * (visibility.mT @ seen) + view.bias[which] * share
+        return (view.clean[which] + painted).clamp(0.0, 1.0)
 
 
 def view_canvas_published(
