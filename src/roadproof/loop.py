@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, BlackBox, attack, kept_attack
+from roadproof.attacks import AttackResult, attack, kept_attack
 from roadproof.budget import QUICK, Budget
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
@@ -140,8 +140,7 @@ def stress_test(
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
-    climbs = not isinstance(budget.method, BlackBox)
-    require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=climbs)
+    require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
     with working_in(folder):
         return _stages(run, another if another and processes > 1 else simulator, processes)
 

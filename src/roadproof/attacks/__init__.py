@@ -9,9 +9,9 @@ from roadproof.attacks.blackbox import BlackBox as BlackBox
 from roadproof.attacks.blackbox import GaussianProcess as GaussianProcess
 from roadproof.attacks.blackbox import RandomSearch as RandomSearch
 from roadproof.attacks.checks import Check as Check
+from roadproof.attacks.method import Method as Method
 from roadproof.attacks.methods import METHODS as METHODS
 from roadproof.attacks.methods import GradOpt as GradOpt
-from roadproof.attacks.methods import Method as Method
 from roadproof.attacks.methods import Published as Published
 from roadproof.attacks.methods import method_of as method_of
 from roadproof.attacks.objective import OBJECTIVES as OBJECTIVES

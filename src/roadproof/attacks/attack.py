@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.blackbox import BlackBox
 from roadproof.attacks.checks import check_gradients, check_search, check_world
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search
-from roadproof.attacks.methods import GradOpt, Method
+from roadproof.attacks.method import Method
+from roadproof.attacks.methods import GradOpt
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.result import AttackResult, Candidate, Cost
 from roadproof.controllers import Controller
@@ -77,7 +77,7 @@ def attack(
     candidates = _candidates(measure, search, space, groups)
     cost = Cost(controller_frames=measure.frames_evaluated, seconds=time.perf_counter() - start)
     checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
-    if not isinstance(method, BlackBox):
+    if method.by_gradient:
         checks = (check_gradients(measure, space, search), *checks)
     if isinstance(measure, DeviationMeasure):
         checks += check_world(measure, candidates[0].pattern)

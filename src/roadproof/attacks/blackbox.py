@@ -7,7 +7,7 @@ in it comes from the seed and the number of trials; a search that was killed the
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias, Unpack, cast
@@ -19,8 +19,8 @@ from torch import Tensor
 from roadproof.attacks import proposals
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
 from roadproof.attacks.gradopt import Running, Search
+from roadproof.attacks.method import Method
 from roadproof.attacks.objective import Measure, Objective
-from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.objectives import Group, parse_groups
 from roadproof.recordings import RecordingSet
@@ -37,7 +37,7 @@ Value: TypeAlias = Callable[[Float[Tensor, "b k n"]], Float[Tensor, " b"]]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class BlackBox:
+class BlackBox(Method):
     """A search that knows patterns by their values alone; one of its kinds is meant.
 
     Args:
@@ -47,7 +47,7 @@ class BlackBox:
         RoadproofError: a number is below 1.
     """
 
-    word: ClassVar[str]
+    by_gradient: ClassVar[bool] = False
     family: ClassVar[Family] = "published"
     at_once: ClassVar[int] = AT_ONCE
     calls: int = 1000
@@ -67,18 +67,6 @@ class BlackBox:
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
         """All drives, to whichever side they give way."""
         return parse_groups("all", recordings)
-
-    def measure(
-        self,
-        objective: Objective,
-        recordings: RecordingSet,
-        controller: Controller,
-        groups: Sequence[Group],
-        *,
-        device: torch.device | str,
-    ) -> Measure:
-        """The objective's own."""
-        return objective.measure(recordings, controller, groups, device=device)
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
         """Try patterns on recorded frames or in the recorded world, some at once; each counts by its best group."""

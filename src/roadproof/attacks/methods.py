@@ -11,58 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Protocol, Unpack, cast, runtime_checkable
+from typing import Any, ClassVar, Unpack, cast
 
 import torch
 
 from roadproof.attacks.blackbox import CMAES, TPE, BayesianOptimisation, GaussianProcess, RandomSearch, at_least_one
 from roadproof.attacks.gradopt import Ladder, Rung, Running, Search, dropping, gradopt
+from roadproof.attacks.method import Method
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.published import MASKS, PublishedMeasure
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
+from roadproof.objectives import Group
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
 
-@runtime_checkable
-class Method(Protocol):
-    """A way to search the pattern of largest value."""
-
-    word: ClassVar[str]
-
-    def steps(self, objective: Objective) -> int:
-        """How often `on_step` is called."""
-        ...
-
-    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """Drives attacked together, where nothing else is said."""
-        ...
-
-    def measure(
-        self,
-        objective: Objective,
-        recordings: RecordingSet,
-        controller: Controller,
-        groups: Sequence[Group],
-        *,
-        device: torch.device | str,
-    ) -> Measure:
-        """What it climbs of an objective.
-
-        Raises:
-            RoadproofError: it does not climb that objective.
-        """
-        ...
-
-    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
-        """Make an objective's measure large for all of its groups."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GradOpt:
+class GradOpt(Method):
     """Exact gradients, and starts that compete (successive halving) before the best of them are searched to the end.
 
     Args:
@@ -104,23 +70,6 @@ class GradOpt:
         """Iterations of all rungs."""
         return sum(rung.iterations for rung in self.ladder(objective))
 
-    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """The paper's two groups: the drives of each side apart."""
-        del recordings
-        return (RIGHT_GROUP, LEFT_GROUP)
-
-    def measure(
-        self,
-        objective: Objective,
-        recordings: RecordingSet,
-        controller: Controller,
-        groups: Sequence[Group],
-        *,
-        device: torch.device | str,
-    ) -> Measure:
-        """The objective's own."""
-        return objective.measure(recordings, controller, groups, device=device)
-
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
         """Climb its ladder."""
         return gradopt(measure, space, self.ladder(objective), **running)
@@ -143,7 +92,7 @@ class _OnGrid(Rung):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Published:
+class Published(Method):
     """GradOpt as its authors published it: to compare with, not to use.
 
     Locally linearised gradients, Adam without momentum, random starts of 250 iterations each with rates of 0.1, 0.01
@@ -181,11 +130,6 @@ class Published:
         """Its three rates."""
         stages = ((100, 0.1, 10.0), (100, 0.01, 1.0), (50, 0.001, 1.0))
         return tuple(_OnGrid(self.restarts, count, rate, grid=grid) for count, rate, grid in stages)
-
-    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """The paper's two groups: the drives of each side apart."""
-        del recordings
-        return (RIGHT_GROUP, LEFT_GROUP)
 
     def measure(
         self,

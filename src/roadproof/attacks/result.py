@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.attacks.checks import Check
-from roadproof.attacks.methods import GradOpt, Method, method_of, stored
+from roadproof.attacks.method import Method
+from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
 from roadproof.io.files import read_json, write_atomically
 from roadproof.io.records import record

@@ -82,7 +82,7 @@ def attack(
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import OBJECTIVES, BlackBox, method_of, show_pattern
+    from roadproof.attacks import OBJECTIVES, method_of, show_pattern
     from roadproof.attacks import attack as run
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
@@ -118,7 +118,7 @@ def attack(
         size=(drives.view.height_px, drives.view.width_px),
         device=device,
         drives=False,
-        gradients=not isinstance(searched, BlackBox),
+        gradients=searched.by_gradient,
     )
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(OBJECTIVES[word])) as on_step:

@@ -43,7 +43,7 @@ def identity_of(driver: object, size: tuple[int, int]) -> str:
 
     Args:
         driver: a controller, or a function that drives, such as `training.expert.expert`.
-        size: see `answers_of`.
+        size: (height, width) in pixels of the pictures it is shown, where it does not say its own.
 
     Raises:
         ControllerError: as `answers_of`.

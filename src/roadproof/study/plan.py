@@ -156,7 +156,7 @@ class Study:
 
     Args:
         controller: its spec.
-        scenarios: where.
+        scenarios: the stretches of road on which every method finds its patterns.
         figures: K, or "1-b" for one black figure.
         methods: how patterns are found.
         seeds: of recording and search.
