@@ -23,12 +23,12 @@ import torch
 
 import roadproof
 from roadproof.attacks import Surrogate
+from roadproof.attacks.groups import parse_groups
 from roadproof.attacks.published import PublishedMeasure
 from roadproof.controllers import CIL, pilotnet_controller
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.memory import keep_freed_memory
-from roadproof.objectives import parse_groups
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Push, Recording, RecordingSet, load_recordings
 from roadproof.search_space import SearchSpace

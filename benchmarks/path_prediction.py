@@ -31,14 +31,14 @@ import roadproof
 from roadproof.attacks import GradOpt, PathDeviation, Surrogate
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Rung, gradopt
-from roadproof.budget import QUICK
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.calibration import calibrate
 from roadproof.drives import record
-from roadproof.evaluation import DrivenObjective
 from roadproof.io.files import write_atomically
 from roadproof.memory import keep_freed_memory
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
 from roadproof.patterns import Pattern
+from roadproof.pipeline.budget import QUICK
+from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace

@@ -28,6 +28,8 @@ import roadproof
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Observation, Weather
+from roadproof.driving.episode import Episode
+from roadproof.driving.rollout import Driver, replay, rollout
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
 from roadproof.io.files import write_atomically
 from roadproof.patterns import Pattern, raster
@@ -38,7 +40,6 @@ from roadproof.photometry import (
     fit_affine,
     pixel_maps_from_two_paints,
 )
-from roadproof.rollout import Driver, Episode, replay, rollout
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage

@@ -17,7 +17,7 @@ from PIL import Image
 
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.photometry import ColourFit, fit_colour, samples_from_pictures
-from roadproof.poses import placed
+from roadproof.recorded.poses import placed
 from roadproof.recordings import Push, Recording, RecordingSet, save_recordings
 
 DRIVES = {"t1": Push.CLEAN, "t2": Push.RIGHT, "t3": Push.LEFT}

@@ -9,7 +9,7 @@ For every controller, scenario and seed, closed loop, alone on the road, in the 
   T=3 published  on a Group of three drives pushed by steering noise of some degrees, the surrogate's strongest
   T=3 metres     the same, pushed aside by metres, the surrogate's strongest
   + driven       of its candidates the one that deviates most when driven at noon
-  + rounds       searched on along the way the attacked car took, the best driven of all (`roadproof.rounds`)
+  + rounds       searched on along the way the attacked car took, the best driven of all (`pipeline.rerecording`)
   + weathers     as "+ driven", searched in expectation over a dry and a rainy noon instead, half the frames of each
 All searches have the same steps and two-paint calibration, so that rows differ in what they are named after. All
 enlarge the steering shift; `first_choice.py` compares that with the search in the recorded world.
@@ -36,17 +36,18 @@ import torch
 
 import roadproof
 from roadproof.attacks import GradOpt
-from roadproof.budget import STEERING, Budget
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import SteeringNoise, Trajectories, Window, load_drives
+from roadproof.driving.evaluate import evaluate, random_patterns
+from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.intervals import mean_95
 from roadproof.errors import RoadproofError
-from roadproof.evaluation import Evaluation, evaluate, random_patterns
 from roadproof.io.files import write_atomically
-from roadproof.ledger import StageCost
-from roadproof.loop import StressTest, stress_test
-from roadproof.metrics import mean_95
 from roadproof.patterns import Pattern
+from roadproof.pipeline.budget import STEERING, Budget
+from roadproof.pipeline.stage_costs import StageCost
+from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.processes import processes_beside
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace

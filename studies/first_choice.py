@@ -30,13 +30,14 @@ import torch
 
 import roadproof
 from roadproof.attacks import GradOpt, Objective, PathDeviation, SteeringShift, attack, kept_attack
-from roadproof.budget import QUICK
 from roadproof.calibration import Calibrated, calibrate
 from roadproof.drives import record
-from roadproof.evaluation import evaluate, select_by_driving
+from roadproof.driving.evaluate import evaluate
+from roadproof.driving.intervals import mean_95
 from roadproof.io.files import write_atomically
 from roadproof.memory import keep_freed_memory
-from roadproof.metrics import mean_95
+from roadproof.pipeline.budget import QUICK
+from roadproof.pipeline.selection import select_by_driving
 from roadproof.processes import processes_beside
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace

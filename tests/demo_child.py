@@ -7,10 +7,10 @@ import sys
 from paint_shy import along_a_street
 from roadproof.attacks import GradOpt, SteeringShift, methods
 from roadproof.attacks.gradopt import Rung
-from roadproof.budget import BUDGETS, Budget
 from roadproof.cli import main
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
+from roadproof.pipeline.budget import BUDGETS, Budget
 from roadproof.scenarios import save_scenarios
 
 TINY = Budget(

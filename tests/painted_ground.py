@@ -7,8 +7,7 @@ import torch
 
 from roadproof.datatypes import Control, VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
-from roadproof.recordings import Push, Recording, RecordingSet
-from roadproof.tracks import Track
+from roadproof.recordings import Push, Recording, RecordingSet, Track
 from scenes import PLAIN
 
 CANVAS = CanvasPlacement(x_m=120.0, y_m=-40.0, yaw_rad=0.0)

@@ -7,8 +7,7 @@ from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homograph
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded.pictures import Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.recordings import Push, Recording, RecordingSet
-from roadproof.tracks import Track
+from roadproof.recordings import Push, Recording, RecordingSet, Track
 
 CANVAS = CanvasPlacement(x_m=130.0, y_m=-40.0, yaw_rad=0.6)
 VEHICLE = Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.05)

@@ -15,15 +15,14 @@ from roadproof.coverage import Shape
 from roadproof.datatypes import Ending, Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window
 from roadproof.drives.drives import Settings, write_drive, write_settings
-from roadproof.evaluation import Evaluation, Selection
-from roadproof.evaluation.result import judge
-from roadproof.evaluation.selection import Driven
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation, judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.selection import Driven, Selection
 from roadproof.recordings import Push, save_recordings
 from roadproof.report.film import Strip
 from roadproof.roads.maps import load_map, scenario_route
-from roadproof.rollout import Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace
 from scenes import recording_set

@@ -11,8 +11,9 @@ import pytest
 
 import needs
 from roadproof.attacks import AttackResult
-from roadproof.evaluation import Evaluation, Selection
-from roadproof.ledger import read_cost
+from roadproof.driving.evaluation import Evaluation
+from roadproof.pipeline.selection import Selection
+from roadproof.pipeline.stage_costs import read_cost
 from roadproof.report.run import read_run
 
 needs.town()

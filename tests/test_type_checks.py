@@ -7,8 +7,9 @@ from jaxtyping import TypeCheckError
 
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control
+from roadproof.driving.deviation import deviation_m
+from roadproof.driving.intervals import mean_95
 from roadproof.geometry import CameraModel
-from roadproof.metrics import deviation_m, mean_95
 from roadproof.patterns import Pattern
 
 

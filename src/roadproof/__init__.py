@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from roadproof.attacks import SteeringShift as SteeringShift
     from roadproof.attacks import attack as attack
     from roadproof.attacks import show_pattern as show_pattern
-    from roadproof.budget import PUBLISHED as PUBLISHED
-    from roadproof.budget import QUICK as QUICK
-    from roadproof.budget import STEERING as STEERING
-    from roadproof.budget import Budget as Budget
+    from roadproof.attacks.groups import Group as Group
+    from roadproof.attacks.groups import parse_groups as parse_groups
     from roadproof.compositing import CanvasView as CanvasView
     from roadproof.compositing import composite as composite
     from roadproof.compositing import view_canvas as view_canvas
@@ -33,18 +31,14 @@ if TYPE_CHECKING:
     from roadproof.coverage import Shape as Shape
     from roadproof.datatypes import Control as Control
     from roadproof.datatypes import Weather as Weather
+    from roadproof.driving.evaluate import evaluate as evaluate
+    from roadproof.driving.evaluation import Evaluation as Evaluation
     from roadproof.errors import RoadproofError as RoadproofError
-    from roadproof.evaluation import Evaluation as Evaluation
-    from roadproof.evaluation import evaluate as evaluate
     from roadproof.geometry import CameraModel as CameraModel
     from roadproof.geometry import CanvasPlacement as CanvasPlacement
     from roadproof.geometry import CropResize as CropResize
     from roadproof.geometry import homography_from_points as homography_from_points
     from roadproof.geometry import homography_from_pose as homography_from_pose
-    from roadproof.loop import StressTest as StressTest
-    from roadproof.loop import stress_test as stress_test
-    from roadproof.objectives import Group as Group
-    from roadproof.objectives import parse_groups as parse_groups
     from roadproof.patterns import Pattern as Pattern
     from roadproof.patterns import load_pattern as load_pattern
     from roadproof.patterns import raster as raster
@@ -52,9 +46,15 @@ if TYPE_CHECKING:
     from roadproof.photometry import AffineResponse as AffineResponse
     from roadproof.photometry import ColourTransform as ColourTransform
     from roadproof.photometry import fit_colour as fit_colour
-    from roadproof.poses import placed as placed
+    from roadproof.pipeline.budget import PUBLISHED as PUBLISHED
+    from roadproof.pipeline.budget import QUICK as QUICK
+    from roadproof.pipeline.budget import STEERING as STEERING
+    from roadproof.pipeline.budget import Budget as Budget
+    from roadproof.pipeline.stress_test import StressTest as StressTest
+    from roadproof.pipeline.stress_test import stress_test as stress_test
     from roadproof.recorded import RecordedSimulator as RecordedSimulator
     from roadproof.recorded import Vehicle as Vehicle
+    from roadproof.recorded.poses import placed as placed
     from roadproof.recordings import Push as Push
     from roadproof.recordings import Recording as Recording
     from roadproof.recordings import RecordingSet as RecordingSet
@@ -82,20 +82,21 @@ _ROOMS = {
         "attack",
         "show_pattern",
     ),
+    "attacks.groups": ("Group", "parse_groups"),
     "compositing": ("CanvasView", "composite", "view_canvas"),
     "controllers": ("Controller", "CruiseControl", "check_controller", "load_controller"),
     "coverage": ("Shape",),
     "datatypes": ("Control", "Weather"),
+    "driving.evaluate": ("evaluate",),
+    "driving.evaluation": ("Evaluation",),
     "errors": ("RoadproofError",),
-    "evaluation": ("Evaluation", "evaluate"),
     "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
-    "budget": ("Budget", "PUBLISHED", "QUICK", "STEERING"),
-    "loop": ("StressTest", "stress_test"),
-    "objectives": ("Group", "parse_groups"),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
     "photometry": ("AffineResponse", "ColourTransform", "fit_colour"),
-    "poses": ("placed",),
+    "pipeline.budget": ("Budget", "PUBLISHED", "QUICK", "STEERING"),
+    "pipeline.stress_test": ("StressTest", "stress_test"),
     "recorded": ("RecordedSimulator", "Vehicle"),
+    "recorded.poses": ("placed",),
     "recordings": ("Push", "Recording", "RecordingSet", "load_recordings", "save_recordings"),
     "report.page": ("write_report",),
     "scenarios": ("Scenario", "builtin_scenarios", "find_scenario"),

@@ -9,9 +9,9 @@ import torch
 from painted_ground import RampFollower, recorded_road
 from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack
 from roadproof.attacks.gradopt import Rung, gradopt
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP
 from roadproof.recorded import RecordedWorld, Start, Vehicle
 from roadproof.recorded.world import UNSURE
 from roadproof.search_space import SearchSpace

@@ -10,12 +10,12 @@ from safetensors import SafetensorError
 
 from roadproof.attacks import AttackResult, GradOpt, PathDeviation, Published, SteeringShift, Surrogate, attack
 from roadproof.attacks.gradopt import Rung, dropping, gradopt, random_search
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.methods import method_of
 from roadproof.attacks.published import PublishedMeasure
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.patterns import Pattern, boxes_from_published
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set

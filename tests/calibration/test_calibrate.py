@@ -12,10 +12,10 @@ from roadproof.calibration import Method, calibrate, load_report, replays_needed
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.drives import Swerve, Trajectories, Window, record
+from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import load_recordings, save_recordings
-from roadproof.rollout import replay, rollout
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.training.expert import expert
 

@@ -9,9 +9,9 @@ from PIL import Image
 import needs
 from carla_serving import free_port, serving, straight_map
 from roadproof.datatypes import VehicleState
-from roadproof.evaluation import Evaluation
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation
 from roadproof.geometry import CanvasPlacement
-from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario, save_scenarios
 from roadproof.simulators.protocol import PaintKind
 

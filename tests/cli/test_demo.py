@@ -7,9 +7,9 @@ import pytest
 import needs
 from paint_shy import along_a_street
 from roadproof.attacks import GradOpt, SteeringShift
-from roadproof.budget import BUDGETS, Budget
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
+from roadproof.pipeline.budget import BUDGETS, Budget
 from roadproof.scenarios import save_scenarios
 
 TINY = Budget(

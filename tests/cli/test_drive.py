@@ -13,8 +13,8 @@ from PIL import Image
 
 import needs
 from roadproof.coverage import Shape
+from roadproof.driving.episode import Episode
 from roadproof.patterns import Pattern, save_pattern
-from roadproof.rollout import Episode
 from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
 
 needs.town()

@@ -12,7 +12,7 @@ from PIL import Image
 import needs
 from paint_shy import just_before_the_canvas
 from roadproof.coverage import Shape
-from roadproof.evaluation import Evaluation
+from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.scenarios import save_scenarios
 

@@ -8,7 +8,7 @@ import pytest
 
 import needs
 from roadproof.drives import load_drives
-from roadproof.evaluation import Selection
+from roadproof.pipeline.selection import Selection
 from roadproof.recordings import load_recordings
 
 needs.town()

@@ -12,10 +12,10 @@ import torch
 from recorded_drives import drivable_set
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
-from roadproof.evaluation import Evaluation
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recordings import save_recordings
-from roadproof.rollout import Episode
 
 TESTS = Path(__file__).parents[1]
 BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))

@@ -9,9 +9,9 @@ import pytest
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
 from roadproof.drives import SteeringNoise
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, swerving
+from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.recordings import Push
-from roadproof.rollout import Episode
 
 DT_S, SPEED_MPS = 0.05, 7.0
 FRAME = np.zeros((4, 4, 3), np.uint8)

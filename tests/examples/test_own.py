@@ -13,14 +13,14 @@ import pytest
 from PIL import Image
 
 import needs
-import roadproof.loop
+import roadproof.pipeline.stress_test
 from references import approach
 from roadproof.attacks import GradOpt
 from roadproof.attacks.gradopt import Rung
 from roadproof.controllers import check_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
-from roadproof.evaluation import Evaluation
+from roadproof.driving.evaluation import Evaluation
 from roadproof.geometry import apply_homography
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -63,7 +63,7 @@ def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys
         weathers=(Weather.CLEAR_NOON,),
         starts=0,
     )
-    monkeypatch.setattr(roadproof.budget, "QUICK", tiny)
+    monkeypatch.setattr(roadproof.pipeline.budget, "QUICK", tiny)
     names = run("own_controller.py", tmp_path, monkeypatch=monkeypatch)
     check_controller(names["LineFollower"]()).require()
     (trial,) = Evaluation.load(tmp_path / "evaluation").trials

@@ -12,10 +12,11 @@ from recorded_drives import drivable_set
 from roadproof.attacks import Candidate
 from roadproof.coverage import Shape
 from roadproof.datatypes import VehicleState, Weather
-from roadproof.evaluation import Evaluation, Selection, evaluate, select_by_driving
-from roadproof.evaluation.result import passage_deviation_m, path_of
-from roadproof.metrics import passage
+from roadproof.driving.deviation import passage
+from roadproof.driving.evaluate import evaluate
+from roadproof.driving.evaluation import Evaluation, passage_deviation_m, path_of
 from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.film import film_trial
 from roadproof.report.page import write_report

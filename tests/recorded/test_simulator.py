@@ -9,11 +9,12 @@ import torch
 from paint_shy import PaintShy
 from recorded_drives import CANVAS, VEHICLE, drivable_set, shown_from, track
 from roadproof.datatypes import Control, Ending, Weather
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import path_of
+from roadproof.driving.rollout import rollout
 from roadproof.errors import RecordingError, SimulatorError
-from roadproof.evaluation.result import path_of
 from roadproof.recorded.simulator import FURTHEST_ASIDE_M, FURTHEST_TURNED_RAD, RecordedSimulator
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.rollout import Episode, rollout
 from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.protocol import Identified, PaintKind, Simulator
 

@@ -8,7 +8,7 @@ import torch
 
 from roadproof.errors import RecordingError
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.tracks import Track
+from roadproof.recordings import Track
 
 KNOWN = Vehicle(
     dt_s=0.05,

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from roadproof.evaluation.result import path_of
-from roadproof.metrics import Mean
+from roadproof.driving.evaluation import path_of
+from roadproof.driving.intervals import Mean
 from roadproof.patterns import raster
 from roadproof.report import charts
 from roadproof.report.top_view import top_view

@@ -13,8 +13,8 @@ needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Weather
-from roadproof.evaluation import evaluate
-from roadproof.evaluation.episodes import load_episodes
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.evaluate import evaluate
 from roadproof.patterns import Pattern
 from roadproof.report.film import EVENT_SHOWN_S, film_trial, told
 

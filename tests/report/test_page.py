@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from browser import opened, until
+from roadproof.driving.evaluation import load_paint
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.evaluation.result import load_paint
-from roadproof.ledger import Ledger
 from roadproof.patterns import save_pattern
+from roadproof.pipeline.stage_costs import Ledger
 from roadproof.report.page import write_report
 from roadproof.simulators.protocol import PaintKind
 from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run, write_selection

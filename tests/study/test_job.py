@@ -18,11 +18,11 @@ from safetensors.torch import load_file
 
 import needs
 from roadproof.attacks import CMAES, AttackResult, GradOpt, PathDeviation, Published, SteeringShift, proposals
-from roadproof.budget import PUBLISHED, QUICK, STEERING
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.patterns import load_pattern
+from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING
 from roadproof.study.job import MEASURED, budget_of, run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan
 from roadproof.study.plan import Job, StartPlan, TrafficPlan

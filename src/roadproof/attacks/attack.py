@@ -14,12 +14,12 @@ from torch import Tensor
 from roadproof.attacks.checks import check_gradients, check_search, check_world
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search
+from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.result import AttackResult, Candidate, Cost
 from roadproof.controllers import Controller
-from roadproof.objectives import Group
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 

@@ -19,10 +19,10 @@ from torch import Tensor
 from roadproof.attacks import proposals
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
 from roadproof.attacks.gradopt import Running, Search
+from roadproof.attacks.groups import Group, parse_groups
 from roadproof.attacks.method import Method
 from roadproof.attacks.objective import Measure, Objective
 from roadproof.errors import RoadproofError
-from roadproof.objectives import Group, parse_groups
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import Family, SearchSpace
 

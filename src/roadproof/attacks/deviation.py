@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.groups import Direction, Group
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
-from roadproof.objectives import Direction, Group
 from roadproof.recorded.world import UNSURE, RecordedWorld, Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace

@@ -8,9 +8,9 @@ from typing import ClassVar, Unpack
 import torch
 
 from roadproof.attacks.gradopt import Running, Search
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group
 from roadproof.attacks.objective import Measure, Objective
 from roadproof.controllers import Controller
-from roadproof.objectives import LEFT_GROUP, RIGHT_GROUP, Group
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 

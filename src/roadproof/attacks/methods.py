@@ -17,12 +17,12 @@ import torch
 
 from roadproof.attacks.blackbox import CMAES, TPE, BayesianOptimisation, GaussianProcess, RandomSearch, at_least_one
 from roadproof.attacks.gradopt import Ladder, Rung, Running, Search, dropping, gradopt
+from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.published import MASKS, PublishedMeasure
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
-from roadproof.objectives import Group
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 

@@ -16,10 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.groups import Group
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
-from roadproof.objectives import Group
 from roadproof.recorded.world import Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace

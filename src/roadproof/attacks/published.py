@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.groups import Group, divergence
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.published import AntialiasedView, MaskedView, pasted, view_canvas_published
 from roadproof.controllers import Controller
 from roadproof.errors import PatternError
-from roadproof.objectives import Group, divergence
 from roadproof.patterns import visibilities
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from roadproof.attacks.groups import Group
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing import composite
 from roadproof.controllers import Controller
-from roadproof.objectives import Group
 from roadproof.patterns import Pattern
 from roadproof.recordings import RecordingSet
 

@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.groups import Group, divergence
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.errors import ControllerError
-from roadproof.objectives import Group, divergence
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
 from roadproof.recordings import Recording, RecordingSet

@@ -14,10 +14,10 @@ from jaxtyping import Float, UInt8
 
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives import Drive, Drives
+from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.io.arrays import read_record, write_archive
-from roadproof.rollout import replay, rollout
 from roadproof.simulators.protocol import PatternImage, Simulator
 
 ASTRAY_M, ASTRAY_RAD = 0.02, 0.003

@@ -84,13 +84,13 @@ def attack(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks import OBJECTIVES, method_of, show_pattern
     from roadproof.attacks import attack as run
+    from roadproof.attacks.groups import parse_groups
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
     from roadproof.io.locks import hold
-    from roadproof.objectives import parse_groups
     from roadproof.recordings import Push, load_recordings
     from roadproof.search_space import FAMILIES, SearchSpace
 

@@ -28,7 +28,7 @@ from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
-    from roadproof.loop import StressTest
+    from roadproof.pipeline.stress_test import StressTest
     from roadproof.simulators.protocol import Simulator
 
 
@@ -52,12 +52,12 @@ def demo(
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.budget import BUDGETS
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.io.files import write_atomically
     from roadproof.io.locks import hold
-    from roadproof.loop import stress_test
+    from roadproof.pipeline.budget import BUDGETS
+    from roadproof.pipeline.stress_test import stress_test
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -107,8 +107,8 @@ def demo(
 def _film(world: Simulator, controller: Controller, result: StressTest, out: Path) -> None:
     """The clean and the painted drive side by side; composited frames beside the rendered ones."""
     from roadproof.drives import load_drives
-    from roadproof.evaluation import compare_with_rendered, rendered_frames
-    from roadproof.evaluation.result import load_paint
+    from roadproof.driving.evaluation import load_paint
+    from roadproof.pipeline.fidelity import compare_with_rendered, rendered_frames
     from roadproof.recordings import load_recordings
     from roadproof.report.film import film_trial
 
@@ -125,7 +125,7 @@ def _film(world: Simulator, controller: Controller, result: StressTest, out: Pat
 def _report(result: StressTest, out: Path) -> None:
     from rich.console import Console
 
-    from roadproof.ledger import StageCost
+    from roadproof.pipeline.stage_costs import StageCost
     from roadproof.report.page import write_report
     from roadproof.report.run import read_run
     from roadproof.report.verdict import verdict

@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from roadproof.datatypes import Control, Observation
-    from roadproof.evaluation.episodes import AnyDriver
+    from roadproof.driving.drive_store import AnyDriver
+    from roadproof.driving.episode import Episode
+    from roadproof.driving.rollout import OnStep
     from roadproof.recorded.simulator import RecordedSimulator
     from roadproof.report.video import DriveVideo
     from roadproof.roads.roadmap import RoadMap
-    from roadproof.rollout import Episode, OnStep
     from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
 
@@ -63,9 +64,9 @@ def drive(
     """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.datatypes import Weather
+    from roadproof.driving.rollout import rollout
     from roadproof.io.locks import hold
     from roadproof.patterns import read_paint
-    from roadproof.rollout import rollout
 
     inside = recorded_in(simulator)
     asked = scenario_asked(inside, scenario, scenarios)

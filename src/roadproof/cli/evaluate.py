@@ -25,8 +25,9 @@ from roadproof.limits import MAX_CROWD, MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
-    from roadproof.evaluation import Evaluation, Fidelity, Row
+    from roadproof.driving.evaluation import Evaluation, Row
     from roadproof.patterns import Pattern
+    from roadproof.pipeline.fidelity import Fidelity
     from roadproof.recordings import RecordingSet
     from roadproof.simulators.protocol import Simulator
 
@@ -82,9 +83,10 @@ def evaluate(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.cli.progress import progress
     from roadproof.controllers import Controller
+    from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns
+    from roadproof.driving.evaluate import evaluate as run
+    from roadproof.driving.starts import StartRange
     from roadproof.errors import PatternError
-    from roadproof.evaluation import PAPER_WEATHERS, StartRange, random_patterns
-    from roadproof.evaluation import evaluate as run
     from roadproof.io.locks import hold
     from roadproof.patterns import load_pattern, read_paint
     from roadproof.recordings import load_recordings
@@ -156,8 +158,8 @@ def _compared(
     world: Simulator, who: Controller, evaluation: Evaluation, figures: Pattern, recorded: RecordingSet, out: Path
 ) -> Fidelity | None:
     """The surrogate's frames beside the simulator's, where the set was recorded on this clean drive."""
-    from roadproof.evaluation import compare_with_rendered, is_drive_of, rendered_frames
-    from roadproof.rollout import rollout
+    from roadproof.driving.rollout import rollout
+    from roadproof.pipeline.fidelity import compare_with_rendered, is_drive_of, rendered_frames
 
     clean = rollout(world, who, evaluation.scenario, weather=evaluation.weathers[0])
     drive = next((each for each in recorded.recordings if each.push == "clean"), None)

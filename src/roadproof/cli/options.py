@@ -15,7 +15,7 @@ from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.datatypes import Weather
-    from roadproof.rollout import Policy
+    from roadproof.driving.rollout import Policy
     from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)

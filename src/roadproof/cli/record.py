@@ -67,7 +67,6 @@ def record(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from dataclasses import replace
 
-    from roadproof.budget import BUDGETS
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Weather
     from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories
@@ -75,6 +74,7 @@ def record(
     from roadproof.errors import RecordingError, ScenarioError
     from roadproof.io.files import inside
     from roadproof.io.locks import hold
+    from roadproof.pipeline.budget import BUDGETS
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator
 

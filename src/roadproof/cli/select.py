@@ -12,7 +12,7 @@ from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult
-    from roadproof.evaluation import Selection
+    from roadproof.pipeline.selection import Selection
 
 
 def select(
@@ -32,9 +32,9 @@ def select(
     from roadproof.controllers import load_controller
     from roadproof.drives import load_drives
     from roadproof.errors import RoadproofError
-    from roadproof.evaluation import select_by_driving
     from roadproof.io.locks import hold
     from roadproof.patterns import save_pattern
+    from roadproof.pipeline.selection import select_by_driving
 
     recorded = load_drives(run / "record").settings
     place = run / "attack"

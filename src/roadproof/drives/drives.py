@@ -1,7 +1,7 @@
 """Recorded drives before calibration, and their folder.
 
     RECORD/record.json         what was asked for: scenario, weather, seed, trajectories, window, camera, input, driver
-    RECORD/DRIVE/episode.npz   the whole drive (`rollout.Episode`)
+    RECORD/DRIVE/episode.npz   the whole drive (`driving.episode`)
     RECORD/DRIVE/drive.npz     of the kept frames: frame_number, frames, steer, right_m; and how the drive came about
 
 A drive's folder is there when the drive is finished. Nothing is pickled.
@@ -19,14 +19,13 @@ from jaxtyping import Float, Int, UInt8
 
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Trajectories, Window
+from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_record, write_archive
 from roadproof.io.files import read_json, write_atomically, write_folder_atomically
-from roadproof.recordings import Push
-from roadproof.rollout import Episode
+from roadproof.recordings import Push, Track
 from roadproof.scenarios import Scenario
-from roadproof.tracks import Track
 
 FORMAT = "roadproof-record"
 FORMAT_VERSION = 1

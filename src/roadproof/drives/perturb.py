@@ -23,9 +23,10 @@ from jaxtyping import Float
 
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives.trajectories import SteeringNoise
+from roadproof.driving.episode import Episode
+from roadproof.driving.rollout import Policy
 from roadproof.errors import RecordingError
 from roadproof.recordings import Push
-from roadproof.rollout import Episode, Policy
 
 _GAIN_PRIOR = 0.3
 """1/m: between a small car with a small steering angle (0.23) and CARLA's large ones (0.42)."""

@@ -19,10 +19,11 @@ from roadproof.datatypes import Control, EventKind, Observation, VehicleState, W
 from roadproof.drives.drives import Drive, Drives, Settings, read_drive, write_drive, write_settings
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
 from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
+from roadproof.driving.episode import Episode
+from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, homography_from_pose
 from roadproof.recordings import Push
-from roadproof.rollout import Driver, Episode, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 

@@ -23,12 +23,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from roadproof.driving.deviation import passage
 from roadproof.errors import RecordingError
 from roadproof.geometry import CanvasPlacement
-from roadproof.metrics import passage
 from roadproof.recorded.pictures import Poses
 from roadproof.recorded.vehicle import curvatures
-from roadproof.tracks import Track
+from roadproof.recordings import Track
 
 _FAR_M = 4.0
 

@@ -31,7 +31,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.errors import RecordingError
-from roadproof.tracks import Track
+from roadproof.recordings import Track
 
 _MOVING_MPS = 2.0
 _LEAST_STEPS = 12

@@ -16,8 +16,8 @@ from torch import Tensor
 from roadproof.compositing.composite import composite_own
 from roadproof.controllers import Controller, PedalController
 from roadproof.controllers.asking import controls_of, steer_of
+from roadproof.driving.deviation import deviation_m
 from roadproof.errors import RecordingError
-from roadproof.metrics import deviation_m
 from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
 from roadproof.recorded.pictures import FrameBank, Gap, Poses

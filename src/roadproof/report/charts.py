@@ -19,13 +19,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from roadproof.datatypes import Event
-from roadproof.evaluation.fidelity import Fidelity
-from roadproof.evaluation.prediction import Prediction
-from roadproof.evaluation.result import path_of
+from roadproof.driving.deviation import HORIZON_M, lateral_m
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import path_of
 from roadproof.geometry import CanvasPlacement
-from roadproof.metrics import HORIZON_M, lateral_m
+from roadproof.pipeline.fidelity import Fidelity
+from roadproof.pipeline.prediction import Prediction
 from roadproof.report.words import in_words
-from roadproof.rollout import Episode
 
 VARIABLES = {
     "ink": "#010101",

@@ -6,7 +6,7 @@ import shlex
 from dataclasses import astuple
 
 from roadproof.attacks import AttackResult
-from roadproof.evaluation import Evaluation
+from roadproof.driving.evaluation import Evaluation
 from roadproof.report.run import Run
 from roadproof.simulators.protocol import PaintKind
 

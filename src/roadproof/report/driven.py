@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from roadproof.evaluation import Selection
+from roadproof.pipeline.selection import Selection
 from roadproof.report.words import MISSING, in_words
 
 

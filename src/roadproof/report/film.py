@@ -15,13 +15,14 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from roadproof.datatypes import Control, Observation
-from roadproof.evaluation.episodes import load_episodes
-from roadproof.evaluation.result import Evaluation, path_of
+from roadproof.driving.deviation import lateral_m, passage
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation, path_of
+from roadproof.driving.rollout import replay, rollout
 from roadproof.io.arrays import write_archive
 from roadproof.io.files import write_atomically
-from roadproof.metrics import lateral_m, passage
 from roadproof.report.words import in_words
-from roadproof.rollout import Episode, replay, rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 

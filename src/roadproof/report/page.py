@@ -15,10 +15,10 @@ from PIL import Image
 
 import roadproof
 from roadproof.calibration.report import Spread
+from roadproof.driving.infractions import counted
 from roadproof.io.files import write_atomically
-from roadproof.ledger import StageCost
-from roadproof.metrics import counted
 from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.stage_costs import StageCost
 from roadproof.report import charts
 from roadproof.report.asphalt import on_asphalt
 from roadproof.report.commands import commands_of

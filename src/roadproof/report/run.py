@@ -3,12 +3,12 @@
 RUN/record/DRIVE/episode.npz   recorded drives
 RUN/recordings/                the same, calibrated (`roadproof.recordings`)
 RUN/attack/                    what the attack found (`roadproof.attacks`)
-RUN/selection/                 optional: its candidates, driven (`roadproof.evaluation`)
-RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.rounds`)
-RUN/evaluation/                what driving over it showed (`roadproof.evaluation`)
-RUN/prediction.npz             optional: the path foretold beside the driven one (`roadproof.evaluation`)
+RUN/selection/                 optional: its candidates, driven (`pipeline.selection`)
+RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.pipeline.rerecording`)
+RUN/evaluation/                what driving over it showed (`driving.evaluation`)
+RUN/prediction.npz             optional: the path foretold beside the driven one (`pipeline.prediction`)
 RUN/pattern.json               optional: the pattern that was chosen in the end
-RUN/run.json                   optional: what the stages took (`roadproof.ledger`)
+RUN/run.json                   optional: what the stages took (`roadproof.pipeline.stage_costs`)
 RUN/commands.txt               optional: the commands that made it, one a line
 """
 
@@ -22,16 +22,18 @@ from roadproof.attacks import AttackResult
 from roadproof.calibration.report import CalibrationReport, load_report
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation, Trial, load_paint
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.evaluation import Evaluation, Fidelity, Prediction, Selection, Trial
-from roadproof.evaluation.episodes import load_episodes
-from roadproof.evaluation.result import load_paint
 from roadproof.io.arrays import read_archive
-from roadproof.ledger import StageCost, read_cost
 from roadproof.patterns import Pattern, load_pattern
+from roadproof.pipeline.fidelity import Fidelity
+from roadproof.pipeline.prediction import Prediction
+from roadproof.pipeline.selection import Selection
+from roadproof.pipeline.stage_costs import StageCost, read_cost
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.report.film import FILM, POSTER, STRIP, Strip
-from roadproof.rollout import Episode
 from roadproof.simulators.protocol import PatternImage
 
 

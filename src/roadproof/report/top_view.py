@@ -16,14 +16,15 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from roadproof.driving.deviation import passage
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import path_of
+from roadproof.driving.infractions import counted
 from roadproof.errors import ScenarioError
-from roadproof.evaluation.result import path_of
 from roadproof.geometry import CanvasPlacement
-from roadproof.metrics import counted, passage
 from roadproof.report.charts import CLEAN, INK, PAINTED, VARIABLES, Chart, svg_of
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
-from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage
 

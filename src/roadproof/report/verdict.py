@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadproof.datatypes import Ending
-from roadproof.evaluation import Evaluation
-from roadproof.metrics import mean_95
+from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.intervals import mean_95
 from roadproof.report.run import Run
 from roadproof.report.words import mean_in_words
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from roadproof.metrics import Mean
+from roadproof.driving.intervals import Mean
 
 MISSING = "–"
 UNKNOWN = "not known"

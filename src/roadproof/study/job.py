@@ -17,7 +17,7 @@ A row is one drive over the pattern against the same drive without it. Its colum
     leaderboard                   the CARLA Leaderboard's factor with paint, 1 where nothing happened
     clean_leaderboard             the same without
     first_event_s       s         when something first went wrong with paint; none where nothing did
-    left_lane                     whether the car left its lane (`evaluation.Trial.leaves_lane`)
+    left_lane                     whether the car left its lane (`driving.evaluation.Trial`)
     ending                        why the painted drive ended
     events                        of the painted drive, those that count, as JSON: kind, seconds, with what or where
     clean_events                  of the clean one
@@ -48,19 +48,20 @@ import torch
 
 from roadproof.attacks import OBJECTIVES, BayesianOptimisation, BlackBox, GradOpt, Published, method_of
 from roadproof.attacks.blackbox import blackbox_search
-from roadproof.budget import PUBLISHED, QUICK, STEERING, Budget
 from roadproof.calibration import Method as Calibration
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Event, Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
-from roadproof.evaluation import DrivenObjective, Evaluation, StartRange, evaluate
-from roadproof.evaluation.episodes import load_episodes
-from roadproof.evaluation.objective import Measure
-from roadproof.evaluation.result import Trial, path_of
-from roadproof.evaluation.selection import first_of_each_group
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.evaluate import evaluate
+from roadproof.driving.evaluation import Evaluation, Trial, path_of
+from roadproof.driving.starts import StartRange
 from roadproof.io.arrays import packed
-from roadproof.loop import StressTest, stress_test
 from roadproof.patterns import Pattern, save_pattern
+from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING, Budget
+from roadproof.pipeline.driven_objective import DrivenObjective, Measure
+from roadproof.pipeline.selection import first_of_each_group
+from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator

@@ -122,7 +122,7 @@ class BlackBoxPlan:
     start: int = 0
 
     def __post_init__(self) -> None:
-        from roadproof.evaluation.objective import MEASURES
+        from roadproof.pipeline.driven_objective import MEASURES
 
         one_of(self.objective, "objective", MEASURES)
         one_of(self.where, "where", ("simulator", "recorded"))

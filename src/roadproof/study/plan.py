@@ -95,7 +95,7 @@ class StartPlan:
 
     Args:
         count: drives alone in each weather.
-        right_m: see `evaluation.starts.StartRange`, as turned_rad and faster_mps.
+        right_m: see `driving.starts.StartRange`, as turned_rad and faster_mps.
     """
 
     count: int = 5
@@ -104,7 +104,7 @@ class StartPlan:
     faster_mps: float = 2.0
 
     def __post_init__(self) -> None:
-        from roadproof.evaluation.starts import MOST
+        from roadproof.driving.starts import MOST
 
         within(self.count, "count", 1, 1000)
         for name, most in MOST.items():

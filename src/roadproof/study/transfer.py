@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from roadproof.controllers import Controller, load_controller
+from roadproof.driving.evaluate import evaluate
 from roadproof.errors import ScenarioError, StudyError
-from roadproof.evaluation import evaluate
 from roadproof.io.files import inside, write_atomically
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator

@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from roadproof.datatypes import VehicleState, Weather
+from roadproof.driving.episode import Episode
 from roadproof.patterns import Pattern, raster
-from roadproof.rollout import Episode
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 

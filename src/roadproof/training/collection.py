@@ -16,10 +16,10 @@ import torch
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import act_of
 from roadproof.datatypes import Command, Control, Event, Observation, Weather
+from roadproof.driving.rollout import Policy
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
 from roadproof.roads.maps import load_map
-from roadproof.rollout import Policy
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage

@@ -10,8 +10,8 @@ import numpy as np
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import act_of
 from roadproof.datatypes import Event, Observation, Weather
+from roadproof.driving.rollout import Policy
 from roadproof.roads.routes import Crossing
-from roadproof.rollout import Policy
 from roadproof.scenarios import Scenario
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert

@@ -2,8 +2,8 @@ import re
 
 import pytest
 
+from roadproof.driving.intervals import Mean
 from roadproof.errors import StudyError
-from roadproof.metrics import Mean
 from roadproof.report.study.table import Estimate, Heading, Table, in_latex, in_markdown, latex_text, markdown_text
 
 HOSTILE = "<b>_BO_ 100% $x^2$ {a} \\end{table} #1 & ~ | `c` *d* [e](f)"

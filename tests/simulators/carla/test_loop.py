@@ -22,20 +22,21 @@ pytest.importorskip("carla", reason="CARLA's client is not installed: pip instal
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 from roadproof.attacks import GradOpt, SteeringShift
-from roadproof.budget import Budget
 from roadproof.calibration import load_report
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
+from roadproof.driving.deviation import lateral_m
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation, Trial, judge, path_of
+from roadproof.driving.rollout import rollout
 from roadproof.errors import RoadproofError
-from roadproof.evaluation import Evaluation, Fidelity, Trial, compare_with_rendered, rendered_frames
-from roadproof.evaluation.episodes import load_episodes
-from roadproof.evaluation.result import judge, path_of
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.loop import StressTest, stress_test
-from roadproof.metrics import lateral_m
+from roadproof.pipeline.budget import Budget
+from roadproof.pipeline.fidelity import Fidelity, compare_with_rendered, rendered_frames
+from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.recordings import load_recordings
-from roadproof.rollout import Episode, rollout
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.protocol import PaintKind

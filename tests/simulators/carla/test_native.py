@@ -12,10 +12,11 @@ pytest.importorskip("carla", reason="CARLA's client is not installed: pip instal
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 from roadproof.datatypes import Control, VehicleState
+from roadproof.driving.episode import Episode
+from roadproof.driving.rollout import rollout
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.roads.maps import load_map
-from roadproof.rollout import Episode, rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL
 from roadproof.simulators.carla.native import Ground, find_ground, texture_of

@@ -14,9 +14,9 @@ pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]"
 import carla
 
 from roadproof.datatypes import Control, EventKind, VehicleState
+from roadproof.driving.infractions import infraction_points
+from roadproof.driving.rollout import rollout
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
-from roadproof.metrics import infraction_points
-from roadproof.rollout import rollout
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.session import Session
 from roadproof.simulators.carla.signals import trigger_volume

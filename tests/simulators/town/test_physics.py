@@ -7,12 +7,12 @@ import needs
 from roadproof.datatypes import Control, EventKind, VehicleState
 
 needs.town()
-from roadproof.driving.judge import Judge, people_hit
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import Surface
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import MAX_STEER_RAD, WHEELBASE_M, Contact, Physics
 from roadproof.simulators.town.scenery import Solid
+from roadproof.simulators.tracker.judge import Judge, people_hit
 
 NOBODY = np.zeros((0, 2))
 
@@ -141,7 +141,7 @@ def test_further_right_comes_the_sidewalk_and_then_the_land(roads):
 
 
 def test_wheels_decide_about_the_sidewalk_where_the_map_says_it_is(roads):
-    from roadproof.driving.judge import wheels
+    from roadproof.simulators.tracker.judge import wheels
 
     for offset in np.arange(1.0, 5.0, 0.25):
         state = on_lane(roads, float(offset))

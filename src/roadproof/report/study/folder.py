@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from roadproof.driving.deviation import Path2D
 from roadproof.errors import StudyError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.arrays import read_archive
 from roadproof.io.files import read_json
 from roadproof.io.pictures import read_picture
-from roadproof.metrics import Path2D
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.report.study.results import JobId, Method, Record
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from roadproof.metrics import Mean
+from roadproof.driving.intervals import Mean
 from roadproof.report.study.blocks import DEVIATION, LEFT_LANE, PENALTY, Block, Metric, overall, reference, rivals
 from roadproof.report.study.notes import note
 from roadproof.report.study.results import Method, Results

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from roadproof.driving.deviation import Path2D
 from roadproof.errors import ScenarioError
-from roadproof.metrics import Path2D
 from roadproof.patterns import raster
 from roadproof.report.asphalt import on_asphalt
 from roadproof.report.study.blocks import compared, reference

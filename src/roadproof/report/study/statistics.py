@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float, Int
 
+from roadproof.driving.intervals import Mean
 from roadproof.errors import StudyError
-from roadproof.metrics import Mean
 
 Case: TypeAlias = tuple[str, ...]
 """What a value belongs to: the scenario first, then what else tells it apart, the seed for instance."""

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from roadproof.driving.intervals import Mean
 from roadproof.errors import StudyError
-from roadproof.metrics import Mean
 
 
 @dataclass(frozen=True, slots=True)

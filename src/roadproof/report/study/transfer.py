@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
+from roadproof.driving.intervals import Mean
 from roadproof.errors import StudyError
-from roadproof.metrics import Mean
 from roadproof.report.study.blocks import DEVIATION, Metric
 from roadproof.report.study.charts import INK, MUTED, Picture, plain
 from roadproof.report.study.results import Record

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import queue
 
-from roadproof.driving.body import Contact
 from roadproof.simulators.carla.actors import Crowd
 from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.tracker.body import Contact
 
 
 class Collisions:

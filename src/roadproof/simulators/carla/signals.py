@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 from roadproof.datatypes import Event, VehicleState
-from roadproof.driving.signals import RedLights, StopSigns, TriggerVolume
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.tracker.signals import RedLights, StopSigns, TriggerVolume
 
 STOP_SIGN = "traffic.stop"
 
@@ -15,7 +15,7 @@ STOP_SIGN = "traffic.stop"
 class Signals:
     """Watches one drive for red lights and stop signs that the car runs.
 
-    The rules are those of `roadproof.driving.signals`. The server is asked once, when the drive begins, what lights
+    The rules are those of `simulators.tracker.signals`. The server is asked once, when the drive begins, what lights
     and signs it has; where it has none, nothing is ever found. What a light shows comes with each step, without a call.
     """
 

@@ -12,8 +12,6 @@ from types import TracebackType
 import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
-from roadproof.driving.endings import Endings
-from roadproof.driving.judge import Judge
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, Homography
 from roadproof.roads.maps import scenario_route
@@ -33,6 +31,8 @@ from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
 from roadproof.simulators.carla.weather import set_weather
 from roadproof.simulators.protocol import PaintChoice, PaintKind, PatternImage, Pictures
+from roadproof.simulators.tracker.endings import Endings
+from roadproof.simulators.tracker.judge import Judge
 from roadproof.traffic.agents import NOBODY, Agents
 from roadproof.traffic.traffic import Traffic
 

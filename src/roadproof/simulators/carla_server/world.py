@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, VehicleState, Weather
-from roadproof.driving.judge import people_hit
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.roads.maps import BUILTIN_MAPS, builtin_map_file, load_map
@@ -29,6 +28,7 @@ from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
 from roadproof.simulators.town.scenery import Scenery, build_scenery
+from roadproof.simulators.tracker.judge import people_hit
 
 FREE_RUN_S = 0.05
 CAR_LENGTH_M = 4.5

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Control, VehicleState
-from roadproof.driving.body import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.scenery import Solid
+from roadproof.simulators.tracker.body import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
 
 WHEEL_RADIUS_M = 0.33
 MASS_KG = 1500.0

@@ -9,8 +9,6 @@ from types import TracebackType
 import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
-from roadproof.driving.endings import Endings
-from roadproof.driving.judge import Judge
 from roadproof.errors import SimulatorError
 from roadproof.geometry import (
     CIL_CAMERA,
@@ -31,6 +29,8 @@ from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
 from roadproof.simulators.town.scenery import Scenery, build_scenery
+from roadproof.simulators.tracker.endings import Endings
+from roadproof.simulators.tracker.judge import Judge
 from roadproof.traffic.agents import NOBODY, Agents
 from roadproof.traffic.traffic import Traffic
 

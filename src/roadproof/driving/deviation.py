@@ -1,0 +1,106 @@
+"""How far a drive went from another: the paper's deviation between two paths, and signed distances beside one."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from roadproof.errors import EpisodeError
+from roadproof.geometry import CanvasPlacement
+
+Path2D = Float[np.ndarray, "n 2"]
+"""World x, y of the car, one row an observation."""
+
+
+HORIZON_M = 25.0
+"""So far before the canvas a driver begins to see what is painted on it."""
+
+
+LEAVES_LANE_M = 0.8
+"""So far from where the clean drive was, part of a car is over its lane's edge: half a lane of 3.5 m less half a car of
+1.9 m."""
+
+
+def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZON_M) -> slice:
+    """The instants at which a clean drive has the canvas in view: from `horizon_m` before it to its end.
+
+    Distances are driven ones, measured from where the drive comes closest to the canvas' middle, so bends do no harm.
+
+    Args:
+        clean: path of the drive without paint.
+        canvas: where the canvas lies.
+        horizon_m: from how far before its near edge the canvas counts as seen.
+
+    Raises:
+        EpisodeError: the path is empty, or has NaN or infinite values.
+    """
+    _check_path(clean, "clean")
+    driven_m = np.concatenate([[0.0], np.hypot(*np.diff(clean, axis=0).T).cumsum()])
+    middle_m = driven_m[np.hypot(clean[:, 0] - canvas.x_m, clean[:, 1] - canvas.y_m).argmin()]
+    half_m = canvas.length_m / 2
+    seen = np.flatnonzero((driven_m >= middle_m - half_m - horizon_m) & (driven_m <= middle_m + half_m))
+    return slice(int(seen[0]), int(seen[-1]) + 1)
+
+
+def deviation_m(clean: Path2D, painted: Float[np.ndarray, "m 2"]) -> float:
+    """The paper's deviation between two drives, in metres.
+
+        Deviation = 1/(2T) ∑_{t=1}^{T} [ min_{t'} |W̃_t − W_{t'}| + min_{t'} |W_t − W̃_{t'}| ]
+
+    with W the positions without and W̃ those with the pattern, at the instants when the canvas is in view (`passage`).
+    Each position is compared with the *nearest position* of the other drive, at whatever time, in both directions; so
+    the measure is symmetric, does not mind a delay along the same path, and is 0 for equal drives. Where one drive
+    ended before all instants had passed, each direction is the mean over the positions there are.
+
+    Args:
+        clean: positions without the pattern.
+        painted: positions with it.
+
+    Raises:
+        EpisodeError: a path is empty, or has NaN or infinite values.
+
+    References:
+        The paper, eq. (devdef).
+    """
+    _check_path(clean, "clean")
+    _check_path(painted, "painted")
+    apart = np.hypot(*(clean[:, None] - painted[None]).transpose(2, 0, 1))
+    return float((apart.min(0).mean() + apart.min(1).mean()) / 2)
+
+
+def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, " m"]:
+    """Signed distance of positions beside a path, left positive: to the nearest point of its polyline.
+
+    Positions before its beginning or beyond its end are compared with the line that goes on straight.
+
+    Args:
+        reference: the path, in the order it was driven.
+        positions: what to compare.
+
+    Raises:
+        EpisodeError: a path is empty or not finite, or the reference does not move.
+    """
+    _check_path(reference, "reference")
+    _check_path(positions, "compared")
+    step = np.diff(reference, axis=0)
+    length = np.hypot(*step.T)
+    # A car that stands has no direction.
+    start, step, length = reference[:-1][length > 1e-6], step[length > 1e-6], length[length > 1e-6]
+    if not len(step):
+        raise EpisodeError("the reference drive does not move, so nothing can be beside it; check the controller")
+    ahead = step / length[:, None]
+    away = positions[:, None] - start[None]
+    along = (away * ahead).sum(-1)
+    low, high = np.zeros(len(step)), length.copy()
+    low[0], high[-1] = -np.inf, np.inf
+    gap = away - np.clip(along, low, high)[..., None] * ahead
+    nearest = np.hypot(gap[..., 0], gap[..., 1]).argmin(1)
+    rows = np.arange(len(positions))
+    x, y = away[rows, nearest].T
+    left = ahead[nearest, 0] * y - ahead[nearest, 1] * x >= 0
+    return np.hypot(*gap[rows, nearest].T) * np.where(left, 1.0, -1.0)
+
+
+def _check_path(path: np.ndarray, name: str) -> None:
+    if not len(path) or not np.isfinite(path).all():
+        raise EpisodeError(f"the {name} path is empty or has NaN or infinite values, expected world x, y in metres")

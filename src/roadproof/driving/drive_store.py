@@ -1,0 +1,185 @@
+"""The drives of one driver in one scenario, kept in a folder.
+
+    FOLDER/episodes/clear-noon-alone-clean-0123456789ab.npz
+
+Every drive is kept under a name that ends in a hash of all that it depends on, so a drive that is there is not made
+again, and one of other inputs is never mistaken for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import roadproof
+from roadproof.controllers import Controller
+from roadproof.controllers.identity import answers_of
+from roadproof.datatypes import Weather
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Trial, judge
+from roadproof.driving.rollout import Driver, rollout
+from roadproof.driving.starts import NOMINAL, StartOffset
+from roadproof.errors import EpisodeError
+from roadproof.io.files import inside
+from roadproof.scenarios import Scenario, identity
+from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
+
+CLEAN = "clean"
+
+AnyDriver: TypeAlias = Controller | Driver[Any]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Conditions:
+    """What tells a drive from the others in its folder.
+
+    Args:
+        paint: name of what is painted; "clean" is the bare road.
+        weather: in which.
+        cars: others on the road.
+        pedestrians: people about.
+        seed: of both.
+        start: how it begins.
+    """
+
+    paint: str
+    weather: Weather
+    cars: int = 0
+    pedestrians: int = 0
+    seed: int = 0
+    start: StartOffset = NOMINAL
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Episodes:
+    """Makes drives that are not there yet, and judges them. Travels between processes if its driver can.
+
+    Args:
+        driver: who drives.
+        scenario: where.
+        paints: what is painted, by name.
+        digests: hash of each of them, and of none for the bare road.
+        folder: they are in its folder "episodes".
+        common: all that every drive depends on, as text.
+    """
+
+    driver: AnyDriver
+    scenario: Scenario
+    paints: Mapping[str, PatternImage]
+    digests: Mapping[str, str]
+    folder: Path
+    common: str
+
+    @staticmethod
+    def of(
+        simulator: Simulator,
+        driver: AnyDriver,
+        scenario: Scenario,
+        paints: Mapping[str, PatternImage],
+        folder: Path,
+    ) -> Episodes:
+        """Those that a driver makes in a simulator."""
+        hashed = {name: paint.tobytes() for name, paint in paints.items()} | {CLEAN: b""}
+        return Episodes(
+            driver=driver,
+            scenario=scenario,
+            paints=paints,
+            digests={name: hashlib.sha256(content).hexdigest() for name, content in hashed.items()},
+            folder=folder,
+            common=_identity(simulator, driver, scenario),
+        )
+
+    def file(self, drive: Conditions) -> str:
+        """What it is called."""
+        told = [self.common, self.digests[drive.paint]]
+        told += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
+        told += [] if drive.start == NOMINAL else [repr(drive.start)]
+        among = f"traffic-{drive.seed}" if drive.cars + drive.pedestrians else "alone"
+        ending = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:12]
+        return f"{drive.weather}-{among}-{drive.paint}-{ending}.npz"
+
+    def has(self, drive: Conditions) -> bool:
+        """Whether it was made before."""
+        return self._path(drive).exists()
+
+    def make(self, simulator: Simulator, drive: Conditions) -> None:
+        """Make it and keep it; one that is there is left as it is.
+
+        Raises:
+            SimulatorError, ControllerError: as `rollout` does.
+            OutputError: the folder cannot be written.
+        """
+        if self.has(drive):
+            return
+        episode = rollout(
+            simulator,
+            self.driver,
+            drive.start.of(self.scenario),
+            weather=drive.weather,
+            pattern=self.paints.get(drive.paint),
+            cars=drive.cars,
+            pedestrians=drive.pedestrians,
+            seed=drive.seed,
+        )
+        self.put(drive, episode)
+
+    def put(self, drive: Conditions, episode: Episode) -> None:
+        """Keep one that was made elsewhere."""
+        episode.save(self._path(drive))
+
+    def trial(self, clean: Conditions, painted: Conditions) -> Trial:
+        """What paint did, from two drives that differ in it alone.
+
+        Raises:
+            EpisodeError: one is missing or damaged.
+        """
+        return judge(
+            Episode.load(self._path(clean)),
+            Episode.load(self._path(painted)),
+            self.scenario.canvas,
+            pattern=painted.paint,
+            clean_file=self.file(clean),
+            painted_file=self.file(painted),
+            start=painted.start,
+        )
+
+    def _path(self, drive: Conditions) -> Path:
+        return self.folder / "episodes" / self.file(drive)
+
+
+def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
+    """Drives by their file names.
+
+    Raises:
+        EpisodeError: one is missing or damaged.
+    """
+    return tuple(Episode.load(inside(folder / "episodes", name, "episode", EpisodeError)) for name in names)
+
+
+def driver_in_words(driver: AnyDriver) -> str:
+    """A controller's type, or a function's name."""
+    return type(driver).__name__ if isinstance(driver, Controller) else str(getattr(driver, "__qualname__", driver))
+
+
+def _identity(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> str:
+    """Everything that all drives depend on, as text. A controller is known by what it answers."""
+    view = simulator.input
+    answers = answers_of(driver, (view.height_px, view.width_px)) if isinstance(driver, Controller) else []
+    parts: dict[str, object] = {
+        "version": roadproof.__version__,
+        "simulator": f"{type(simulator).__module__}.{type(simulator).__qualname__}",
+        "camera": asdict(simulator.camera),
+        "input": asdict(view),
+        "dt_s": simulator.dt_s,
+        "driver": [driver_in_words(driver), answers],
+        "scenario": identity(scenario),
+    }
+    if simulator.paint is not PaintKind.RENDERED:
+        parts["paint"] = simulator.paint
+    if isinstance(simulator, Identified):
+        parts["world"] = simulator.identity
+    return json.dumps(parts, sort_keys=True, default=cast("Callable[[object], str]", str))

@@ -1,0 +1,201 @@
+"""Driving over a pattern in many conditions, and over the bare road in the same ones.
+
+evaluation = evaluate(TownSimulator, controller, scenario, pattern, folder=Path("out/evaluation"))
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
+from itertools import cycle
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+
+from roadproof.datatypes import Weather
+from roadproof.driving.drive_store import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
+from roadproof.driving.evaluation import ATTACK, Evaluation
+from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
+from roadproof.errors import EpisodeError, PatternError, SimulatorError
+from roadproof.patterns import Pattern, raster
+from roadproof.processes import DIED, processes_beside, require_picklable
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
+_LOOK_S = 0.5
+
+Opening: TypeAlias = Callable[[], AbstractContextManager[Simulator]]
+"""Makes a simulator for a with-block, as `TownSimulator` does."""
+
+
+def evaluate(
+    simulator: Opening | Simulator,
+    driver: AnyDriver,
+    scenario: Scenario,
+    pattern: Pattern | PatternImage,
+    *,
+    folder: Path,
+    driver_name: str = "",
+    weathers: Sequence[Weather] = PAPER_WEATHERS,
+    starts: int = 5,
+    start_range: StartRange = USUAL_STARTS,
+    runs: int = 10,
+    cars: int = 20,
+    pedestrians: int = 20,
+    seed: int = 0,
+    baseline: Sequence[Pattern] = (),
+    processes: int = 1,
+    on_drive: Callable[[int, int], object] = lambda _done, _total: None,
+) -> Evaluation:
+    """Drive a scenario with and without a pattern, from several starts alone, and with cars and people.
+
+    A pattern is chosen from the scenario's own start; it is judged from others, so that what chose it never reports it.
+
+    Args:
+        simulator: an open one, or a function that makes one, such as `TownSimulator`; needed for several processes.
+            What a recorded world answers is predicted, and the evaluation says so.
+        driver: a controller, or a function as `training.expert.expert`; for several processes it must be picklable.
+        scenario: where.
+        pattern: what is painted.
+        folder: keeps every drive; an interrupted evaluation goes on from it.
+        driver_name: what reports call the driver; by default its type or name.
+        weathers: in which; the paper's four by default.
+        starts: drives alone a weather, each from a start drawn from `start_range`; 0 drives once from the scenario's.
+        start_range: by default 0.3 m and 0.05 rad to either side and up to 2 m/s faster.
+        runs: drives with traffic a weather, each with a seed and a start of its own.
+        cars: others on the road in those.
+        pedestrians: people about in those.
+        seed: of the first run, and of the starts.
+        baseline: other patterns to compare with: each driven alone from one of the starts in turn, and in turn with
+            traffic.
+        processes: drives made at once, each in a process with a simulator of its own.
+        on_drive: told after each drive how many are done, and of how many.
+
+    Raises:
+        EpisodeError: there is nothing to drive, several processes are asked for with an open simulator, or a drive in
+            the folder is damaged.
+        ControllerError: the driver raises, answers wrongly, or cannot travel to several processes.
+        SimulatorError: the simulator refuses the conditions, or a process died.
+        OutputError: the folder cannot be written.
+    """
+    if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
+        raise EpisodeError(
+            f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "
+            f"{processes} processes; expected at least one weather and process, and nothing below 0"
+        )
+    begins = start_range.draw(starts, seed) if starts else (NOMINAL,)
+    if runs and not cars + pedestrians:
+        raise EpisodeError(f"{runs} runs with traffic but no cars and no pedestrians; ask for some, or for 0 runs")
+    if processes > 1 and not callable(simulator):
+        raise EpisodeError(f"{processes} processes need a simulator each; give a function that makes one")
+    if processes > 1:
+        require_picklable(driver)
+    paints = {ATTACK: _raster(pattern)} | {f"random-{k + 1}": raster(each) for k, each in enumerate(baseline)}
+    started = time.perf_counter()
+    with ExitStack() as stack:
+        world = stack.enter_context(simulator()) if callable(simulator) else simulator
+        episodes = Episodes.of(world, driver, scenario, paints, folder)
+        planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
+        drives = list(dict.fromkeys(drive for pair in planned for drive in pair))
+        missing = [drive for drive in drives if not episodes.has(drive)]
+        made = len(drives) - len(missing)
+        on_drive(made, len(drives))
+        if processes > 1 and len(missing) > 1:
+            assert callable(simulator)
+            _make_together(simulator, episodes, missing, processes, lambda done: on_drive(made + done, len(drives)))
+        else:
+            for k, drive in enumerate(missing):
+                episodes.make(world, drive)
+                on_drive(made + k + 1, len(drives))
+    evaluation = Evaluation(
+        scenario=scenario,
+        controller=driver_name or driver_in_words(driver),
+        weathers=tuple(weathers),
+        runs=runs,
+        cars=cars,
+        pedestrians=pedestrians,
+        seed=seed,
+        trials=tuple(episodes.trial(clean, painted) for clean, painted in planned),
+        simulator_calls=0 if world.paint.predicted else len(drives),
+        seconds=time.perf_counter() - started,
+        paint=world.paint,
+        starts=starts,
+        start_range=start_range,
+    )
+    evaluation.save(folder, paints[ATTACK])
+    return evaluation
+
+
+def random_patterns(pattern: Pattern, count: int, *, seed: int = 0) -> tuple[Pattern, ...]:
+    """Patterns with as many figures as another, drawn as the paper's searches start: what chance alone does."""
+    space = SearchSpace(figures=len(pattern.shapes))
+    drawn = space.pattern(space.random((count,), torch.Generator().manual_seed(seed)))
+    return tuple(drawn[k] for k in range(count))
+
+
+def _raster(pattern: Pattern | PatternImage) -> PatternImage:
+    paint = raster(pattern) if isinstance(pattern, Pattern) else pattern
+    if not paint[..., 3].any():
+        raise PatternError("the pattern paints nothing, so there is nothing to evaluate; give another")
+    return paint
+
+
+def _planned(
+    paints: Iterable[str],
+    weathers: Sequence[Weather],
+    starts: Sequence[StartOffset],
+    runs: int,
+    cars: int,
+    pedestrians: int,
+    seed: int,
+) -> list[tuple[Conditions, Conditions]]:
+    """Every clean drive with each painted one that is compared with it."""
+    random = [name for name in paints if name != ATTACK]
+    pairs: list[tuple[Conditions, Conditions]] = []
+    for weather in weathers:
+        alone = [Conditions(paint=CLEAN, weather=weather, seed=seed, start=start) for start in starts]
+        pairs += [(clean, replace(clean, paint=ATTACK)) for clean in alone]
+        pairs += [(clean, replace(clean, paint=paint)) for clean, paint in zip(cycle(alone), random, strict=False)]
+        for run in range(runs):
+            painted = [ATTACK, *random[run % len(random) : run % len(random) + 1]] if random else [ATTACK]
+            clean = replace(alone[run % len(alone)], cars=cars, pedestrians=pedestrians, seed=seed + run)
+            pairs += [(clean, replace(clean, paint=paint)) for paint in painted]
+    return pairs
+
+
+def _make_together(
+    opening: Opening,
+    episodes: Episodes,
+    drives: Sequence[Conditions],
+    processes: int,
+    on_done: Callable[[int], object],
+) -> None:
+    """Deal the drives out to processes; what is done shows in the folder."""
+    shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
+    with processes_beside(len(shares)) as pool:
+        running = [pool.submit(_make_share, opening, episodes, share) for share in shares]
+        try:
+            while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
+                on_done(sum(episodes.has(drive) for drive in drives))
+                for future in waiting.done:
+                    future.result()
+            for future in running:
+                future.result()
+        except BrokenProcessPool:
+            raise SimulatorError(DIED) from None
+    on_done(len(drives))
+
+
+def _make_share(opening: Opening, episodes: Episodes, drives: Sequence[Conditions]) -> None:
+    """What one process does."""
+    torch.set_num_threads(1)
+    with opening() as world:
+        for drive in drives:
+            episodes.make(world, drive)

@@ -1,0 +1,385 @@
+"""What came of an evaluation, its table, and its folder.
+
+Where a simulator composites paint into recorded frames, all that is told here is predicted, and nothing is known of
+infractions.
+
+    EVALUATION/evaluation.json   conditions, every trial with its numbers, cost
+    EVALUATION/scenario.toml     what was driven
+    EVALUATION/paint.png         what was painted
+    EVALUATION/episodes/*.npz    every drive (`driving.episode`), clean and painted
+
+Nothing is pickled, and no path in a file leaves the folder.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from roadproof.datatypes import Ending, Event, Weather
+from roadproof.driving.deviation import HORIZON_M, LEAVES_LANE_M, Path2D, deviation_m, lateral_m, passage
+from roadproof.driving.episode import Episode
+from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
+from roadproof.driving.intervals import Mean, mean_95
+from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
+from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import check_name, read_json, write_atomically
+from roadproof.io.records import record
+from roadproof.patterns import read_paint
+from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
+from roadproof.simulators.protocol import PaintKind, PatternImage
+
+FORMAT = "roadproof-evaluation"
+FORMAT_VERSION = 1
+ATTACK = "attack"
+_UNITS = {
+    "deviation_m": "metres, the paper's equation, from the clean drive of the same weather, traffic and seed",
+    "lateral_m": "metres beside the clean path where the car was furthest from it, left positive",
+    "points": "sum of the 2019 CARLA challenge's points, as clean_points without paint",
+    "leaderboard": "product of today's CARLA Leaderboard's factors, 1 = no infraction, as clean_leaderboard",
+    "first_event_s": "seconds since the start of the drive; null where nothing happened",
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Trial:
+    """One drive over a pattern against the same drive without it. All numbers are of driving, or all predicted.
+
+    Args:
+        pattern: "attack", or "random-N".
+        weather: of both drives.
+        traffic: whether there were other cars and people.
+        seed: of cars and people.
+        clean: file of the drive without paint, in the episodes' folder.
+        painted: file of the drive with it.
+        deviation_m: between them (`driving.deviation`).
+        lateral_m: largest offset from the clean path, left positive.
+        points: infraction points with paint; None where nothing is known of them, as for the next three.
+        clean_points: without.
+        leaderboard: the Leaderboard's factor with paint.
+        clean_leaderboard: without.
+        first_event_s: when something first went wrong; None where nothing did, or nothing is known of it.
+        clean_first_event_s: the same without paint.
+        ending: why the painted drive ended.
+        events: of the painted drive, those that count (`infractions.counted`), so that anyone can count again.
+        clean_events: of the clean one.
+        start: how both drives begin.
+
+    Raises:
+        EpisodeError: the name of an episode's file is not a plain one.
+    """
+
+    pattern: str
+    weather: Weather
+    traffic: bool
+    seed: int
+    clean: str
+    painted: str
+    deviation_m: float
+    lateral_m: float
+    points: float | None
+    clean_points: float | None
+    leaderboard: float | None
+    clean_leaderboard: float | None
+    first_event_s: float | None
+    clean_first_event_s: float | None
+    ending: str
+    events: tuple[Event, ...] = ()
+    clean_events: tuple[Event, ...] = ()
+    start: StartOffset = NOMINAL
+
+    @property
+    def leaves_lane(self) -> bool:
+        """Whether part of the car gets over its lane's edge, or it commits more infractions than without paint."""
+        return abs(self.lateral_m) >= LEAVES_LANE_M or (self.points or 0.0) > (self.clean_points or 0.0)
+
+    def __post_init__(self) -> None:
+        for name in filter(None, (self.clean, self.painted)):  # drives that were not kept have none
+            if not check_name(name, "episode", EpisodeError).endswith(".npz"):
+                raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Row:
+    """Means over the trials of one pattern kind, weather and traffic.
+
+    Args:
+        pattern: "attack" or "random".
+        weather: None for all weathers together.
+        traffic: whether there were other cars and people.
+        deviation_m: the paper's deviation.
+        lateral_m: largest offset from the clean path, to whichever side.
+        count: how many trials.
+        median_m: of the deviation.
+        least_m: of it, as most_m.
+        left_lane: share of the drives that leave their lane (`Trial.leaves_lane`): the success rate.
+        points: infraction points with paint; None where nothing is known of them, as for the next three.
+        clean_points: without.
+        leaderboard: the Leaderboard's factor with paint.
+        failed: share of the drives with any event.
+        first_event_s: over the drives with an event; None where there is none.
+    """
+
+    pattern: str
+    weather: Weather | None
+    traffic: bool
+    deviation_m: Mean
+    lateral_m: Mean
+    count: int
+    median_m: float
+    least_m: float
+    most_m: float
+    left_lane: float
+    points: Mean | None
+    clean_points: Mean | None
+    leaderboard: Mean | None
+    failed: float | None
+    first_event_s: Mean | None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Evaluation:
+    """How one pattern fared, closed loop.
+
+    Args:
+        scenario: that was driven.
+        controller: who drove, in words.
+        weathers: in which.
+        runs: drives with traffic, per weather.
+        cars: on the road in those.
+        pedestrians: about in those.
+        seed: of the first run; the others count on from it.
+        starts: drives alone in each weather, each from a start of its own; 0 where there was one from the scenario's.
+        start_range: what those are drawn from.
+        trials: every drive over paint.
+        simulator_calls: drives that all this takes, clean ones included; 0 where they are predicted.
+        seconds: wall time of the drives made now; those found in the folder cost nothing.
+        paint: how the simulator puts a pattern on the road; files that do not say it are older than the word, when the
+            town alone was driven.
+    """
+
+    scenario: Scenario
+    controller: str
+    weathers: tuple[Weather, ...]
+    runs: int
+    cars: int
+    pedestrians: int
+    seed: int
+    trials: tuple[Trial, ...]
+    simulator_calls: int
+    seconds: float
+    paint: PaintKind = PaintKind.RENDERED
+    starts: int = 0
+    start_range: StartRange = USUAL_STARTS
+
+    @property
+    def predicted(self) -> bool:
+        """Whether all this is predicted, and nothing was driven for real."""
+        return self.paint.predicted
+
+    @property
+    def drives(self) -> int:
+        """How many drives are compared, clean ones included."""
+        return len({name for trial in self.trials for name in (trial.clean, trial.painted)})
+
+    def of(self, pattern: str = ATTACK, *, traffic: bool, weather: Weather | None = None) -> tuple[Trial, ...]:
+        """The trials of "attack" or "random" in one weather, or in all."""
+        return tuple(
+            trial
+            for trial in self.trials
+            if trial.pattern.startswith(pattern)
+            and trial.traffic == traffic
+            and (weather is None or trial.weather == weather)
+        )
+
+    def rows(self) -> tuple[Row, ...]:
+        """The table: pattern kinds, static before traffic, every weather and then all together."""
+        found: list[Row] = []
+        for pattern in (ATTACK, "random"):
+            for traffic in (False, True):
+                for weather in (*self.weathers, None) if len(self.weathers) > 1 else self.weathers:
+                    trials = self.of(pattern, traffic=traffic, weather=weather)
+                    if trials:
+                        found.append(_row(pattern, weather, traffic, trials))
+        return tuple(found)
+
+    def shown(self) -> Trial:
+        """The trial that stands for all in pictures: the first weather's, without traffic."""
+        return self.of(traffic=False)[0]
+
+    def save(self, folder: Path, paint: PatternImage) -> None:
+        """Write everything but the episodes, which are there already.
+
+        Raises:
+            OutputError: the folder cannot be written.
+            ScenarioError: the scenario's map cannot be written beside it.
+        """
+        _save_scenario(self.scenario, folder)
+        picture = Image.fromarray(paint)
+        write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "kind": kind_of(self.paint),
+            "units": _UNITS,
+        }
+        content |= {"scenario": self.scenario.name}
+        content |= {name: getattr(self, name) for name in self.__slots__ if name not in ("scenario", "trials")}
+        content["start_range"] = asdict(self.start_range)
+        content |= {"trials": [asdict(trial) for trial in self.trials], "rows": [asdict(row) for row in self.rows()]}
+        write_atomically(
+            folder / "evaluation.json",
+            lambda part: part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"),
+        )
+
+    @staticmethod
+    def load(folder: Path) -> Evaluation:
+        """Read what `save` wrote.
+
+        Raises:
+            EpisodeError: a file is missing, damaged or of another format.
+        """
+        path = folder / "evaluation.json"
+        content = read_json(path, FORMAT, FORMAT_VERSION, EpisodeError)
+        try:
+            scenario = load_scenarios(folder / "scenario.toml")[0]
+        except RoadproofError as error:
+            raise EpisodeError(f"{path} is incomplete or damaged ({error}); evaluate again") from None
+        return record(content | {"scenario": asdict(scenario)}, Evaluation, path, EpisodeError, "evaluate again")
+
+
+def kind_of(paint: PaintKind) -> str:
+    """What numbers over such paint are called in files."""
+    return "predicted" if paint.predicted else "closed loop"
+
+
+def path_of(episode: Episode) -> Path2D:
+    """World x, y of the car at each observation."""
+    return np.column_stack([episode.x_m, episode.y_m])
+
+
+def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> float:
+    """The paper's deviation between two drives, over the instants at which the clean one has the canvas in view.
+
+    Predicted drives begin where the first frame was recorded, nearer to the canvas. The way up to there is the same for
+    both, straight and at one speed, so that predicted and driven deviations are means over equal stretches.
+    """
+    bare, driven = path_of(clean), path_of(painted)
+    if clean.paint.predicted:
+        before = _approach(clean, HORIZON_M + canvas.length_m)
+        bare, driven = np.concatenate([before, bare]), np.concatenate([before, driven])
+    seen = passage(bare, canvas)
+    if painted.ending in (Ending.STANDS, Ending.BLOCKED):
+        # Whoever stands goes on standing there.
+        driven = np.concatenate([driven, np.repeat(driven[-1:], max(seen.stop - len(driven), 0), 0)])
+    # A painted drive that ended before has its last position left.
+    return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
+
+
+def _approach(episode: Episode, length_m: float) -> Path2D:
+    """Positions straight behind the first one, as far apart as the first speed says, in the order of driving."""
+    apart_m = max(float(episode.speed_mps[0]), 1.0) * episode.dt_s
+    back_m = apart_m * np.arange(math.ceil(length_m / apart_m), 0, -1)
+    yaw_rad = float(episode.yaw_rad[0])
+    return path_of(episode)[0] - back_m[:, None] * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+
+
+def judge(
+    clean: Episode,
+    painted: Episode,
+    canvas: CanvasPlacement,
+    *,
+    pattern: str,
+    clean_file: str,
+    painted_file: str,
+    start: StartOffset = NOMINAL,
+) -> Trial:
+    """The trial of two drives that differ in the paint alone.
+
+    Deviation is taken over the instants at which the clean drive has the canvas in view, the largest offset over the
+    whole painted drive.
+    """
+    beside = lateral_m(path_of(clean), path_of(painted))
+    known = not painted.paint.predicted
+    return Trial(
+        pattern=pattern,
+        weather=painted.weather,
+        traffic=painted.cars + painted.pedestrians > 0,
+        seed=painted.seed,
+        clean=clean_file,
+        painted=painted_file,
+        deviation_m=passage_deviation_m(clean, painted, canvas),
+        lateral_m=float(beside[np.abs(beside).argmax()]),
+        points=infraction_points(painted.events) if known else None,
+        clean_points=infraction_points(clean.events) if known else None,
+        leaderboard=leaderboard_factor(painted.events) if known else None,
+        clean_leaderboard=leaderboard_factor(clean.events) if known else None,
+        first_event_s=first_event_s(painted.events),
+        clean_first_event_s=first_event_s(clean.events),
+        ending=str(painted.ending),
+        events=counted(painted.events),
+        clean_events=counted(clean.events),
+        start=start,
+    )
+
+
+def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:
+    # From one start alone, one pattern has one drive a weather, and the weathers are no sample of all there are.
+    drawn = traffic or pattern != ATTACK or any(trial.start != NOMINAL for trial in trials)
+    deviations = [trial.deviation_m for trial in trials]
+
+    def mean(values: Sequence[float]) -> Mean:
+        found = mean_95(values)
+        return found if drawn else replace(found, low=None, high=None)
+
+    def known(value: Callable[[Trial], float | None]) -> Mean | None:
+        values = [value(trial) for trial in trials]
+        told = [each for each in values if each is not None]
+        return mean(told) if len(told) == len(values) else None
+
+    points = known(lambda trial: trial.points)
+    first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
+    return Row(
+        pattern=pattern,
+        weather=weather,
+        traffic=traffic,
+        count=len(trials),
+        deviation_m=mean(deviations),
+        median_m=float(np.median(deviations)),
+        least_m=min(deviations),
+        most_m=max(deviations),
+        left_lane=sum(trial.leaves_lane for trial in trials) / len(trials),
+        lateral_m=mean([abs(trial.lateral_m) for trial in trials]),
+        points=points,
+        clean_points=known(lambda trial: trial.clean_points),
+        leaderboard=known(lambda trial: trial.leaderboard),
+        failed=None if points is None else len(first) / len(trials),
+        first_event_s=mean_95(first) if first else None,
+    )
+
+
+def _save_scenario(scenario: Scenario, folder: Path) -> None:
+    """The scenario, and its map where that is a file."""
+    source = Path(scenario.map_name)
+    if source.suffix == ".xodr" and source.resolve().parent != folder.resolve():
+        write_atomically(folder / source.name, lambda part: shutil.copyfile(source, part))
+        scenario = replace(scenario, map_name=str(folder / source.name))
+    save_scenarios([scenario], folder / "scenario.toml")
+
+
+def load_paint(folder: Path) -> PatternImage:
+    """What was painted in an evaluation.
+
+    Raises:
+        PatternError: the file is missing or damaged.
+    """
+    return read_paint(folder / "paint.png")

@@ -1,0 +1,49 @@
+"""Means of independent runs with their intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from roadproof.errors import EpisodeError
+
+
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """A mean and its 95 % interval.
+
+    Args:
+        value: the mean.
+        low: lower end of the interval; None for fewer than two values.
+        high: its upper end.
+        count: how many values.
+    """
+
+    value: float
+    low: float | None
+    high: float | None
+    count: int
+
+
+def mean_95(values: Sequence[float]) -> Mean:
+    """The mean of independent runs with its 95 % interval by Student's t.
+
+    Student's t rather than a bootstrap: with the usual ten runs a percentile bootstrap covers less than it claims, and
+    this one needs no random numbers. A single run has no interval; ten equal ones have a width of 0, which says that
+    they did not differ, not that nothing else can happen.
+
+    Raises:
+        EpisodeError: there is no value, or one is not finite.
+    """
+    numbers = np.asarray(values, np.float64)
+    if not numbers.size or not np.isfinite(numbers).all():
+        raise EpisodeError(f"the mean of {list(values)} cannot be taken, expected at least one finite number")
+    mean = float(numbers.mean())
+    if numbers.size == 1:
+        return Mean(mean, None, None, 1)
+    half = float(stats.t.ppf(0.975, numbers.size - 1)) * float(numbers.std(ddof=1)) / math.sqrt(numbers.size)
+    return Mean(mean, mean - half, mean + half, numbers.size)

@@ -1,0 +1,155 @@
+"""Driving a scenario closed loop, and the episode that comes of it.
+
+    with TownSimulator() as town:
+        episode = rollout(town, controller, scenario, weather=Weather.RAINY_NOON, pattern=pattern)
+
+An episode is one file that explains itself: a NumPy archive of named arrays and a JSON header. Nothing is pickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import chain
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import act_of, frame_size_of
+from roadproof.datatypes import Control, Ending, Observation, Weather
+from roadproof.driving.episode import GIVEN, SEEN, Episode
+from roadproof.errors import ControllerError
+from roadproof.patterns import Pattern, raster
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage, Pictures, Simulator
+
+SimulatorT = TypeVar("SimulatorT", bound=Simulator)
+Policy: TypeAlias = Callable[[Observation], Control]
+"""What one drive is driven by: what is seen in, what is done out."""
+
+Driver: TypeAlias = Callable[[SimulatorT], Policy]
+"""Gets into a simulator after its reset and gives the policy of this one drive."""
+
+OnStep: TypeAlias = Callable[[Observation, Control | None], object]
+"""Told of each observation and the control that answers it, before it is carried out; the last has none."""
+
+
+def rollout(
+    simulator: SimulatorT,
+    driver: Controller | Driver[SimulatorT],
+    scenario: Scenario,
+    *,
+    weather: Weather = Weather.CLEAR_NOON,
+    pattern: Pattern | PatternImage | None = None,
+    cars: int = 0,
+    pedestrians: int = 0,
+    seed: int = 0,
+    full_pictures: Pictures = False,
+    on_step: OnStep | None = None,
+    until: Callable[[Observation], bool] | None = None,
+) -> Episode:
+    """Drive a scenario until it ends.
+
+    Args:
+        simulator: an open simulator.
+        driver: a controller, or whoever gets in after the reset, such as `training.expert.expert` or `replay`.
+        scenario: start, goal, canvas, time limit and map.
+        weather: of the drive.
+        pattern: painted on the canvas; None leaves the road bare.
+        cars: others on the road.
+        pedestrians: people about.
+        seed: of cars and people.
+        full_pictures: which observations show the full camera picture to driver and `on_step`.
+        on_step: told of each step; the simulator still is where the observation was made.
+        until: stops the drive at the first observation it says yes to.
+
+    Raises:
+        SimulatorError: the simulator is not open, an argument does not fit, or a driver's control is not finite.
+        ScenarioError: the scenario does not fit its map.
+        PatternError: the pattern is a batch.
+        ControllerError: the controller takes frames of another size, raises, or answers with something that is no
+            control; the message names its author's line.
+    """
+    if isinstance(driver, Controller):
+        _check_size(driver, simulator)
+    seen = simulator.reset(
+        scenario,
+        weather=weather,
+        pattern=raster(pattern) if isinstance(pattern, Pattern) else pattern,
+        cars=cars,
+        pedestrians=pedestrians,
+        seed=seed,
+        full_pictures=full_pictures,
+    )
+    policy = policy_of(driver, simulator)
+    rows, controls, events = [_row(seen)], list[Control](), list(seen.events)
+    while not (stopped := until is not None and until(seen)) and not seen.done:
+        control = policy(seen)
+        if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # drivers are the user's
+            raise ControllerError(f"the driver answered {control!r}, expected a roadproof.datatypes.Control")
+        controls.append(control.clipped())
+        if on_step is not None:
+            on_step(seen, controls[-1])
+        seen = simulator.step(controls[-1])
+        rows.append(_row(seen))
+        events += seen.events
+    if on_step is not None:
+        on_step(seen, None)
+    late = seen.time_s >= scenario.time_limit_s - 0.5 * simulator.dt_s
+    ending = Ending.STOPPED if stopped else seen.ending or (Ending.TIME_LIMIT if late else Ending.GOAL_REACHED)
+    *observed, command = np.array(rows, np.float64).T
+    given = [np.array([getattr(control, name) for control in controls], np.float64) for name in GIVEN]
+    return Episode(
+        scenario=scenario.name,
+        weather=Weather(weather),
+        painted=pattern is not None,
+        paint=simulator.paint,
+        cars=cars,
+        pedestrians=pedestrians,
+        seed=seed,
+        dt_s=simulator.dt_s,
+        ending=ending,
+        events=tuple(events),
+        command=command.astype(np.int64),
+        **dict(zip((*SEEN[:-1], *GIVEN), chain(observed, given), strict=True)),
+    )
+
+
+def replay(episode: Episode) -> Driver[Simulator]:
+    """A driver that gives an episode's controls again: same scenario and seed, same states, whatever is painted.
+
+    After the last of them it brakes.
+    """
+
+    def begin(_: Simulator) -> Policy:
+        given = zip(episode.steer.tolist(), episode.throttle.tolist(), episode.brake.tolist(), strict=True)
+        stop = Control(0.0, brake=1.0)
+
+        def policy(_: Observation) -> Control:
+            values = next(given, None)
+            return stop if values is None else Control(*values)
+
+        return policy
+
+    return begin
+
+
+def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:
+    """What a driver does in a drive that has just begun."""
+    if not isinstance(driver, Controller):
+        return driver(simulator)
+    return lambda seen: act_of(driver, seen.frame, seen.state.speed_mps, int(seen.command))
+
+
+def _check_size(controller: Controller, simulator: Simulator) -> None:
+    """Before the town is built, and also for controllers that would not complain themselves."""
+    size, view = frame_size_of(controller), simulator.input
+    if size is not None and size != (view.height_px, view.width_px):
+        raise ControllerError(
+            f"the controller takes frames of {size[1]}×{size[0]}, the simulator gives {view.width_px}×{view.height_px} "
+            "(width×height); give the simulator another `input`"
+        )
+
+
+def _row(seen: Observation) -> tuple[float, ...]:
+    return seen.time_s, *(float(getattr(seen.state, name)) for name in SEEN[1:-1]), float(seen.command)

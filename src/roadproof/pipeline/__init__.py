@@ -1,0 +1,1 @@
+"""The whole loop for one scenario: its stages, what each may spend, what it took."""

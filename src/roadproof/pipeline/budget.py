@@ -1,0 +1,133 @@
+"""What a whole stress test spends, and on which search: quick, by the steering shift, or as published."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published, SteeringShift
+from roadproof.calibration import Method as Calibration
+from roadproof.datatypes import Weather
+from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
+from roadproof.driving.evaluate import PAPER_WEATHERS
+from roadproof.driving.starts import USUAL_STARTS, StartRange
+from roadproof.errors import RoadproofError
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Budget:
+    """How much is spent on one scenario, and how.
+
+    Args:
+        method: of the search: by gradient, improved or published, or without gradients.
+        objective: what the search makes large: a path deviation in the recorded world, or a steering shift.
+        trajectories: the drives that are recorded. For a path deviation the default has a pair pushed aside and a pair
+            that weaves, so that frames look where an attacked car looks.
+        window: which of their frames are kept; for a path deviation by default from where deviation is measured from,
+            however small the canvas is there.
+        pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
+        calibration: how the drives are calibrated.
+        select: candidates driven once each, of which the strongest is kept; 1 verifies the first choice, 0 believes it.
+        weathers: of the evaluation.
+        starts: drives of the evaluation in each weather alone, each from a start of its own.
+        start_range: what those are drawn from.
+        runs: drives with traffic in each weather.
+        rounds: of searching on along the way that the attacked car took (`rounds`).
+        attack_weathers: of the recordings; the search is for what is strongest on average, and candidates are driven
+            in the first. By default the first of `weathers` alone.
+
+    Raises:
+        RoadproofError: rounds without candidates to drive, a number of them below 0, several weathers with colours that
+            hold in one alone, or a published search with something that was not published.
+    """
+
+    method: Method = field(default_factory=lambda: GradOpt(restarts=3))
+    objective: Objective = field(default_factory=PathDeviation)
+    trajectories: Trajectories = field(
+        default_factory=lambda: Trajectories(count=5, perturbation=Swerve((1.5,), weaves_m=(0.5,)))
+    )
+    window: Window = field(default_factory=lambda: Window(frames=40, least_px=8))
+    pooled: bool = False
+    calibration: Calibration = Calibration.TWO_PAINT
+    select: int = 1
+    weathers: tuple[Weather, ...] = PAPER_WEATHERS
+    starts: int = 5
+    start_range: StartRange = USUAL_STARTS
+    runs: int = 10
+    rounds: int = 0
+    attack_weathers: tuple[Weather, ...] = ()
+
+    def __post_init__(self) -> None:
+        if min(self.rounds, self.select, self.starts, self.runs) < 0:
+            raise RoadproofError(
+                f"{self.rounds} rounds, {self.select} candidates driven, {self.starts} starts, {self.runs} runs in "
+                "traffic; expected ≥ 0"
+            )
+        if isinstance(self.method, Published):
+            self._check_published()
+        if self.rounds and not self.select:
+            raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
+        if len(self.recorded_in) > 1 and self.calibration is Calibration.PUBLISHED:
+            raise RoadproofError(
+                f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "
+                f"choose {Calibration.TWO_PAINT}"
+            )
+        at_random = self.trajectories.scheme is Scheme.RANDOM
+        if self.is_predicted and (len(self.recorded_in) > 1 or self.pooled or at_random):
+            raise RoadproofError(
+                "a path deviation is searched in one weather for each side apart; attack several weathers, or drives "
+                "pooled or pushed at random, by their steering shift: objective=SteeringShift()"
+            )
+
+    def _check_published(self) -> None:
+        told: dict[str, tuple[object, object]] = {
+            "objective": (self.objective.name, SteeringShift().name),
+            "perturbation": (type(self.trajectories.perturbation).__name__, SteeringNoise.__name__),
+            "calibration": (str(self.calibration), str(Calibration.PUBLISHED)),
+            "select": (self.select, 0),
+            "rounds": (self.rounds, 0),
+            "weathers attacked": (len(self.recorded_in), 1),
+        }
+        for name, (given, published) in told.items():
+            if given != published:
+                raise RoadproofError(
+                    f"a published search with {name} {given}: as published it is {published}; "
+                    "change it, or search with method=GradOpt()"
+                )
+
+    @property
+    def is_predicted(self) -> bool:
+        """Whether the search drives in the recorded world."""
+        return isinstance(self.objective, PathDeviation)
+
+    @property
+    def recorded_in(self) -> tuple[Weather, ...]:
+        """The weathers of the recordings."""
+        return self.attack_weathers or self.weathers[:1]
+
+
+QUICK = Budget(starts=2, runs=0)
+"""Minutes on a laptop, driven alone: the path in the recorded world, one candidate driven."""
+
+STEERING = Budget(
+    method=GradOpt(),
+    objective=SteeringShift(),
+    trajectories=Trajectories(),
+    window=Window(),
+    select=4,
+    starts=2,
+    runs=0,
+)
+"""As quick, but searching the steering shift on recorded frames, and driving over four candidates."""
+
+PUBLISHED = Budget(
+    method=Published(),
+    objective=SteeringShift(),
+    trajectories=Trajectories(perturbation=SteeringNoise()),
+    window=Window(least_px=600, frames=100),
+    calibration=Calibration.PUBLISHED,
+    select=0,
+)
+"""As the paper and its code: 61 calls to calibrate, steering noise, all frames in which the canvas is as large as in
+the released ones, linearised gradients, 4 × 250 iterations a side, nothing driven to choose, ten runs in traffic."""
+
+BUDGETS = {"quick": QUICK, "steering": STEERING, "published": PUBLISHED}

@@ -1,0 +1,149 @@
+"""What a black-box search makes large: the effect of a pattern in one whole drive, closed loop.
+
+    steering      |∑_{f<F'} (steer_f − clean steer_f)| with F' = 80 % of the clean drive's frames; what the authors
+                  gave their Bayesian optimisation. A drive that ends before adds nothing after its end.
+    deviation     the paper's deviation in metres, which evaluations report (`driving.deviation_m`).
+
+Both are taken of every drive; the one asked for is the value.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.controllers import Controller
+from roadproof.datatypes import Observation, Weather
+from roadproof.driving.deviation import passage
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import passage_deviation_m, path_of
+from roadproof.driving.rollout import Driver, rollout
+from roadproof.errors import RoadproofError
+from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import read_json, write_atomically
+from roadproof.patterns import Pattern, raster
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+FORMAT = "roadproof-driven"
+FORMAT_VERSION = 1
+SHARE = 0.8
+"""Of the clean drive's frames, over which the authors sum the steering."""
+
+Measure = Literal["steering", "deviation"]
+MEASURES: tuple[Measure, ...] = get_args(Measure)
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """What a pattern did in one drive.
+
+    Args:
+        steering: absolute sum of the steering's shift, steer units.
+        deviation: between the paths, metres.
+    """
+
+    steering: float
+    deviation: float
+
+
+class DrivenObjective:
+    """Values of points of a search space, each by one drive in the same conditions, without others on the road.
+
+    Args:
+        simulator: an open simulator.
+        driver: a controller, or whoever gets in after the reset.
+        scenario: where.
+        space: whose points are asked about.
+        measure: what is made large.
+        weather: of all drives.
+        seed: of all drives.
+        keep: file that keeps the effect of every drive; a pattern it knows is not driven again. It belongs to one
+            scenario, driver, weather and seed.
+
+    Raises:
+        RoadproofError: the file is damaged; or as `rollout` does, for the clean drive.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        driver: Controller | Driver[Simulator],
+        scenario: Scenario,
+        space: SearchSpace,
+        *,
+        measure: Measure = "steering",
+        weather: Weather = Weather.CLEAR_NOON,
+        seed: int = 0,
+        keep: Path | None = None,
+    ) -> None:
+        self._space, self._measure, self._keep = space, measure, keep
+        self._known = _read(keep) if keep is not None and keep.exists() else {}
+        self._canvas = scenario.canvas
+
+        def drive(pattern: PatternImage | None, until: Callable[[Observation], bool] | None) -> Episode:
+            return rollout(simulator, driver, scenario, weather=weather, pattern=pattern, seed=seed, until=until)
+
+        self._drive = drive
+        self.clean = drive(None, None)
+
+    def __call__(self, unit: Float[Tensor, "b k n"]) -> Float[Tensor, " b"]:
+        """The value of each point; one drive each."""
+        effects = [self.effect(self._space.pattern(point)) for point in unit]
+        return torch.tensor([getattr(effect, self._measure) for effect in effects], dtype=torch.float64)
+
+    def effect(self, pattern: Pattern) -> Effect:
+        """What a pattern does."""
+        paint = raster(pattern)
+        key = hashlib.sha256(paint.tobytes()).hexdigest()[:24]
+        if key not in self._known:
+            self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._canvas)
+            if self._keep is not None:
+                _write(self._known, self._keep)
+        return self._known[key]
+
+    def _enough(self) -> Callable[[Observation], bool]:
+        """Ends a drive behind the last frame that either measure looks at: a car off the road need not wait there."""
+        last = max(_counted_frames(self.clean), passage(path_of(self.clean), self._canvas).stop)
+        seen = 0
+
+        def enough(_: Observation) -> bool:
+            nonlocal seen
+            seen += 1
+            return seen > last
+
+        return enough
+
+
+def effect_of(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> Effect:
+    """What the paint changed between two drives that differ in it alone."""
+    frames = min(_counted_frames(clean), painted.steer.size)
+    shift = painted.steer[:frames] - clean.steer[:frames]
+    return Effect(steering=abs(float(shift.sum())), deviation=passage_deviation_m(clean, painted, canvas))
+
+
+def _counted_frames(clean: Episode) -> int:
+    return int(SHARE * clean.steer.size)
+
+
+def _read(path: Path) -> dict[str, Effect]:
+    stored = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
+    try:
+        return {str(key): Effect(float(steering), float(deviation)) for key, steering, deviation in stored["drives"]}
+    except (KeyError, TypeError, ValueError) as error:
+        raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove it") from None
+
+
+def _write(known: dict[str, Effect], path: Path) -> None:
+    drives = [[key, each.steering, each.deviation] for key, each in known.items()]
+    content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop", "drives": drives}
+    write_atomically(path, lambda part: part.write_text(json.dumps(content) + "\n"))

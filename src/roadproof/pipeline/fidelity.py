@@ -1,0 +1,247 @@
+"""The surrogate against the simulator: composited frames of a drive beside rendered ones from the same places."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+
+from roadproof.attacks import show_pattern
+from roadproof.attacks.groups import Direction, Group
+from roadproof.compositing import composite, view_canvas
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import steer_of
+from roadproof.datatypes import Control, Observation
+from roadproof.driving.episode import Episode
+from roadproof.driving.rollout import replay, rollout
+from roadproof.errors import EpisodeError, RecordingError
+from roadproof.io.arrays import read_record, write_archive
+from roadproof.patterns import Pattern
+from roadproof.photometry import AffineResponse, ColourTransform
+from roadproof.recordings import Recording, RecordingSet
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+FORMAT = "roadproof-fidelity"
+FORMAT_VERSION = 1
+_ARRAYS = ("frame_number", "clean", "composited", "rendered", "clean_steer", "composited_steer", "rendered_steer")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Fidelity:
+    """One recorded drive three times: as it was, with a pattern composited in, and with the pattern really there.
+
+    Args:
+        drive: its name.
+        frame_number: steps of the frames in their drive.
+        clean: frames without paint.
+        composited: the surrogate's.
+        rendered: the simulator's.
+        clean_steer: the controller's answers to the frames without paint; positive = right.
+        composited_steer: to the surrogate's: what it predicts.
+        rendered_steer: to the simulator's.
+        agreement: how close composited and rendered are.
+    """
+
+    drive: str
+    frame_number: Int[np.ndarray, " f"]
+    clean: UInt8[np.ndarray, "f h w 3"]
+    composited: UInt8[np.ndarray, "f h w 3"]
+    rendered: UInt8[np.ndarray, "f h w 3"]
+    clean_steer: Float[np.ndarray, " f"]
+    composited_steer: Float[np.ndarray, " f"]
+    rendered_steer: Float[np.ndarray, " f"]
+    agreement: Agreement
+
+    def save(self, path: Path) -> None:
+        """Write one NumPy archive with a JSON header.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        header = {"format": FORMAT, "version": FORMAT_VERSION, "drive": self.drive, "agreement": asdict(self.agreement)}
+        write_archive(path, {name: getattr(self, name) for name in _ARRAYS}, header)
+
+    @staticmethod
+    def load(path: Path) -> Fidelity:
+        """Read what `save` wrote.
+
+        Raises:
+            EpisodeError: the file is missing, damaged or of another format.
+        """
+        header, arrays = read_record(
+            path, _ARRAYS, EpisodeError, "evaluate again", format_version=(FORMAT, FORMAT_VERSION)
+        )
+        try:
+            return Fidelity(drive=str(header["drive"]), agreement=Agreement(**header["agreement"]), **arrays)
+        except (KeyError, TypeError, ValueError) as error:
+            raise EpisodeError(f"{path} is incomplete ({error!r}); evaluate again") from None
+
+
+def compare_with_rendered(
+    pattern: Pattern,
+    recordings: RecordingSet,
+    controller: Controller,
+    rendered: UInt8[np.ndarray, "f h w 3"],
+    *,
+    drive: str = "clean",
+    device: torch.device | str = "cpu",
+) -> Fidelity:
+    """Composite a pattern into a recorded drive and compare with the same frames rendered over the real paint.
+
+    Any drive will do that was recorded and calibrated without paint: the clean one, a pushed one, or the attacked one
+    replayed over the bare road.
+
+    Args:
+        pattern: what was painted.
+        recordings: the calibrated set.
+        controller: on `device`.
+        rendered: the simulator's frames over the paint, one for each of the drive's (`rendered_frames`).
+        drive: which of the set.
+        device: where to composite.
+
+    Raises:
+        RecordingError: there is no such drive, or it has another number or size of frames.
+        EpisodeError: no frame shows paint.
+    """
+    recorded = _drive(recordings, drive)
+    if rendered.shape != recorded.frames.shape:
+        raise RecordingError(
+            f"drive {drive} has frames of shape {recorded.frames.shape}, the rendered ones {rendered.shape}; "
+            "render the same frames"
+        )
+    alone = replace(recordings, recordings=(recorded,))
+    shown = show_pattern(pattern, alone, controller, Group((recorded.push,), Direction.EITHER), device=device)[0]
+    with torch.no_grad():
+        frames = torch.as_tensor(rendered, device=device).permute(0, 3, 1, 2).float() / 255
+        speed = torch.as_tensor(recorded.speed_mps, device=device, dtype=torch.float32)
+        command = torch.as_tensor(recorded.command, device=device, dtype=torch.int64)
+        rendered_steer = steer_of(controller, frames, speed, command).float().cpu().numpy()
+    return Fidelity(
+        drive=drive,
+        frame_number=recorded.frame_number,
+        clean=recorded.frames,
+        composited=shown.painted,
+        rendered=rendered,
+        clean_steer=shown.clean_steer,
+        composited_steer=shown.painted_steer,
+        rendered_steer=rendered_steer,
+        agreement=agreement(
+            shown.painted,
+            rendered,
+            _covered(pattern, recordings, recorded),
+            clean_steer=shown.clean_steer,
+            composited_steer=shown.painted_steer,
+            rendered_steer=rendered_steer,
+        ),
+    )
+
+
+def rendered_frames(
+    simulator: Simulator,
+    scenario: Scenario,
+    episode: Episode,
+    pattern: Pattern | PatternImage,
+    frame_number: Int[np.ndarray, " f"],
+) -> UInt8[np.ndarray, "f h w 3"]:
+    """A drive's controls given again over the painted road: what the controller would have seen at some of its steps.
+
+    Raises:
+        RecordingError: the drive has fewer steps.
+    """
+    wanted = set(frame_number.tolist())
+    if not wanted or min(wanted) < 0 or max(wanted) >= len(episode):
+        raise RecordingError(f"frames up to {max(wanted, default=0)} are asked of a drive of {len(episode)} steps")
+    frames: list[np.ndarray] = []
+    step = 0
+
+    def keep(seen: Observation, _: Control | None) -> None:
+        nonlocal step
+        if step in wanted:
+            frames.append(seen.frame)
+        step += 1
+
+    rollout(simulator, replay(episode), scenario, weather=episode.weather, pattern=pattern, on_step=keep)
+    return np.stack(frames)
+
+
+def is_drive_of(recorded: Recording, episode: Episode) -> bool:
+    """Whether a recording was taken on the drive of an episode: the same speeds at the same steps."""
+    steps = recorded.frame_number
+    inside = int(steps.max()) < len(episode)
+    return inside and bool(np.allclose(episode.speed_mps[steps], recorded.speed_mps, atol=0.02))
+
+
+def _drive(recordings: RecordingSet, name: str) -> Recording:
+    for recording in recordings.recordings:
+        if recording.name == name:
+            return recording
+    names = ", ".join(recording.name for recording in recordings.recordings)
+    raise RecordingError(f"the set has no drive {name!r}, expected one of {names}")
+
+
+def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) -> Bool[np.ndarray, "f h w"]:
+    """Pixels of which the pattern covers at least half: a white pattern on a black road says so."""
+    plain = ColourTransform(AffineResponse.identity())
+    dark = view_canvas(np.zeros_like(recorded.frames), recorded.image_from_canvas, recordings.view, plain)
+    white = Pattern(pattern.shapes, pattern.boxes, torch.ones_like(pattern.colours))
+    return composite(white, dark)[:, 0].numpy() >= 0.5
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Agreement:
+    """How well composited frames stand for rendered ones of the same drive.
+
+    Args:
+        frames: how many were compared.
+        paint_error: mean absolute difference in the paint, in 8-bit levels.
+        elsewhere_error: the same outside it, where both should show the bare road.
+        steer_error: mean absolute difference of the controller's answers, in steer units.
+        predicted_shift: mean shift of steering a frame that the composites predict; positive = right.
+        rendered_shift: the shift on the rendered frames.
+    """
+
+    frames: int
+    paint_error: float
+    elsewhere_error: float
+    steer_error: float
+    predicted_shift: float
+    rendered_shift: float
+
+
+def agreement(
+    composited: UInt8[np.ndarray, "f h w 3"],
+    rendered: UInt8[np.ndarray, "f h w 3"],
+    paint: Bool[np.ndarray, "f h w"],
+    *,
+    clean_steer: Float[np.ndarray, " f"],
+    composited_steer: Float[np.ndarray, " f"],
+    rendered_steer: Float[np.ndarray, " f"],
+) -> Agreement:
+    """Compare composites with what a simulator rendered from the same places.
+
+    Args:
+        composited: recorded frames with the pattern composited in.
+        rendered: the same frames with the pattern really there.
+        paint: which pixels the pattern covers.
+        clean_steer: the controller's answers to the frames without paint.
+        composited_steer: to the composited ones.
+        rendered_steer: to the rendered ones.
+
+    Raises:
+        EpisodeError: no pixel shows paint.
+    """
+    if not paint.any():
+        raise EpisodeError("no frame shows any paint, so there is nothing to compare; check the pattern and the drive")
+    error = np.abs(composited.astype(np.float32) - rendered).mean(-1)
+    return Agreement(
+        frames=len(composited),
+        paint_error=float(error[paint].mean()),
+        elsewhere_error=0.0 if paint.all() else float(error[~paint].mean()),
+        steer_error=float(np.abs(composited_steer - rendered_steer).mean()),
+        predicted_shift=float((composited_steer - clean_steer).mean()),
+        rendered_shift=float((rendered_steer - clean_steer).mean()),
+    )

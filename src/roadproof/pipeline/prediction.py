@@ -1,0 +1,133 @@
+"""What the recorded world foretold of a pattern, beside what the car did: both paths, and how far they are apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from roadproof.controllers import Controller
+from roadproof.driving.deviation import passage
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import passage_deviation_m, path_of
+from roadproof.errors import EpisodeError
+from roadproof.io.arrays import read_record, write_archive
+from roadproof.patterns import Pattern
+from roadproof.recorded.world import UNSURE, RecordedWorld
+from roadproof.recordings import RecordingSet
+
+FORMAT = "roadproof-prediction"
+FORMAT_VERSION = 2
+_PATHS = ("clean_xy", "predicted_xy", "driven_xy")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Prediction:
+    """One pattern, foretold and driven over.
+
+    Args:
+        predicted_m: the paper's deviation in the recorded world, against its own bare road; mean over small errors of
+            steering.
+        least_m: of it over those errors.
+        most_m: of it over those errors.
+        driven_m: the same in the simulator.
+        path_error_m: mean distance between the predicted and the driven position at the same instants.
+        gap_m: the most that the predicted path is aside of a recorded pose.
+        gap_rad: the most that it is turned from one.
+        clean_xy: world x, y of the clean drive while the canvas is in view.
+        predicted_xy: of the predicted one.
+        driven_xy: of the driven one.
+    """
+
+    predicted_m: float
+    least_m: float
+    most_m: float
+    driven_m: float
+    path_error_m: float
+    gap_m: float
+    gap_rad: float
+    clean_xy: Float[np.ndarray, "t 2"]
+    predicted_xy: Float[np.ndarray, "t 2"]
+    driven_xy: Float[np.ndarray, "u 2"]
+
+    @property
+    def error_m(self) -> float:
+        """Predicted minus driven deviation."""
+        return self.predicted_m - self.driven_m
+
+    def save(self, path: Path) -> None:
+        """Write one NumPy archive with a JSON header.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        header: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION}
+        header |= {name: getattr(self, name) for name in self.__slots__ if name not in _PATHS}
+        write_archive(path, {name: getattr(self, name) for name in _PATHS}, header)
+
+    @staticmethod
+    def load(path: Path) -> Prediction:
+        """Read what `save` wrote.
+
+        Raises:
+            EpisodeError: the file is missing, damaged or of another format.
+        """
+        header, paths = read_record(
+            path, _PATHS, EpisodeError, "remove it to predict again", format_version=(FORMAT, FORMAT_VERSION)
+        )
+        try:
+            told: dict[str, Any] = {name: float(header[name]) for name in Prediction.__slots__ if name not in _PATHS}
+            told |= {name: paths[name].astype(np.float64) for name in _PATHS}
+            return Prediction(**told)
+        except (KeyError, TypeError, ValueError) as error:
+            raise EpisodeError(f"{path} is incomplete ({error!r}); remove it to predict again") from None
+
+
+def predict(
+    recordings: RecordingSet,
+    controller: Controller,
+    pattern: Pattern,
+    clean: Episode,
+    painted: Episode,
+    *,
+    device: torch.device | str = "cpu",
+) -> Prediction:
+    """Drive over a pattern in the recorded world, and compare with a drive over it in the simulator.
+
+    Args:
+        recordings: with canvas and tracks.
+        controller: on `device`; the one that drove.
+        pattern: one pattern.
+        clean: the simulator's drive over the bare road, the recorded one.
+        painted: its drive over the pattern.
+        device: where to predict.
+
+    Raises:
+        RecordingError: the set cannot be driven in.
+    """
+    world = RecordedWorld(recordings, device=device)
+    world.fit(controller)
+    on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
+    with torch.no_grad():
+        rolled = world.roll(controller, on_device)
+    deviations = world.deviations_m(controller, on_device, UNSURE)
+    predicted, canvas = world.whole_path(rolled, 0), world.course.canvas
+    seen = passage(path_of(clean), canvas)
+    driven = path_of(painted)[seen]
+    both = min(len(driven), len(predicted))
+    return Prediction(
+        predicted_m=float(deviations.mean()),
+        least_m=float(deviations.min()),
+        most_m=float(deviations.max()),
+        driven_m=passage_deviation_m(clean, painted, canvas),
+        path_error_m=float(np.hypot(*(predicted[:both] - driven[:both]).T).mean()) if both else 0.0,
+        gap_m=float(rolled.left_m.abs().max()),
+        gap_rad=float(rolled.turned_rad.abs().max()),
+        clean_xy=path_of(clean)[seen],
+        predicted_xy=predicted,
+        driven_xy=driven,
+    )

@@ -1,0 +1,224 @@
+"""Re-recording rounds: searching on where the attacked car really went.
+
+Composited frames stand for drives near the recorded ones. Once a pattern bites, the car is elsewhere, so each round
+drives where the last pattern took it, over the bare road, calibrates that drive as the others, adds it to them, and
+searches on from the patterns that deviated most when driven. Rounds are not monotone: the best *driven* of all counts.
+
+    RUN/round-1/round-1/       the drive over the bare road (`drives.record_along`)
+    RUN/round-1/calibration/   how good its calibration is; its replays are in RUN/calibration/
+    RUN/round-1/recordings/    it and the clean one, calibrated
+    RUN/round-1/attack/        what was found with it (`attacks.attack`)
+    RUN/round-1/selection/     which of that was strongest when driven (`pipeline.selection`)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, attack, kept_attack
+from roadproof.attacks.groups import Direction, Group, parse_groups
+from roadproof.calibration import Calibrated, calibrate, replays_needed
+from roadproof.calibration import Method as Calibration
+from roadproof.controllers import Controller
+from roadproof.drives import Drives, record_along
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.errors import CalibrationError, RecordingError
+from roadproof.pipeline.selection import Selection, select_by_driving
+from roadproof.recordings import Recording, RecordingSet
+from roadproof.simulators.protocol import Simulator
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Round:
+    """A search and the drives over what it found.
+
+    Args:
+        attack: the search; its numbers are the surrogate's.
+        selection: the drives over its candidates; closed loop.
+        simulator_calls: drives of this round: recording, calibration and selection.
+    """
+
+    attack: AttackResult
+    selection: Selection
+    simulator_calls: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Rounds:
+    """What came of the rounds.
+
+    Args:
+        first: the choice before them.
+        done: each of them.
+        stopped: why there are fewer than asked for; empty where there are not.
+    """
+
+    first: Selection
+    done: tuple[Round, ...]
+    stopped: str = ""
+
+    @property
+    def best(self) -> Selection:
+        """The choice that deviated most when driven, of all rounds and the one before."""
+        return max((self.first, *(each.selection for each in self.done)), key=lambda chosen: chosen.deviation_m)
+
+    @property
+    def simulator_calls(self) -> int:
+        """Drives of all rounds."""
+        return sum(each.simulator_calls for each in self.done)
+
+
+def search_on(
+    simulator: Simulator,
+    controller: Controller,
+    drives: Drives,
+    recordings: RecordingSet,
+    groups: Sequence[Group],
+    found: AttackResult,
+    selection: Selection,
+    *,
+    objective: Objective,
+    rounds: int,
+    best: int,
+    method: Calibration,
+    folder: Path,
+    device: torch.device | str = "cpu",
+    on_step: Callable[[int, int, str], object] = lambda _done, _total, _word: None,
+) -> Rounds:
+    """Search on for some rounds, each with one drive more.
+
+    A round is the search before, but no starts compete: every start is a pattern that was found before. It ends the
+    rounds when the drive cannot be calibrated, because it shows too little of the canvas.
+
+    Args:
+        simulator: an open simulator.
+        controller: on `device`.
+        drives: recorded without paint; gives scenario and weather.
+        recordings: calibrated; those the search before was on.
+        groups: of it.
+        found: by it.
+        selection: of it; its drives are in `folder`/selection.
+        objective: what the search before made large, and each round's search makes large.
+        rounds: how many.
+        best: candidates driven in each.
+        method: of calibration.
+        folder: of the run; what it holds is not done again.
+        device: where to search.
+        on_step: told how much is done, of how much, and a word on it.
+
+    Raises:
+        RoadproofError: as the stages do.
+    """
+    clean = Drives(settings=drives.settings, drives=drives.drives[:1])
+    steps = _gone_on(found.method).steps(objective)
+    per_round = steps + best
+    known, last, done = _ranked(found, selection), _Driven(selection, folder / "selection"), list[Round]()
+    for number in range(1, rounds + 1):
+        place, before = folder / f"round-{number}", per_round * (number - 1)
+
+        def tell(now: int, word: str, before: int = before) -> None:
+            on_step(before + now, per_round * rounds, word)
+
+        tell(0, "recording")
+        try:
+            added, calls = _recorded(simulator, controller, clean, last, method, place)
+        except (CalibrationError, RecordingError) as error:
+            return Rounds(first=selection, done=tuple(done), stopped=f"round {number}: {error}")
+        recordings = replace(recordings, recordings=(*recordings.recordings, added))
+        if groups[0].direction is Direction.EITHER:
+            groups = parse_groups("all", recordings)
+        starts = [candidate for _, candidate in known]
+        again = _searched(recordings, controller, groups, found, objective, starts, place / "attack", device, tell)
+        chosen = select_by_driving(
+            simulator,
+            controller,
+            drives.settings.scenario,
+            again.candidates,
+            best=best,
+            weather=drives.settings.weather,
+            folder=place / "selection",
+            clean=last.bare(),
+            on_drive=lambda n, far, tell=tell: tell(steps + n - 1, f"{far:.2f} m"),
+        )
+        done.append(Round(attack=again, selection=chosen, simulator_calls=calls + chosen.simulator_calls))
+        known = sorted([*_ranked(again, chosen), *known], key=lambda each: -each[0])
+        last = _Driven(chosen, place / "selection")
+    return Rounds(first=selection, done=tuple(done))
+
+
+@dataclass(frozen=True, slots=True)
+class _Driven:
+    """A choice and where its drives are."""
+
+    selection: Selection
+    folder: Path
+
+    def bare(self) -> Episode:
+        """The drive without paint."""
+        return load_episodes(self.folder, [self.selection.driven[0].trial.clean])[0]
+
+    def over_chosen(self) -> Episode:
+        """The drive over the pattern that was chosen."""
+        return load_episodes(self.folder, [self.selection.driven[self.selection.chosen].trial.painted])[0]
+
+
+def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Candidate]]:
+    """What was found, with its deviation when driven: the largest first, then what was not driven."""
+    driven = {each.rank: each.trial.deviation_m for each in selection.driven}
+    ranked = [(driven.get(rank, -1.0), candidate) for rank, candidate in enumerate(found.candidates, 1)]
+    return sorted(ranked, key=lambda each: -each[0])
+
+
+def _recorded(
+    simulator: Simulator, controller: Controller, clean: Drives, last: _Driven, method: Calibration, place: Path
+) -> tuple[Recording, int]:
+    """The way that the last pattern took the car, without the paint and calibrated, and the drives that took."""
+    drive = record_along(simulator, controller, clean, last.over_chosen(), name=place.name, folder=place)
+    both = replace(clean, drives=(*clean.drives, drive))
+    calibrated = Calibrated.load(place)
+    if calibrated is None:
+        # The clean drive's replays lie there already and are not driven again.
+        calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration")
+        calibrated.save(place)
+    calls = drive.calls + replays_needed(both, method) - replays_needed(clean, method)
+    return calibrated.recordings.recordings[1], calls
+
+
+def _searched(
+    recordings: RecordingSet,
+    controller: Controller,
+    groups: Sequence[Group],
+    found: AttackResult,
+    objective: Objective,
+    starts: Sequence[Candidate],
+    place: Path,
+    device: torch.device | str,
+    tell: Callable[[int, str], None],
+) -> AttackResult:
+    """The search before, from where it and the rounds came to."""
+    return kept_attack(
+        place,
+        lambda checkpoint: attack(
+            recordings,
+            controller,
+            found.space,
+            objective=objective,
+            groups=groups,
+            method=_gone_on(found.method),
+            seed=found.seed,
+            starts=starts,
+            device=device,
+            checkpoint=checkpoint,
+            on_step=lambda step, best: tell(step, f"{best:.2f}"),
+        ),
+    )
+
+
+def _gone_on(method: Method) -> Method:
+    """The method with as many starts as it ended with, none of which compete."""
+    return replace(method, halving=False) if isinstance(method, GradOpt) else method

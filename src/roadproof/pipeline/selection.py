@@ -1,0 +1,195 @@
+"""Choosing among what a search found by driving over it: the surrogate ranks only coarsely.
+
+SELECTION/selection.json      every candidate driven, with what came of it
+SELECTION/pattern.json, .png  the one that was chosen
+SELECTION/episodes/*.npz      the drives: clean, and one for each candidate (`driving.drive_store`)
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from roadproof.attacks import Candidate
+from roadproof.controllers import Controller
+from roadproof.datatypes import Weather
+from roadproof.driving.drive_store import CLEAN, Conditions, Episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Trial
+from roadproof.errors import RoadproofError
+from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import record
+from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import Simulator
+
+FORMAT = "roadproof-selection"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Driven:
+    """One candidate and the drive over it, closed loop.
+
+    Args:
+        group: what it was found on.
+        rank: its place by the surrogate, 1 the strongest.
+        trial: what came of the drive.
+    """
+
+    group: str
+    rank: int
+    trial: Trial
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Selection:
+    """The candidate that deviated most when driven.
+
+    Args:
+        pattern: it.
+        driven: every candidate driven, in the surrogate's order.
+        chosen: index of it among them.
+        simulator_calls: drives, the clean one included where it was made for this; 0 where they are predicted.
+        predicted: nothing was driven for real.
+    """
+
+    pattern: Pattern
+    driven: tuple[Driven, ...]
+    chosen: int
+    simulator_calls: int
+    predicted: bool = False
+
+    @property
+    def deviation_m(self) -> float:
+        """Of the drive over the chosen one."""
+        return self.driven[self.chosen].trial.deviation_m
+
+    def save(self, folder: Path) -> None:
+        """Write the choice beside the drives.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        save_pattern(self.pattern, folder / "pattern.json")
+        content = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "kind": "predicted" if self.predicted else "closed loop",
+            "driven": [asdict(each) for each in self.driven],
+            "chosen": self.chosen,
+            "simulator_calls": self.simulator_calls,
+        }
+        write_atomically(folder / "selection.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+
+    @staticmethod
+    def load(folder: Path) -> Selection:
+        """Read what `save` wrote.
+
+        Raises:
+            RoadproofError: a file is missing or damaged.
+        """
+        path = folder / "selection.json"
+        content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
+        told = record(content, _Stored, path, RoadproofError, f"remove {folder}")
+        if not 0 <= told.chosen < len(told.driven):
+            raise RoadproofError(f"{path} has chosen {told.chosen} of {len(told.driven)}; remove {folder}")
+        return Selection(
+            pattern=load_pattern(folder / "pattern.json"),
+            driven=told.driven,
+            chosen=told.chosen,
+            simulator_calls=told.simulator_calls,
+            predicted=told.kind == "predicted",
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Stored:
+    """selection.json."""
+
+    driven: tuple[Driven, ...]
+    chosen: int
+    simulator_calls: int
+    kind: str = "closed loop"
+
+
+def select_by_driving(
+    simulator: Simulator,
+    controller: Controller,
+    scenario: Scenario,
+    candidates: Sequence[Candidate],
+    *,
+    best: int,
+    weather: Weather = Weather.CLEAR_NOON,
+    folder: Path,
+    clean: Episode | None = None,
+    on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
+) -> Selection:
+    """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
+
+    Deviation rather than infraction points, which jump: what grazes a post at noon may touch nothing in the rain.
+
+    Args:
+        simulator: an open simulator.
+        controller: that was attacked.
+        scenario: where.
+        candidates: the strongest first, as in `AttackResult.candidates`.
+        best: how many are driven; every group gets its share, since the surrogate does not know which side gives way.
+        weather: of the drives.
+        folder: keeps every drive and the choice; what it holds is not done again.
+        clean: the drive over the bare road, where it was made already.
+        on_drive: told after each drive how many are done, and the largest deviation so far.
+
+    Raises:
+        RoadproofError: there is nothing to drive, the folder is damaged, or it holds a choice among others.
+        SimulatorError, ControllerError: as `rollout` does.
+        OutputError: the folder cannot be written.
+    """
+    chosen = first_of_each_group(candidates, best)
+    if not chosen:
+        raise RoadproofError(f"{len(candidates)} candidates and {best} of them to drive; expected at least one")
+    paints = {f"candidate-{rank}": raster(candidate.pattern) for rank, candidate in chosen}
+    episodes = Episodes.of(simulator, controller, scenario, paints, folder)
+    bare = Conditions(paint=CLEAN, weather=weather)
+    over = [replace(bare, paint=name) for name in paints]
+    if (folder / "selection.json").exists():
+        kept = Selection.load(folder)
+        if [each.trial.painted for each in kept.driven] != [episodes.file(drive) for drive in over]:
+            raise RoadproofError(
+                f"{folder} holds a choice for another attack, controller or scenario, or among more or fewer "
+                "candidates; remove it to choose again"
+            )
+        return kept
+    calls = int(clean is None)
+    if clean is not None and not episodes.has(bare):
+        episodes.put(bare, clean)
+    episodes.make(simulator, bare)
+    on_drive(1, 0.0)
+    driven: list[Driven] = []
+    for (rank, candidate), drive in zip(chosen, over, strict=True):
+        episodes.make(simulator, drive)
+        driven.append(Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, drive)))
+        on_drive(1 + len(driven), max(each.trial.deviation_m for each in driven))
+    winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
+    selection = Selection(
+        pattern=chosen[winner][1].pattern,
+        driven=tuple(driven),
+        chosen=winner,
+        simulator_calls=0 if simulator.paint.predicted else calls + len(driven),
+        predicted=simulator.paint.predicted,
+    )
+    selection.save(folder)
+    return selection
+
+
+def first_of_each_group(candidates: Sequence[Candidate], count: int) -> list[tuple[int, Candidate]]:
+    """The strongest of each group, then the second strongest, until there are `count`; with their ranks."""
+    seen: dict[str, int] = {}
+    placed: list[tuple[int, int, Candidate]] = []
+    for rank, candidate in enumerate(candidates, 1):
+        seen[candidate.group] = seen.get(candidate.group, 0) + 1
+        placed.append((seen[candidate.group], rank, candidate))
+    kept = sorted(placed, key=lambda each: each[:2])[:count]
+    return sorted(((rank, candidate) for _, rank, candidate in kept), key=lambda each: each[0])

@@ -1,0 +1,188 @@
+"""Recorded drives past a canvas, as a search takes them: frames, homographies, colours, and where the car was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from roadproof.datatypes import Command
+from roadproof.errors import GeometryError, RecordingError
+from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
+from roadproof.io.files import check_name
+from roadproof.photometry import ColourTransform, PixelMaps
+from roadproof.recordings.track import FASTEST_MPS, Track
+
+PER_FRAME = ("frame_number", "image_from_canvas", "speed_mps", "command", "steer")
+"""Arrays of a recording with one row a frame, besides its frames."""
+
+
+class Push(StrEnum):
+    """How a drive was perturbed: not at all, to one side only, or at random."""
+
+    CLEAN = "clean"
+    LEFT = "left"
+    RIGHT = "right"
+    RANDOM = "random"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Recording:
+    """One drive, as far as the canvas is in view.
+
+    Args:
+        name: names its folder.
+        push: how it was perturbed.
+        frames: the controller's input without any paint, (F, H, W, 3).
+        frame_number: of each frame in the drive, rising.
+        image_from_canvas: one homography a frame, canvas px to camera px.
+        speed_mps: m/s, from −1 (rolling back) to `FASTEST_MPS`.
+        command: CARLA's codes (`datatypes.Command`).
+        steer: what the recorded controller answered to each frame, in [−1, 1]; for information.
+        maps: per-pixel gain and offset of the paint, where they were calibrated; to the response of the set's colour.
+        track: poses and controls of the whole drive, where they are known; its steps are numbered as the frames are.
+
+    Raises:
+        RecordingError: a frame has no pose in the track, lengths differ, a value is not finite or outside its range,
+            or a homography is not a view of the canvas.
+    """
+
+    name: str
+    push: Push
+    frames: UInt8[np.ndarray, "f h w 3"]
+    frame_number: Int[np.ndarray, "..."]
+    image_from_canvas: Float[np.ndarray, "..."]
+    speed_mps: Float[np.ndarray, "..."]
+    command: Int[np.ndarray, "..."]
+    steer: Float[np.ndarray, "..."]
+    maps: PixelMaps | None = None
+    track: Track | None = None
+
+    def __post_init__(self) -> None:
+        check_name(self.name, "drive", RecordingError)
+        count = len(self.frames)
+        if count == 0:
+            raise RecordingError(f"drive {self.name} has no frames, expected at least one that shows the canvas")
+        for field in PER_FRAME:
+            values: np.ndarray = getattr(self, field)
+            tail = (3, 3) if field == "image_from_canvas" else ()
+            if values.shape != (count, *tail):
+                raise RecordingError(
+                    f"drive {self.name}: {field} has shape {values.shape}, expected {(count, *tail)} for {count} frames"
+                )
+            bad = np.flatnonzero(~np.isfinite(values.reshape(count, -1)).all(1))
+            if bad.size:
+                number = self.frame_number[bad[0]]
+                raise RecordingError(f"drive {self.name}: {field} of frame {number} is NaN or infinite; drop the frame")
+        self._check_ranges()
+        for number, homography in zip(self.frame_number, self.image_from_canvas, strict=True):
+            try:
+                check_image_from_canvas(homography)
+            except GeometryError as error:
+                raise RecordingError(f"drive {self.name}, frame {number}: {error}") from None
+        if self.track is not None:
+            try:
+                self.track.rows(self.frame_number)
+            except RecordingError as error:
+                raise RecordingError(f"drive {self.name}: {error}") from None
+
+    def _check_ranges(self) -> None:
+        if self.frame_number[0] < 0 or (np.diff(self.frame_number.astype(np.int64)) < 1).any():
+            raise RecordingError(f"drive {self.name}: frame numbers do not rise from 0; order its frames, each once")
+        known = [int(command) for command in Command]
+        for field, fits, expected in (
+            (
+                "command",
+                np.isin(self.command, known),
+                f"one of {', '.join(map(str, known))} (2 follow, 3 left, 4 right, 5 straight)",
+            ),
+            ("speed_mps", (self.speed_mps >= -1) & (self.speed_mps <= FASTEST_MPS), f"−1 to {FASTEST_MPS:g} m/s"),
+            ("steer", np.abs(self.steer) <= 1, "−1 to 1"),
+        ):
+            for row in np.flatnonzero(~fits)[:1]:
+                value, number = getattr(self, field)[row], self.frame_number[row]
+                raise RecordingError(
+                    f"drive {self.name}: {field} of frame {number} is {value}, expected {expected}; drop the frame"
+                )
+
+    def thinned(self, every: int) -> Recording:
+        """Every n-th frame, counted back from the last one, which shows the canvas largest; the track stays whole."""
+        frames = slice((len(self.frames) - 1) % every, None, every)
+        maps = self.maps and PixelMaps(
+            self.maps.gain[frames], self.maps.offset[frames], self.maps.visible[frames], self.maps.response
+        )
+        kept = {name: getattr(self, name)[frames] for name in ("frames", *PER_FRAME)}
+        return replace(self, maps=maps, **kept)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class RecordingSet:
+    """Drives of one scenario with one camera, one controller input and one colour transform.
+
+    Args:
+        camera: the camera on the car.
+        view: how the controller's input is made from its picture.
+        colour: painted → seen, common to all drives.
+        recordings: the drives.
+        origin: where they come from, in words.
+        canvas: where it lies in the world of the tracks, where that is known.
+
+    Raises:
+        RecordingError: no drive, two of one name, or frames of another size than the controller's input.
+    """
+
+    camera: CameraModel
+    view: CropResize
+    colour: ColourTransform
+    recordings: tuple[Recording, ...]
+    origin: str = ""
+    canvas: CanvasPlacement | None = None
+
+    def __post_init__(self) -> None:
+        if not self.recordings:
+            raise RecordingError("the set has no drives, expected at least a clean one")
+        names = [recording.name for recording in self.recordings]
+        if len(set(names)) != len(names):
+            raise RecordingError(f"two drives have the same name among {', '.join(names)}")
+        for recording in self.recordings:
+            height, width = recording.frames.shape[1:3]
+            if (height, width) != (self.view.height_px, self.view.width_px):
+                raise RecordingError(
+                    f"drive {recording.name} has frames of {width}×{height}, "
+                    f"expected {self.view.width_px}×{self.view.height_px} as the set's crop and resize make them"
+                )
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether the set can be driven in: its canvas and the poses of all drives are known."""
+        return self.canvas is not None and all(recording.track is not None for recording in self.recordings)
+
+
+def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
+    """The drives of several sets as one, such as the same drives in several weathers.
+
+    Args:
+        sets: by name; drives of all but the first are named after theirs.
+
+    Raises:
+        RecordingError: there is none, or one differs in camera, crop, colour transform or the place of the canvas;
+            per-pixel maps may differ.
+    """
+    first, *others = sets.values() or (None,)
+    if first is None:
+        raise RecordingError("there are no recordings to pool, expected at least one set")
+    drives = list(first.recordings)
+    for name, each in list(sets.items())[1:]:
+        if (each.camera, each.view, each.colour.to_dict()) != (first.camera, first.view, first.colour.to_dict()):
+            raise RecordingError(f"the recordings {name} have another camera, crop or colour transform than the first")
+        if each.canvas != first.canvas:
+            raise RecordingError(
+                f"the recordings {name} place the canvas at {each.canvas}, but the first at {first.canvas}; "
+                "expected one place for all"
+            )
+        drives += [replace(drive, name=f"{name}-{drive.name}") for drive in each.recordings]
+    origin = "; ".join(each.origin for each in (first, *others))
+    return replace(first, recordings=tuple(drives), origin=origin)

@@ -1,0 +1,290 @@
+"""Evaluations in the town itself: what is driven, what is judged, what is not driven twice."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import bad_drivers
+import needs
+from paint_shy import PaintShy, just_before_the_canvas
+from roadproof.coverage import Shape
+from roadproof.datatypes import Weather
+from roadproof.driving.deviation import deviation_m, lateral_m, passage
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluate import evaluate, random_patterns
+from roadproof.driving.evaluation import Evaluation, load_paint, path_of
+from roadproof.driving.infractions import infraction_points
+from roadproof.driving.rollout import rollout
+from roadproof.driving.starts import StartRange
+from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
+from roadproof.patterns import Pattern, raster
+
+needs.town()
+from roadproof.simulators.town.simulator import TownSimulator
+
+SHORT = just_before_the_canvas(2.5)
+MAGENTA = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON)
+CONDITIONS = {"weathers": WEATHERS, "starts": 0, "runs": 2, "cars": 2, "pedestrians": 2, "seed": 3}
+
+
+@pytest.fixture(scope="module")
+def done(town, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evaluation")
+    told = []
+    evaluation = evaluate(
+        town,
+        PaintShy(),
+        SHORT,
+        MAGENTA,
+        folder=folder,
+        baseline=random_patterns(MAGENTA, 1, seed=1),
+        on_drive=lambda *args: told.append(args),
+        **CONDITIONS,
+    )
+    return folder, evaluation, told
+
+
+def test_every_condition_is_driven_bare_and_over_every_pattern(done):
+    folder, evaluation, told = done
+    conditions = [(trial.pattern, trial.weather, trial.traffic, trial.seed) for trial in evaluation.trials]
+    expected = [
+        (pattern, weather, traffic, seed)
+        for weather in WEATHERS
+        for traffic, seed in ((False, 3), (True, 3), (True, 4))
+        for pattern in ("attack", "random-1")
+    ]
+    assert conditions == expected
+    # Clean drives are shared between the patterns.
+    assert evaluation.simulator_calls == 2 * 3 * 3 == len(list((folder / "episodes").iterdir()))
+    assert told == [(k, 18) for k in range(19)]
+
+
+def test_trials_are_the_metrics_of_their_two_episodes(done):
+    folder, evaluation, _ = done
+    for trial in evaluation.trials:
+        clean, painted = load_episodes(folder, (trial.clean, trial.painted))
+        assert (clean.painted, painted.painted) == (False, True)
+        assert (clean.weather, clean.cars, clean.seed) == (painted.weather, painted.cars, painted.seed)
+        assert (clean.weather, clean.cars > 0, clean.seed) == (trial.weather, trial.traffic, trial.seed)
+        seen = passage(path_of(clean), SHORT.canvas)
+        assert trial.deviation_m == deviation_m(path_of(clean)[seen], path_of(painted)[seen])
+        assert abs(trial.lateral_m) == np.abs(lateral_m(path_of(clean), path_of(painted))).max()
+        assert (trial.points, trial.clean_points) == (
+            infraction_points(painted.events),
+            infraction_points(clean.events),
+        )
+
+
+def test_the_paint_moves_the_car_to_where_the_driver_flees(done):
+    _, evaluation, _ = done
+    for trial in evaluation.of("attack", traffic=False):
+        assert trial.lateral_m < -0.1, "to the right"
+        assert trial.deviation_m > 0.01
+
+
+def test_an_episode_is_the_plain_rollout_of_its_conditions(done, town):
+    folder, evaluation, _ = done
+    trial = evaluation.of("attack", traffic=True, weather=Weather.CLOUDY_NOON)[1]
+    (kept,) = load_episodes(folder, [trial.painted])
+    again = rollout(
+        town, PaintShy(), SHORT, weather=Weather.CLOUDY_NOON, pattern=MAGENTA, cars=2, pedestrians=2, seed=4
+    )
+    assert all(np.array_equal(getattr(kept, f.name), getattr(again, f.name)) for f in dataclasses.fields(Episode))
+
+
+def test_rows_average_the_trials_and_lose_none(done):
+    _, evaluation, _ = done
+    rows = evaluation.rows()
+    assert [(row.pattern, row.traffic, row.weather) for row in rows] == [
+        (pattern, traffic, weather)
+        for pattern in ("attack", "random")
+        for traffic in (False, True)
+        for weather in (*WEATHERS, None)
+    ]
+    for row in rows:
+        trials = evaluation.of(row.pattern, traffic=row.traffic, weather=row.weather)
+        assert row.points.count == len(trials)
+        assert row.deviation_m.value == pytest.approx(np.mean([trial.deviation_m for trial in trials]))
+        assert row.failed == pytest.approx(np.mean([trial.first_event_s is not None for trial in trials]))
+        single = len(trials) == 1 or (row.pattern == "attack" and not row.traffic)
+        assert (row.deviation_m.high is None) == single, "weathers are no sample"
+
+
+def test_what_is_saved_is_what_is_loaded(done):
+    folder, evaluation, _ = done
+    assert Evaluation.load(folder) == evaluation
+    assert np.array_equal(load_paint(folder), raster(MAGENTA))
+    content = json.loads((folder / "evaluation.json").read_text())
+    assert content["kind"] == "closed loop"
+    assert len(content["trials"]) == 12
+    assert len(content["rows"]) == 12
+
+
+def test_a_second_call_drives_nothing_and_a_lost_drive_alone_is_made_again(done, town):
+    folder, evaluation, _ = done
+    stamps = {path.name: path.stat().st_mtime_ns for path in (folder / "episodes").iterdir()}
+    lost = evaluation.trials[-1].painted
+    (folder / "episodes" / lost).unlink()
+    again = evaluate(
+        town, PaintShy(), SHORT, MAGENTA, folder=folder, baseline=random_patterns(MAGENTA, 1, seed=1), **CONDITIONS
+    )
+    assert again.trials == evaluation.trials
+    now = {path.name: path.stat().st_mtime_ns for path in (folder / "episodes").iterdir()}
+    assert {name for name in now if now[name] != stamps[name]} == {lost}
+
+
+def test_other_inputs_are_other_drives(done, town):
+    folder = done[0]
+    one = {"weathers": WEATHERS[:1], "starts": 0, "runs": 0, "seed": 3}
+    known = {path.name for path in (folder / "episodes").iterdir()}
+
+    def files(driver, pattern, scenario=SHORT):
+        made = evaluate(town, driver, scenario, pattern, folder=folder, **one).trials[0]
+        return made.clean in known, made.painted in known
+
+    other = Pattern(MAGENTA.shapes, MAGENTA.boxes, torch.tensor([[1.0, 0, 0.9]]))
+    assert files(PaintShy(), MAGENTA) == (True, True)
+    assert files(PaintShy(), other) == (True, False), "another paint, the same bare road"
+    assert files(PaintShy(gain=5.0), MAGENTA) == (False, False), "a controller that answers otherwise"
+    assert files(PaintShy(), MAGENTA, dataclasses.replace(SHORT, time_limit_s=2.0)) == (False, False)
+
+
+@pytest.mark.slow
+def test_two_processes_drive_what_one_does(done, tmp_path):
+    _, evaluation, _ = done
+    together = evaluate(
+        TownSimulator,
+        PaintShy(),
+        SHORT,
+        MAGENTA,
+        folder=tmp_path,
+        weathers=WEATHERS[:1],
+        starts=0,
+        runs=1,
+        cars=2,
+        pedestrians=2,
+        seed=3,
+        processes=2,
+    )
+    assert together.trials == tuple(
+        trial
+        for trial in evaluation.trials
+        if trial.pattern == "attack" and trial.seed == 3 and trial.weather == WEATHERS[0]
+    )
+
+
+def test_random_patterns_are_drawn_by_their_seed():
+    one, two, other = (random_patterns(MAGENTA, 3, seed=seed) for seed in (5, 5, 6))
+    assert len(one) == 3
+    assert all(
+        torch.equal(a.boxes, b.boxes) and torch.equal(a.colours, b.colours) for a, b in zip(one, two, strict=True)
+    )
+    assert not torch.equal(one[0].boxes, other[0].boxes)
+    assert len(one[0].shapes) == len(MAGENTA.shapes)
+
+
+MISTAKES = {
+    "0 weathers": {"weathers": ()},
+    "-1 runs": {"runs": -1},
+    "-1 starts": {"starts": -1},
+    "no cars and no pedestrians": {"runs": 2, "cars": 0, "pedestrians": 0},
+    "need a simulator each": {"processes": 2},
+}
+
+
+@pytest.mark.parametrize("message", MISTAKES)
+def test_conditions_that_make_no_sense_are_refused(town, tmp_path, message):
+    with pytest.raises(EpisodeError, match=message):
+        evaluate(town, PaintShy(), SHORT, MAGENTA, folder=tmp_path, **MISTAKES[message])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, tmp_path):
+    narrow = StartRange(right_m=0.2, turned_rad=0.02, faster_mps=1.0)
+    options = {"weathers": WEATHERS, "starts": 3, "start_range": narrow, "runs": 1, "cars": 1, "seed": 3}
+    told = evaluate(town, PaintShy(), SHORT, MAGENTA, folder=tmp_path, **options)
+    alone = told.of(traffic=False, weather=WEATHERS[0])
+    starts = [trial.start for trial in alone]
+    assert (
+        starts == list(narrow.draw(3, seed=3)) == [trial.start for trial in told.of(traffic=False, weather=WEATHERS[1])]
+    )
+    assert len(set(starts)) == 3
+    assert told.of(traffic=True)[0].start == starts[0]
+    for trial in alone:
+        clean, painted = load_episodes(tmp_path, (trial.clean, trial.painted))
+        right = math.sin(SHORT.start.yaw_rad) * (clean.x_m[0] - SHORT.start.x_m)
+        right -= math.cos(SHORT.start.yaw_rad) * (clean.y_m[0] - SHORT.start.y_m)
+        assert right == pytest.approx(trial.start.right_m, abs=1e-3)
+        assert clean.speed_mps[0] - SHORT.start.speed_mps == pytest.approx(trial.start.faster_mps, abs=1e-3)
+        assert (painted.x_m[0], painted.yaw_rad[0]) == (clean.x_m[0], clean.yaw_rad[0])
+    row = told.rows()[0]
+    deviations = sorted(trial.deviation_m for trial in alone)
+    assert (row.count, row.median_m, row.least_m, row.most_m) == (3, deviations[1], deviations[0], deviations[2])
+    assert row.left_lane == np.mean([trial.leaves_lane for trial in alone])
+    assert row.deviation_m.low is not None, "drawn starts are a sample"
+    assert Evaluation.load(tmp_path).trials == told.trials
+    assert Evaluation.load(tmp_path).start_range == narrow
+
+
+@pytest.mark.parametrize("wrong", [{"right_m": 1.5}, {"turned_rad": -0.1}, {"faster_mps": math.nan}], ids=str)
+def test_starts_off_the_lane_are_refused(wrong):
+    name, value = next(iter(wrong.items()))
+    with pytest.raises(EpisodeError, match=f"{name} of the starts is {value}, expected 0 to"):
+        StartRange(**wrong)
+
+
+def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(tmp_path):
+    class Local(bad_drivers.Honest):
+        pass
+
+    with pytest.raises(ControllerError, match=r"pickling the controller raised \w+: Can't.* its class in a module"):
+        evaluate(TownSimulator, Local(), SHORT, MAGENTA, folder=tmp_path, processes=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("driver", "error", "message"),
+    [
+        (bad_drivers.DyingInWorkers, SimulatorError, "a driving process died"),
+        (
+            bad_drivers.FailingInWorkers,
+            ControllerError,
+            r"act raised ZeroDivisionError at \S*bad_drivers\.py:\d+",
+        ),
+    ],
+)
+def test_what_fails_in_a_process_is_one_line_here(tmp_path, driver, error, message):
+    with pytest.raises(error, match=message) as told:
+        evaluate(TownSimulator, driver(), SHORT, MAGENTA, folder=tmp_path, weathers=WEATHERS, runs=0, processes=2)
+    assert "\n" not in str(told.value)
+
+
+def test_a_pattern_that_paints_nothing_is_refused(town, tmp_path):
+    with pytest.raises(PatternError, match="paints nothing"):
+        evaluate(town, PaintShy(), SHORT, np.zeros((400, 400, 4), np.uint8), folder=tmp_path)
+
+
+DAMAGE = {
+    "is not valid JSON": lambda text: text[:100],
+    "required field `trials`": lambda text: text.replace('"trials"', '"trails"'),
+    "is not a plain name": lambda text: text.replace('"clean": "', '"clean": "../'),
+    "has version 9": lambda text: text.replace('"version": 1', '"version": 9'),
+    "Invalid enum value 'dry'": lambda text: text.replace('"clear-noon"', '"dry"'),
+}
+
+
+@pytest.mark.parametrize("message", DAMAGE)
+def test_a_damaged_evaluation_is_refused_by_name(done, tmp_path, message):
+    evaluation = done[1]
+    evaluation.save(tmp_path, raster(MAGENTA))
+    path = tmp_path / "evaluation.json"
+    path.write_text(DAMAGE[message](path.read_text()))
+    with pytest.raises(EpisodeError, match=message):
+        Evaluation.load(tmp_path)

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
+from roadproof.calibration import Method
+from roadproof.controllers import load_controller
+from roadproof.datatypes import Weather
+from roadproof.drives import Swerve, Trajectories, Window, load_drives
+from roadproof.driving.evaluation import Evaluation
+from roadproof.errors import RoadproofError
+from roadproof.pipeline.budget import BUDGETS, Budget
+from roadproof.pipeline.selection import Selection
+from roadproof.pipeline.stress_test import STAGES, stress_test
+from roadproof.recordings import load_recordings
+from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.search_space import SearchSpace
+
+TINY = Budget(
+    objective=SteeringShift(),
+    method=GradOpt(iterations=3, restarts=2, halving=False),
+    trajectories=Trajectories(perturbation=Swerve((1.5,))),
+    window=Window(frames=4),
+    select=2,
+    weathers=(Weather.CLEAR_NOON,),
+    starts=0,
+    runs=0,
+)
+
+
+def run(town, folder, **options):
+    scenario = find_scenario("left-03", builtin_scenarios())
+    options = {"budget": TINY, "space": SearchSpace(figures=1), "controller_name": "pilotnet"} | options
+    return stress_test(town, load_controller("pilotnet"), scenario, folder, **options)
+
+
+@pytest.mark.slow
+def test_the_whole_loop_leaves_every_stage_in_its_folder(town, tmp_path):
+    check_folder(tmp_path / "run", run(town, tmp_path / "run"))
+    with pytest.raises(RoadproofError, match="other settings"):
+        run(town, tmp_path / "run", seed=1)
+
+
+def check_folder(folder, result):
+    assert [drive.name for drive in load_drives(folder / "record").drives] == ["clean", "right", "left"]
+    assert len(load_recordings(folder / "recordings").recordings) == 3
+    assert Selection.load(folder / "selection").driven == result.selection.driven
+    assert Evaluation.load(folder / "evaluation").trials == result.evaluation.trials
+    # Nine calls to calibrate at T = 3 by two paints, the clean drives included.
+    assert result.cost["record"].simulator_calls + result.cost["calibrate"].simulator_calls == 9
+    # The recorded clean drive is not driven again.
+    assert result.cost["select"].simulator_calls == 2
+    assert set(result.cost) == set(STAGES)
+    assert len(result.attack.candidates) == 4
+    shifts = [candidate.surrogate_shift for candidate in result.attack.candidates]
+    assert shifts == sorted(shifts, reverse=True)
+    # One of each group is driven, whichever the surrogate thinks stronger.
+    assert {each.group for each in result.selection.driven} == {"clean+right", "clean+left"}
+    deviations = [each.trial.deviation_m for each in result.selection.driven]
+    assert deviations[result.selection.chosen] == max(deviations)
+
+
+@pytest.mark.parametrize("processes", [0, 2])
+def test_processes_that_have_no_simulator_are_refused_before_anything_is_driven(town, tmp_path, processes):
+    with pytest.raises(RoadproofError, match=f"{processes} processes; expected 1, or more with a function"):
+        run(town, tmp_path / "run", processes=processes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_budgets_say_what_they_spend():
+    published = BUDGETS["published"]
+    assert published.trajectories.count == 3
+    assert published.method.restarts * published.method.steps(published.objective) == 1000
+    assert published.select == 0
+    assert BUDGETS["quick"].is_predicted
+    assert not BUDGETS["steering"].is_predicted
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"select": 2}, "select 2: as published it is 0"),
+        ({"objective": PathDeviation()}, "objective path deviation: as published it is steering shift"),
+        ({"calibration": Method.TWO_PAINT}, "calibration two-paint: as published it is published"),
+        ({"trajectories": Trajectories()}, "perturbation Swerve: as published it is SteeringNoise"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
+)
+def test_a_published_search_with_an_improvement_is_refused(change, message):
+    with pytest.raises(RoadproofError, match=message):
+        dataclasses.replace(BUDGETS["published"], **change)
