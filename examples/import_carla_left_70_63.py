@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from PIL import Image
 
+from roadproof import Push, Recording, RecordingSet, save_recordings
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.photometry import ColourFit, fit_colour, samples_from_pictures
-from roadproof.recorded.poses import placed
-from roadproof.recordings import Push, Recording, RecordingSet, save_recordings
+from roadproof.recorded import placed
 
 DRIVES = {"t1": Push.CLEAN, "t2": Push.RIGHT, "t3": Push.LEFT}
 DT_S = 0.1

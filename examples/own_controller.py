@@ -39,7 +39,7 @@ def main() -> None:
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own-controller")
     scenario = roadproof.find_scenario("straight-04", roadproof.builtin_scenarios())
     with roadproof.TownSimulator() as town:
-        result = roadproof.stress_test(town, LineFollower(), scenario, out, budget=roadproof.QUICK)
+        result = roadproof.stress_test(town, LineFollower(), scenario, out)
     for trial in result.evaluation.trials:
         print(
             f"{trial.weather}: {trial.deviation_m:.2f} m, {trial.points:.0f} points instead of {trial.clean_points:.0f}"

@@ -14,9 +14,12 @@ import numpy as np
 from PIL import Image
 
 import roadproof
+from roadproof.attacks import parse_groups
+from roadproof.geometry import CameraModel, CropResize, homography_from_points
+from roadproof.photometry import AffineResponse, ColourTransform
 
-CAMERA = roadproof.CameraModel(width_px=800, height_px=600, fov_deg=100.0)
-INPUT = roadproof.CropResize(left_px=0, top_px=115, right_px=800, bottom_px=510, width_px=200, height_px=88)
+CAMERA = CameraModel(width_px=800, height_px=600, fov_deg=100.0)
+INPUT = CropResize(left_px=0, top_px=115, right_px=800, bottom_px=510, width_px=200, height_px=88)
 CORNERS = np.array([[-0.5, -0.5], [399.5, -0.5], [399.5, 399.5], [-0.5, 399.5]])
 
 
@@ -34,14 +37,14 @@ def main() -> None:
         push=roadproof.Push.CLEAN,
         frames=np.stack([np.asarray(each.resize(size, Image.Resampling.BILINEAR)) for each in pictures]),
         frame_number=np.arange(count),
-        image_from_canvas=np.stack([roadproof.homography_from_points(CORNERS, row[:8].reshape(4, 2)) for row in table]),
+        image_from_canvas=np.stack([homography_from_points(CORNERS, row[:8].reshape(4, 2)) for row in table]),
         speed_mps=table[:, 8],
         command=np.full(count, 2),  # follow the lane
         steer=np.zeros(count),
     )
-    colour = roadproof.ColourTransform(roadproof.AffineResponse.identity())  # paint looks as it is; better: fit_colour
+    colour = ColourTransform(AffineResponse.identity())  # paint looks as it is; better: fit_colour
     recordings = roadproof.RecordingSet(camera=CAMERA, view=INPUT, colour=colour, recordings=(drive,))
-    groups = roadproof.parse_groups("all", recordings)
+    groups = parse_groups("all", recordings)
     result = roadproof.attack(recordings, controller, roadproof.SearchSpace(figures=3), groups=groups)
     result.save(out)
     print(f"{result.surrogate_shift:.3f} steer a frame, predicted; the pattern is {out / 'pattern.png'}")

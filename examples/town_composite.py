@@ -14,14 +14,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from roadproof.calibration import calibrate
-from roadproof.calibration.replays import Replays
-from roadproof.compositing import composite, view_canvas
-from roadproof.drives import Drive, Trajectories, Window, record
-from roadproof.patterns import raster
-from roadproof.scenarios import builtin_scenarios, find_scenario
-from roadproof.search_space import SearchSpace
-from roadproof.simulators.town.simulator import TownSimulator
+from roadproof import SearchSpace, TownSimulator, builtin_scenarios, calibrate, composite, find_scenario, record
+from roadproof.compositing import view_canvas
+from roadproof.drives import Drive, Trajectories, Window
+from roadproof.pipeline.fidelity import rendered_frames
 from roadproof.training.expert import expert
 
 SCENARIO = find_scenario("right-04", builtin_scenarios())
@@ -60,7 +56,7 @@ def main() -> None:
         drives = record(town, expert, SCENARIO, trajectories=Trajectories(count=1), window=Window(frames=60))
         recordings = calibrate(town, drives).recordings
         clean, drive = recordings.recordings[0], drives.drives[0]
-        painted = Replays(town, drives).frames(drive, "pattern", raster(pattern))
+        painted = rendered_frames(town, SCENARIO, drive.episode, pattern, drive.frame_number)
     seen = view_canvas(clean.frames, clean.image_from_canvas, recordings.view, recordings.colour, maps=clean.maps)
     composited = (255 * composite(pattern, seen)).round().byte().permute(0, 2, 3, 1).numpy()
     steps = approach(drive)

@@ -1,27 +1,53 @@
-"""The public names: all there, all typed, none forgotten."""
+"""The public names: all there, all typed, few enough for one screen."""
 
-import ast
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import roadproof
 
-
-def typed_names():
-    tree = ast.parse(Path(roadproof.__file__).read_text())
-    return {alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names} - {
-        None
-    }
+TYPED = re.findall(r"^from \S+ import (\w+) as \1$", Path(roadproof.__file__).with_suffix(".pyi").read_text(), re.M)
+TEXTS = [
+    path
+    for folder in ("README.md", "docs", "examples")
+    for place in [Path(__file__).parents[1] / folder]
+    for path in ([place] if place.is_file() else [*place.glob("*.md"), *place.glob("*.py")])
+]
 
 
 def test_every_public_name_can_be_used_and_is_typed():
-    names = set(dir(roadproof)) & typed_names()
-    assert names == typed_names()
+    names = set(dir(roadproof)) & set(TYPED)
+    assert names == set(TYPED)
     for name in names:
         assert getattr(roadproof, name) is not None
+
+
+def test_the_public_names_fit_on_one_screen():
+    assert 20 < len(TYPED) <= 30
+    assert len(set(TYPED)) == len(TYPED)
 
 
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         assert roadproof.nothing
+
+
+def test_importing_roadproof_loads_nothing_of_it():
+    code = "import sys, roadproof; dir(roadproof); print([name for name in sys.modules if name.startswith('roadproof.')])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
+def test_readme_docs_and_examples_use_public_names_and_documented_rooms_alone(path):
+    listed = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text()
+    rooms = set(re.findall(r"^\| `(roadproof\.[\w.]+)` \|", listed, re.M))
+    assert "roadproof.geometry" in rooms
+    text = path.read_text()
+    assert set(re.findall(r"^(?:from|import) (roadproof[\w.]*)", text, re.M)) <= rooms | {"roadproof"}
+    for name in re.findall(r"\broadproof\.(\w[\w.]*\w)", text):
+        room = f"roadproof.{name}" in rooms or f"roadproof.{name}".rpartition(".")[0] in rooms
+        assert room or name.split(".")[0] in TYPED, f"roadproof.{name}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import runpy
 import sys
@@ -13,7 +14,6 @@ import pytest
 from PIL import Image
 
 import needs
-import roadproof.pipeline.stress_test
 from references import approach
 from roadproof.attacks import GradOpt
 from roadproof.attacks.gradopt import Rung
@@ -22,6 +22,8 @@ from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.driving.evaluation import Evaluation
 from roadproof.geometry import apply_homography
+from roadproof.pipeline.budget import QUICK
+from roadproof.pipeline.stress_test import stress_test
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -55,7 +57,7 @@ def test_a_recording_of_ones_own_is_attacked(tmp_path, monkeypatch, capsys):
 def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys):
     needs.town()
     tiny = dataclasses.replace(
-        roadproof.QUICK,
+        QUICK,
         method=GradOpt(iterations=8, restarts=2, halving=False),
         trajectories=Trajectories(perturbation=Swerve((1.5,))),
         window=Window(frames=20, least_px=8),
@@ -63,7 +65,8 @@ def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys
         weathers=(Weather.CLEAR_NOON,),
         starts=0,
     )
-    monkeypatch.setattr(roadproof.pipeline.budget, "QUICK", tiny)
+    less = functools.partial(stress_test, budget=tiny)
+    monkeypatch.setattr("roadproof.pipeline.stress_test.stress_test", less)
     names = run("own_controller.py", tmp_path, monkeypatch=monkeypatch)
     check_controller(names["LineFollower"]()).require()
     (trial,) = Evaluation.load(tmp_path / "evaluation").trials

@@ -9,6 +9,7 @@ from roadproof.attacks.blackbox import BlackBox as BlackBox
 from roadproof.attacks.blackbox import GaussianProcess as GaussianProcess
 from roadproof.attacks.blackbox import RandomSearch as RandomSearch
 from roadproof.attacks.checks import Check as Check
+from roadproof.attacks.groups import parse_groups as parse_groups
 from roadproof.attacks.method import Method as Method
 from roadproof.attacks.methods import METHODS as METHODS
 from roadproof.attacks.methods import GradOpt as GradOpt

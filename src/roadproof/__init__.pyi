@@ -1,0 +1,32 @@
+from roadproof.attacks import attack as attack
+from roadproof.calibration import calibrate as calibrate
+from roadproof.compositing import composite as composite
+from roadproof.controllers import Controller as Controller
+from roadproof.controllers import CruiseControl as CruiseControl
+from roadproof.controllers import check_controller as check_controller
+from roadproof.controllers import load_controller as load_controller
+from roadproof.datatypes import Control as Control
+from roadproof.datatypes import Weather as Weather
+from roadproof.drives import record as record
+from roadproof.driving.evaluate import evaluate as evaluate
+from roadproof.driving.rollout import rollout as rollout
+from roadproof.errors import RoadproofError as RoadproofError
+from roadproof.patterns import Pattern as Pattern
+from roadproof.patterns import load_pattern as load_pattern
+from roadproof.patterns import save_pattern as save_pattern
+from roadproof.pipeline.budget import Budget as Budget
+from roadproof.pipeline.stress_test import stress_test as stress_test
+from roadproof.recorded import RecordedSimulator as RecordedSimulator
+from roadproof.recordings import Push as Push
+from roadproof.recordings import Recording as Recording
+from roadproof.recordings import RecordingSet as RecordingSet
+from roadproof.recordings import load_recordings as load_recordings
+from roadproof.recordings import save_recordings as save_recordings
+from roadproof.report.page import write_report as write_report
+from roadproof.scenarios import Scenario as Scenario
+from roadproof.scenarios import builtin_scenarios as builtin_scenarios
+from roadproof.scenarios import find_scenario as find_scenario
+from roadproof.search_space import SearchSpace as SearchSpace
+from roadproof.simulators.town.simulator import TownSimulator as TownSimulator
+
+__version__: str
