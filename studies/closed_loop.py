@@ -153,6 +153,7 @@ def _rows(cell: Cell, town: TownSimulator, controller: Controller, scenario: Sce
             space=SearchSpace(figures=cell.figures),
             seed=cell.seed,
             controller_name=cell.controller,
+            film=False,
         )
 
     def judge(name: str, pattern: Pattern, baseline: Sequence[Pattern] = ()) -> Evaluation:

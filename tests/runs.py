@@ -19,9 +19,9 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation, judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.film import Strip
 from roadproof.pipeline.selection import Driven, Selection
 from roadproof.recordings import Push, save_recordings
-from roadproof.report.film import Strip
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.search_space import SearchSpace

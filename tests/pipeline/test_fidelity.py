@@ -9,11 +9,18 @@ import torch
 import needs
 from paint_shy import PaintShy, just_before_the_canvas
 from roadproof.coverage import Shape
+from roadproof.datatypes import Weather
 from roadproof.driving.rollout import rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.patterns import Pattern
 from roadproof.photometry import ColourTransform, pixel_maps_from_two_paints
-from roadproof.pipeline.fidelity import Fidelity, compare_with_rendered, is_drive_of, rendered_frames
+from roadproof.pipeline.fidelity import (
+    Fidelity,
+    compare_with_rendered,
+    is_drive_of,
+    measure_fidelity,
+    rendered_frames,
+)
 from roadproof.recordings import Push, Recording, RecordingSet
 
 needs.town()
@@ -81,6 +88,18 @@ def test_it_is_known_which_drive_was_recorded(drive):
     episode, recordings, _ = drive
     assert is_drive_of(recordings.recordings[0], episode)
     assert not is_drive_of(recordings.recordings[0], dataclasses.replace(episode, speed_mps=episode.speed_mps + 1.0))
+
+
+def test_the_recorded_clean_drive_is_rendered_over_the_paint_and_kept(drive, town, tmp_path):
+    episode, recordings, rendered = drive
+    weather = Weather.CLEAR_NOON
+    found = measure_fidelity(town, PaintShy(), SHORT, PATTERN, recordings, tmp_path, weather=weather)
+    np.testing.assert_array_equal(found.rendered, rendered)
+    assert Fidelity.load(tmp_path / "fidelity.npz").agreement == found.agreement
+    other = dataclasses.replace(episode, speed_mps=episode.speed_mps + 1.0)
+    assert (
+        measure_fidelity(town, PaintShy(), SHORT, PATTERN, recordings, tmp_path, weather=weather, clean=other) is None
+    )
 
 
 def test_it_is_saved_and_loaded(drive, tmp_path):

@@ -50,7 +50,7 @@ def street(tmp_path_factory):
 
 def run(town, street, folder, budget, **options):
     space = SearchSpace(figures=2)
-    return stress_test(town, PaintShy(gain=30.0), street, folder, budget=budget, space=space, **options)
+    return stress_test(town, PaintShy(gain=30.0), street, folder, budget=budget, space=space, film=False, **options)
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,8 @@ def done(town, street, tmp_path_factory):
 
 def test_a_round_records_the_bare_road_where_the_attacked_car_went(done):
     folder, result, _ = done
+    assert result.fidelity is None
+    assert not list((folder / "evaluation").glob("film.*")), "nobody asked for a film"
     chosen = result.selection.driven[result.selection.chosen].trial
     (attacked,) = load_episodes(folder / "selection", [chosen.painted])
     drive = read_drive("round-1", folder / "round-1")
@@ -116,7 +118,7 @@ def test_what_is_done_is_not_done_again(done, town, street):
 
 def test_a_controller_that_was_trained_again_is_not_answered_from_what_the_one_before_left(done, town, street):
     with pytest.raises(RoadproofError, match="a run of another controller, which answers otherwise"):
-        stress_test(town, PaintShy(gain=1.0), street, done[0], budget=BUDGET, space=SearchSpace(figures=2))
+        stress_test(town, PaintShy(gain=1.0), street, done[0], budget=BUDGET, space=SearchSpace(figures=2), film=False)
 
 
 def test_a_round_that_cannot_be_calibrated_ends_them(done, town, street, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from roadproof.drives import Swerve, Trajectories, Window, load_drives
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.pipeline.budget import BUDGETS, Budget
+from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stress_test import STAGES, stress_test
 from roadproof.recordings import load_recordings
@@ -48,6 +49,10 @@ def check_folder(folder, result):
     assert len(load_recordings(folder / "recordings").recordings) == 3
     assert Selection.load(folder / "selection").driven == result.selection.driven
     assert Evaluation.load(folder / "evaluation").trials == result.evaluation.trials
+    assert (folder / "evaluation" / "film.jpg").exists()
+    kept = Fidelity.load(folder / "evaluation" / "fidelity.npz")
+    assert kept.agreement == result.fidelity.agreement
+    assert kept.agreement.elsewhere_error < 1.0, "rendered from the places of the recorded frames"
     # Nine calls to calibrate at T = 3 by two paints, the clean drives included.
     assert result.cost["record"].simulator_calls + result.cost["calibrate"].simulator_calls == 9
     # The recorded clean drive is not driven again.

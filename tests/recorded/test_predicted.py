@@ -16,9 +16,9 @@ from roadproof.driving.deviation import passage
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation, passage_deviation_m, path_of
 from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recorded.simulator import RecordedSimulator
-from roadproof.report.film import film_trial
 from roadproof.report.page import write_report
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.simulators.protocol import PaintKind

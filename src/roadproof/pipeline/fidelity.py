@@ -14,14 +14,14 @@ from roadproof.attacks.groups import Direction, Group
 from roadproof.compositing import composite, view_canvas
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
-from roadproof.datatypes import Control, Observation
+from roadproof.datatypes import Control, Observation, Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.arrays import read_record, write_archive
 from roadproof.patterns import Pattern
 from roadproof.photometry import AffineResponse, ColourTransform
-from roadproof.recordings import Recording, RecordingSet
+from roadproof.recordings import Push, Recording, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -30,19 +30,40 @@ FORMAT_VERSION = 1
 _ARRAYS = ("frame_number", "clean", "composited", "rendered", "clean_steer", "composited_steer", "rendered_steer")
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Agreement:
+    """How well composited frames stand for rendered ones of the same drive.
+
+    Args:
+        frames: how many frames were compared.
+        paint_error: the mean absolute difference in the paint, in 8-bit levels.
+        elsewhere_error: the same outside it, where both should show the bare road.
+        steer_error: the mean absolute difference between the controller's answers, in steer units.
+        predicted_shift: the mean shift of steering a frame that the composites predict; positive = right.
+        rendered_shift: the same on the rendered frames.
+    """
+
+    frames: int
+    paint_error: float
+    elsewhere_error: float
+    steer_error: float
+    predicted_shift: float
+    rendered_shift: float
+
+
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Fidelity:
     """One recorded drive three times: as it was, with a pattern composited in, and with the pattern really there.
 
     Args:
-        drive: its name.
-        frame_number: steps of the frames in their drive.
-        clean: frames without paint.
-        composited: the surrogate's.
-        rendered: the simulator's.
+        drive: the name of the recorded drive.
+        frame_number: the step of each frame in its drive.
+        clean: the frames without paint.
+        composited: the same with the pattern composited in: the surrogate's.
+        rendered: the same over the real paint: the simulator's.
         clean_steer: the controller's answers to the frames without paint; positive = right.
-        composited_steer: to the surrogate's: what it predicts.
-        rendered_steer: to the simulator's.
+        composited_steer: its answers to the surrogate's frames, which are what the search predicts.
+        rendered_steer: its answers to the simulator's frames.
         agreement: how close composited and rendered are.
     """
 
@@ -81,6 +102,51 @@ class Fidelity:
             raise EpisodeError(f"{path} is incomplete ({error!r}); evaluate again") from None
 
 
+def measure_fidelity(
+    simulator: Simulator,
+    controller: Controller,
+    scenario: Scenario,
+    pattern: Pattern,
+    recordings: RecordingSet,
+    folder: Path,
+    *,
+    weather: Weather,
+    clean: Episode | None = None,
+    device: torch.device | str = "cpu",
+) -> Fidelity | None:
+    """Render the clean drive of a set over the real paint, compare with composites, and keep what came of it.
+
+    Args:
+        simulator: an open simulator of the kind that the set was recorded in.
+        controller: who drove; it computes on `device`.
+        scenario: where the set was recorded.
+        pattern: what is painted.
+        recordings: the calibrated set.
+        folder: the folder of the evaluation, which gets fidelity.npz.
+        weather: the weather in which the set was recorded.
+        clean: the clean drive that was recorded; driven again where it is not given.
+        device: where to composite.
+
+    Returns:
+        The comparison; None where the set holds no clean drive, or one that this controller would not drive here.
+
+    Raises:
+        EpisodeError: no frame shows any of the paint.
+        OutputError: the folder cannot be written.
+    """
+    recorded = next((each for each in recordings.recordings if each.push is Push.CLEAN), None)
+    if recorded is None:
+        return None
+    if clean is None:
+        clean = rollout(simulator, controller, scenario, weather=weather)
+    if not is_drive_of(recorded, clean):
+        return None
+    rendered = rendered_frames(simulator, scenario, clean, pattern, recorded.frame_number)
+    fidelity = compare_with_rendered(pattern, recordings, controller, rendered, drive=recorded.name, device=device)
+    fidelity.save(folder / "fidelity.npz")
+    return fidelity
+
+
 def compare_with_rendered(
     pattern: Pattern,
     recordings: RecordingSet,
@@ -98,9 +164,9 @@ def compare_with_rendered(
     Args:
         pattern: what was painted.
         recordings: the calibrated set.
-        controller: on `device`.
+        controller: whose answers are compared; it computes on `device`.
         rendered: the simulator's frames over the paint, one for each of the drive's (`rendered_frames`).
-        drive: which of the set.
+        drive: the name of one drive of the set.
         device: where to composite.
 
     Raises:
@@ -119,24 +185,16 @@ def compare_with_rendered(
         frames = torch.as_tensor(rendered, device=device).permute(0, 3, 1, 2).float() / 255
         speed = torch.as_tensor(recorded.speed_mps, device=device, dtype=torch.float32)
         command = torch.as_tensor(recorded.command, device=device, dtype=torch.int64)
-        rendered_steer = steer_of(controller, frames, speed, command).float().cpu().numpy()
+        answers = steer_of(controller, frames, speed, command).float().cpu().numpy()
+    steer = {"clean_steer": shown.clean_steer, "composited_steer": shown.painted_steer, "rendered_steer": answers}
     return Fidelity(
         drive=drive,
         frame_number=recorded.frame_number,
         clean=recorded.frames,
         composited=shown.painted,
         rendered=rendered,
-        clean_steer=shown.clean_steer,
-        composited_steer=shown.painted_steer,
-        rendered_steer=rendered_steer,
-        agreement=agreement(
-            shown.painted,
-            rendered,
-            _covered(pattern, recordings, recorded),
-            clean_steer=shown.clean_steer,
-            composited_steer=shown.painted_steer,
-            rendered_steer=rendered_steer,
-        ),
+        agreement=agreement(shown.painted, rendered, _covered(pattern, recordings, recorded), **steer),
+        **steer,
     )
 
 
@@ -191,27 +249,6 @@ def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) ->
     return composite(white, dark)[:, 0].numpy() >= 0.5
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Agreement:
-    """How well composited frames stand for rendered ones of the same drive.
-
-    Args:
-        frames: how many were compared.
-        paint_error: mean absolute difference in the paint, in 8-bit levels.
-        elsewhere_error: the same outside it, where both should show the bare road.
-        steer_error: mean absolute difference of the controller's answers, in steer units.
-        predicted_shift: mean shift of steering a frame that the composites predict; positive = right.
-        rendered_shift: the shift on the rendered frames.
-    """
-
-    frames: int
-    paint_error: float
-    elsewhere_error: float
-    steer_error: float
-    predicted_shift: float
-    rendered_shift: float
-
-
 def agreement(
     composited: UInt8[np.ndarray, "f h w 3"],
     rendered: UInt8[np.ndarray, "f h w 3"],
@@ -227,9 +264,9 @@ def agreement(
         composited: recorded frames with the pattern composited in.
         rendered: the same frames with the pattern really there.
         paint: which pixels the pattern covers.
-        clean_steer: the controller's answers to the frames without paint.
-        composited_steer: to the composited ones.
-        rendered_steer: to the rendered ones.
+        clean_steer: the controller's answers to the frames without paint, in steer units.
+        composited_steer: its answers to the composited ones.
+        rendered_steer: its answers to the rendered ones.
 
     Raises:
         EpisodeError: no pixel shows paint.

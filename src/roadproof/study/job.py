@@ -299,6 +299,7 @@ def _searched(
         space=space_of(job),
         seed=job.seed,
         controller_name=job.controller,
+        film=False,
     )
     costs = [cost for stage, cost in found.cost.items() if stage != "evaluate"]
     return found, sum(cost.simulator_calls for cost in costs), sum(cost.seconds for cost in costs)

@@ -73,8 +73,9 @@ class Side:
 def run(world, folder, pattern=None):
     """The loop, and one pattern driven over, the loop's own by default."""
     controller = load_controller("pilotnet")
+    space = SearchSpace(figures=2)
     result = stress_test(
-        world, controller, SCENARIO, folder, budget=BUDGET, space=SearchSpace(figures=2), controller_name="pilotnet"
+        world, controller, SCENARIO, folder, budget=BUDGET, space=space, controller_name="pilotnet", film=False
     )
     pattern = result.selection.pattern if pattern is None else pattern
     recordings = load_recordings(folder / "recordings")

@@ -16,7 +16,7 @@ from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.patterns import Pattern
-from roadproof.report.film import EVENT_SHOWN_S, film_trial, told
+from roadproof.pipeline.film import EVENT_SHOWN_S, film_trial, last_event
 
 PATTERN = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
 
@@ -38,6 +38,6 @@ def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town
     stood_at = int(np.flatnonzero(drive.speed_mps > 0.1)[-1])
     assert stood_at + EVENT_SHOWN_S / drive.dt_s <= frames <= stood_at + EVENT_SHOWN_S / drive.dt_s + 3
     assert frames < len(drive) - 20
-    assert told(drive, frames - 2, frames) == ("", False)
-    assert told(drive, frames - 1, frames) == ("stands: time limit after 8 s", False)
-    assert told(drive, len(drive) - 1, len(drive)) == ("time limit", False)
+    assert last_event(drive, frames - 2, frames) == ("", False)
+    assert last_event(drive, frames - 1, frames) == ("stands: time limit after 8 s", False)
+    assert last_event(drive, len(drive) - 1, len(drive)) == ("time limit", False)

@@ -1,0 +1,207 @@
+"""Two drives side by side, without and with paint: a film small enough for a page, and pictures of the passage."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from roadproof.datatypes import Control, Observation
+from roadproof.driving.deviation import lateral_m, passage
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation, path_of
+from roadproof.driving.rollout import replay, rollout
+from roadproof.io.arrays import write_archive
+from roadproof.io.files import write_atomically
+from roadproof.io.video import can_film, film_file
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+FILM, POSTER, STRIP = "film.mp4", "film.jpg", "strip.npz"
+MOST_BYTES = 4_500_000
+"""The film may be so large: in base64 it is a third more, which makes a page of about 6 MB."""
+QUALITIES = (26, 30, 34, 38)
+
+VIEW = (640, 480)
+CAPTION_PX = 96
+STRIP_COLUMNS = 6
+STRIP_SIZE = (400, 300)
+STRIP_HORIZON_M = 14.0
+EVENT_SHOWN_S = 3.0
+STANDS_MPS = 0.1
+INK, PAPER, FAINT, CLEAN, PAINTED = (30, 33, 38), (250, 249, 246), (110, 114, 120), (36, 92, 168), (184, 58, 26)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Strip:
+    """Pictures of one passage over the canvas, at the same instants of both drives.
+
+    Args:
+        time_s: seconds since the start, of each picture.
+        lateral_m: how far the painted drive is beside the clean path then, in metres, left positive.
+        clean: camera pictures of the drive over the bare road.
+        painted: camera pictures of the drive over the paint.
+    """
+
+    time_s: Float[np.ndarray, " n"]
+    lateral_m: Float[np.ndarray, " n"]
+    clean: UInt8[np.ndarray, "n h w 3"]
+    painted: UInt8[np.ndarray, "n h w 3"]
+
+    def save(self, path: Path) -> None:
+        """Write one NumPy archive.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        write_archive(path, {name: getattr(self, name) for name in self.__slots__})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Side:
+    """One of the two drives: what the film says of it, and its camera pictures as JPEG, a tenth of the memory."""
+
+    title: str
+    colour: tuple[int, int, int]
+    episode: Episode
+    pictures: Sequence[bytes]
+
+    def last(self, step: int) -> int:
+        """The step whose picture is shown at a step; after the last picture, that one stays."""
+        return min(step, len(self.pictures) - 1)
+
+    def picture(self, step: int) -> Image.Image:
+        return Image.open(io.BytesIO(self.pictures[self.last(step)])).convert("RGB")
+
+
+def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage, folder: Path) -> bool:
+    """Drive the shown trial's two drives again, with the camera's full pictures, and keep film, poster and strip.
+
+    The drives are replayed from their controls, so they are the judged ones.
+
+    Args:
+        simulator: an open simulator of the kind that the evaluation used.
+        evaluation: the drives that were judged.
+        paint: the canvas as it was painted.
+        folder: the folder of the evaluation, which gets film.mp4, film.jpg and strip.npz.
+
+    Returns:
+        Whether there is a film; without PyAV (extra `video`) there are poster and strip alone.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    trial = evaluation.shown()
+    start = trial.start.of(evaluation.scenario)
+    clean, painted = load_episodes(folder, (trial.clean, trial.painted))
+    predicted = ", predicted" if painted.paint.predicted else ""
+    sides = (
+        _Side(f"without paint{predicted}", CLEAN, clean, _pictures(simulator, start, clean, None)),
+        _Side(f"with paint{predicted}", PAINTED, painted, _pictures(simulator, start, painted, paint)),
+    )
+    beside_m = lateral_m(path_of(clean), path_of(painted))
+    last = min(len(clean), len(painted)) - 1
+    seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
+    first, end = min(seen.start, last), min(seen.stop - 1, last)
+    steps: list[int] = sorted({round(first + (end - first) * k / (STRIP_COLUMNS - 1)) for k in range(STRIP_COLUMNS)})
+    bare, driven = (
+        np.stack([np.asarray(side.picture(k).resize(STRIP_SIZE, Image.Resampling.LANCZOS)) for k in steps])
+        for side in sides
+    )
+    Strip(time_s=painted.time_s[steps], lateral_m=beside_m[steps], clean=bare, painted=driven).save(folder / STRIP)
+    poster = _page(sides, beside_m, int(np.abs(beside_m[: last + 1]).argmax()))
+    write_atomically(folder / POSTER, lambda part: poster.save(part, format="JPEG", quality=82))
+    if not can_film():
+        return False
+    for quality in QUALITIES:
+        with film_file(folder / FILM, poster.size, clean.dt_s, quality=quality) as add:
+            for step in range(max(len(side.pictures) for side in sides)):
+                add(np.asarray(_page(sides, beside_m, step)))
+        if (folder / FILM).stat().st_size <= MOST_BYTES:
+            break
+    return True
+
+
+def _pictures(simulator: Simulator, start: Scenario, episode: Episode, paint: PatternImage | None) -> list[bytes]:
+    """The camera's pictures of a drive as JPEG.
+
+    A car that stands for good, at a rail until its time is up, say, is shown for a moment only.
+    """
+    kept: list[bytes] = []
+    moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
+    enough = int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s) if moving.size else 1
+
+    def keep(seen: Observation, _: Control | None) -> None:
+        file = io.BytesIO()
+        Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
+        kept.append(file.getvalue())
+
+    rollout(
+        simulator,
+        replay(episode),
+        start,
+        weather=episode.weather,
+        pattern=paint,
+        cars=episode.cars,
+        pedestrians=episode.pedestrians,
+        seed=episode.seed,
+        full_pictures=True,
+        on_step=keep,
+        until=lambda _: len(kept) >= enough,
+    )
+    return kept
+
+
+def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: int) -> Image.Image:
+    """One image of the film."""
+    large, small = _font(26), _font(19)
+    page = Image.new("RGB", (2 * VIEW[0], VIEW[1] + CAPTION_PX), PAPER)
+    pen = ImageDraw.Draw(page)
+    for left, side in zip((0, VIEW[0]), sides, strict=True):
+        k, episode = side.last(step), side.episode
+        page.paste(side.picture(k), (left, CAPTION_PX))
+        pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=side.colour)
+        pen.text((left + 20, 12), side.title, side.colour, large)
+        beside = f"{abs(beside_m[k]):.2f} m to the {'left' if beside_m[k] > 0 else 'right'}" if left else ""
+        state = f"{abs(3.6 * episode.speed_mps[k]):.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
+        pen.text((left + 20, 50), state, INK, small)
+        event, fresh = last_event(episode, k, len(side.pictures))
+        pen.text((left + VIEW[0] - 20, 14), event, PAINTED if fresh else FAINT, large, anchor="ra")
+    pen.line((VIEW[0], 0, VIEW[0], page.height), PAPER, 3)
+    return page
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    return cast("ImageFont.FreeTypeFont", ImageFont.load_default(size))
+
+
+def last_event(episode: Episode, step: int, shown: int) -> tuple[str, bool]:
+    """What a drive's caption says at a step.
+
+    Args:
+        episode: the drive.
+        step: counted from its start.
+        shown: how many of its steps the film shows.
+
+    Returns:
+        An event of the last three seconds, and True; else, with the last picture, how the drive ends, and False; else
+        nothing, and False.
+    """
+    now_s = float(episode.time_s[step])
+    for event in reversed(episode.events):
+        if 0 <= now_s - event.time_s < EVENT_SHOWN_S:
+            return event.kind.replace("-", " "), True
+    if step < shown - 1:
+        return "", False
+    if shown == len(episode):
+        return str(episode.ending), False
+    return f"stands: {episode.ending} after {episode.time_s[-1]:.0f} s", False

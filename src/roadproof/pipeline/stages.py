@@ -1,0 +1,206 @@
+"""The stages of a stress test, each of which goes on from what its folder holds (`pipeline.stress_test`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from roadproof.attacks import AttackResult, attack, kept_attack, parse_groups
+from roadproof.attacks.groups import Group
+from roadproof.calibration import Calibrated, calibrate, replays_needed
+from roadproof.controllers import Controller
+from roadproof.drives import Drives, record
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.evaluate import Opening, evaluate
+from roadproof.driving.evaluation import Evaluation
+from roadproof.errors import EpisodeError
+from roadproof.patterns import Pattern, raster
+from roadproof.pipeline.budget import Budget
+from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
+from roadproof.pipeline.film import film_trial
+from roadproof.pipeline.prediction import Prediction, predict
+from roadproof.pipeline.rerecording import Rounds, search_on
+from roadproof.pipeline.selection import Selection, select_by_driving
+from roadproof.recordings import Push, RecordingSet
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import Simulator
+
+OnProgress: TypeAlias = Callable[[str, int, int, str], object]
+"""Called with the name of a stage, how many of its steps are done, how many there are, and a word on the last one."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Stages:
+    """The stages of one run; its fields are the arguments of `stress_test`."""
+
+    simulator: Simulator
+    controller: Controller
+    scenario: Scenario
+    folder: Path
+    budget: Budget
+    space: SearchSpace
+    seed: int
+    controller_name: str
+    device: str
+    another: Opening | None
+    processes: int
+    on_progress: OnProgress
+
+    def record(self, number: int) -> Drives:
+        """The drives past the bare canvas in one of the weathers."""
+        budget, wanted = self.budget, self.budget.trajectories
+        total = wanted.count * len(budget.recorded_in)
+        return record(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            weather=budget.recorded_in[number],
+            trajectories=wanted,
+            window=budget.window,
+            seed=self.seed,
+            driver_name=self.controller_name,
+            folder=self._folder_of(number) / "record",
+            on_drive=lambda done: self.on_progress("Recording", number * wanted.count + done, total, ""),
+        )
+
+    def calibrate(self, number: int, drives: Drives) -> RecordingSet:
+        """Those drives, calibrated."""
+        place, each = self._folder_of(number), replays_needed(drives, self.budget.calibration)
+        done, total = Calibrated.load(place), each * len(self.budget.recorded_in)
+        if done is None:
+            done = calibrate(
+                self.simulator,
+                drives,
+                self.budget.calibration,
+                folder=place / "calibration",
+                on_call=lambda made: self.on_progress("Calibrating", number * each + made, total, ""),
+            )
+            done.save(place)
+        return done.recordings
+
+    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+        """The method's own groups where drives were pushed to both sides, else all drives pooled."""
+        sides = {Push.LEFT, Push.RIGHT} <= {recording.push for recording in recordings.recordings}
+        whole = self.budget.pooled or not sides
+        return parse_groups("all", recordings) if whole else self.budget.method.groups(recordings)
+
+    def attack(self, recordings: RecordingSet) -> AttackResult:
+        """The search for patterns."""
+        budget = self.budget
+        steps = budget.method.steps(budget.objective)
+        return kept_attack(
+            self.folder / "attack",
+            lambda checkpoint: attack(
+                recordings,
+                self.controller,
+                self.space,
+                objective=budget.objective,
+                method=budget.method,
+                groups=self.groups(recordings),
+                seed=self.seed,
+                device=self.device,
+                checkpoint=checkpoint,
+                on_step=lambda step, best: self.on_progress("Searching", step, steps, f"{best:.2f}"),
+            ),
+        )
+
+    def select(self, found: AttackResult, drives: Drives) -> Selection:
+        """The drives over what was found, once each."""
+        total = 1 + min(self.budget.select, len(found.candidates))
+        return select_by_driving(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            found.candidates,
+            best=self.budget.select,
+            weather=self.budget.recorded_in[0],
+            folder=self.folder / "selection",
+            # The simulator repeats itself, so the recorded clean drive is the one to compare with.
+            clean=drives.drives[0].episode,
+            on_drive=lambda done, best: self.on_progress("Verifying by driving", done, total, f"{best:.2f} m"),
+        )
+
+    def search_on(self, drives: Drives, recordings: RecordingSet, found: AttackResult, selection: Selection) -> Rounds:
+        """The re-recording rounds."""
+        return search_on(
+            self.simulator,
+            self.controller,
+            drives,
+            recordings,
+            self.groups(recordings),
+            found,
+            selection,
+            objective=self.budget.objective,
+            rounds=self.budget.rounds,
+            best=self.budget.select,
+            method=self.budget.calibration,
+            folder=self.folder,
+            device=self.device,
+            on_step=lambda done, total, word: self.on_progress("Searching on", done, total, word),
+        )
+
+    def predict(
+        self, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None
+    ) -> Prediction | None:
+        """The predicted path of the chosen pattern beside the one driven over it; kept with the run."""
+        chosen = selection if rounds is None else rounds.best
+        if chosen is None or not self.budget.is_predicted:
+            return None
+        path = self.folder / "prediction.npz"
+        if path.exists():
+            return Prediction.load(path)
+        done = enumerate(() if rounds is None else rounds.done, 1)
+        number = next((k for k, each in done if each.selection is chosen), 0)
+        place = self.folder / f"round-{number}" if number else self.folder
+        trial = chosen.driven[chosen.chosen].trial
+        clean, painted = load_episodes(place / "selection", (trial.clean, trial.painted))
+        prediction = predict(recordings, self.controller, pattern, clean, painted, device=self.device)
+        prediction.save(path)
+        return prediction
+
+    def evaluate(self, pattern: Pattern) -> Evaluation:
+        """The drives over the chosen pattern that say how bad it is."""
+        return evaluate(
+            self.another if self.another and self.processes > 1 else self.simulator,
+            self.controller,
+            self.scenario,
+            pattern,
+            folder=self.folder / "evaluation",
+            driver_name=self.controller_name,
+            weathers=self.budget.weathers,
+            starts=self.budget.starts,
+            start_range=self.budget.start_range,
+            runs=self.budget.runs,
+            seed=self.seed,
+            processes=self.processes,
+            on_drive=lambda done, total: self.on_progress("Evaluating", done, total, ""),
+        )
+
+    def film(
+        self, evaluation: Evaluation, pattern: Pattern, drives: Drives, recordings: RecordingSet
+    ) -> Fidelity | None:
+        """What the report shows of driving: two drives as a film, and composites beside renders."""
+        folder = self.folder / "evaluation"
+        film_trial(self.simulator, evaluation, raster(pattern), folder)
+        try:
+            return measure_fidelity(
+                self.simulator,
+                self.controller,
+                self.scenario,
+                pattern,
+                recordings,
+                folder,
+                weather=drives.settings.weather,
+                clean=drives.drives[0].episode,
+                device=self.device,
+            )
+        except EpisodeError:
+            # No recorded frame shows any of the paint: there is nothing to compare.
+            return None
+
+    def _folder_of(self, number: int) -> Path:
+        """Where the drives of a weather are."""
+        return self.folder / self.budget.recorded_in[number] if number else self.folder
