@@ -36,7 +36,7 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 def test_importing_roadproof_loads_nothing_of_it():
-    code = "import sys, roadproof; dir(roadproof); print([name for name in sys.modules if name.startswith('roadproof.')])"
+    code = "import sys, roadproof; dir(roadproof); print([n for n in sys.modules if n.startswith('roadproof.')])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "[]\n"
 

@@ -9,8 +9,8 @@ from roadproof.driving.evaluation import path_of
 from roadproof.driving.intervals import Mean
 from roadproof.patterns import raster
 from roadproof.report import charts
+from roadproof.report.formatting import mean_in_words
 from roadproof.report.top_view import top_view
-from roadproof.report.words import mean_in_words
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from runs import CRASH, PATTERN, driven
 

@@ -10,7 +10,8 @@ from roadproof.scenarios import builtin_scenarios
 pytest.importorskip("av", reason="films need the extra roadproof[video]")
 import av
 
-from roadproof.report.video import ABOVE_PX, DriveVideo
+from roadproof.io.video import film_file
+from roadproof.report.video import ABOVE_PX, SIZE, DriveView
 from roadproof.roads.maps import load_map, scenario_route
 
 SCENARIO = builtin_scenarios()[0]
@@ -37,9 +38,10 @@ def observation(time_s=0.0, x_m=None, picture=True, events=()):
 
 def test_a_film_has_as_many_frames_as_observations_and_their_speed(tmp_path, parts):
     path = tmp_path / "drive.mp4"
-    with DriveVideo(path, **parts, dt_s=0.05) as film:
+    view = DriveView(**parts)
+    with film_file(path, SIZE, 0.05) as add:
         for i in range(12):
-            film.add(observation(0.05 * i, SCENARIO.start.x_m + 0.3 * i), Control(0.1, throttle=0.4))
+            add(view.compose(observation(0.05 * i, SCENARIO.start.x_m + 0.3 * i), Control(0.1, throttle=0.4)))
         assert not path.exists()
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
@@ -51,14 +53,14 @@ def test_a_film_has_as_many_frames_as_observations_and_their_speed(tmp_path, par
     assert [p.name for p in tmp_path.iterdir()] == ["drive.mp4"]
 
 
-def test_the_frame_is_shown_where_there_is_no_picture(tmp_path, parts):
-    film = DriveVideo(tmp_path / "x.mp4", **parts)
+def test_the_frame_is_shown_where_there_is_no_picture(parts):
+    film = DriveView(**parts)
     page = film.compose(observation(picture=False), Control(0.0))
     assert np.abs(page[100:500, 100:700].astype(int) - 90).max() <= 1
 
 
-def test_the_bars_follow_the_controls(tmp_path, parts):
-    film = DriveVideo(tmp_path / "x.mp4", **parts)
+def test_the_bars_follow_the_controls(parts):
+    film = DriveView(**parts)
 
     def blue(steer):
         page = film.compose(observation(), Control(steer)).astype(int)
@@ -71,11 +73,11 @@ def test_the_bars_follow_the_controls(tmp_path, parts):
     assert blue(-1.0)[0] <= 1
 
 
-def test_the_map_shows_the_pattern_where_the_canvas_lies(tmp_path, parts):
+def test_the_map_shows_the_pattern_where_the_canvas_lies(parts):
     pattern = np.zeros((400, 400, 4), np.uint8)
     pattern[:200] = (255, 0, 255, 255)  # the far half
     canvas = SCENARIO.canvas
-    film = DriveVideo(tmp_path / "x.mp4", **parts, pattern=pattern)
+    film = DriveView(**parts, pattern=pattern)
     page = film.compose(dataclasses.replace(observation(), state=VehicleState(
         canvas.x_m, canvas.y_m - 20.0, 0.0, 0.0, 0.0)), Control(0.0)).astype(int)  # fmt: skip
     magenta = np.argwhere(np.abs(page[:ABOVE_PX, 800:] - (255, 0, 255)).max(axis=-1) < 40)
@@ -87,8 +89,8 @@ def test_the_map_shows_the_pattern_where_the_canvas_lies(tmp_path, parts):
     assert len(magenta) == pytest.approx(36 * canvas.width_m * canvas.length_m / 2, rel=0.12)
 
 
-def test_events_are_written_out(tmp_path, parts):
-    plain, eventful = (DriveVideo(tmp_path / "x.mp4", **parts) for _ in range(2))
+def test_events_are_written_out(parts):
+    plain, eventful = (DriveView(**parts) for _ in range(2))
     event = Event(EventKind.SIDEWALK, 0.0, "a wheel on the sidewalk")
     difference = eventful.compose(observation(events=(event,)), Control(0.0)) != plain.compose(
         observation(), Control(0.0)
@@ -99,12 +101,20 @@ def test_events_are_written_out(tmp_path, parts):
 
 
 def test_an_error_leaves_no_film(tmp_path, parts):
-    with pytest.raises(ZeroDivisionError), DriveVideo(tmp_path / "x.mp4", **parts) as film:
-        film.add(observation(), Control(0.0))
+    with pytest.raises(ZeroDivisionError), film_file(tmp_path / "x.mp4", SIZE, 0.05) as add:
+        add(DriveView(**parts).compose(observation(), Control(0.0)))
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_wrong_name_is_refused(tmp_path, parts):
-    with pytest.raises(OutputError, match=r"expected a name that ends in \.mp4"):
-        DriveVideo(tmp_path / "x.avi", **parts)
+def test_a_wrong_name_is_refused(tmp_path):
+    refused = pytest.raises(OutputError, match=r"expected a name that ends in \.mp4")
+    with refused, film_file(tmp_path / "x.avi", SIZE, 0.05):
+        pass
+
+
+def test_a_film_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    refused = pytest.raises(OutputError, match=r"the film cannot be written to .*; choose another place")
+    with refused, film_file(tmp_path / "file" / "x.mp4", SIZE, 0.05):
+        pass

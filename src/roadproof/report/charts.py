@@ -18,14 +18,14 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from roadproof.datatypes import Event
 from roadproof.driving.deviation import HORIZON_M, lateral_m
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import path_of
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
-from roadproof.report.words import in_words
+from roadproof.report.formatting import in_words
+from roadproof.report.plots import LINE_STYLES, draw_search, in_units
 
 VARIABLES = {
     "ink": "#010101",
@@ -47,9 +47,7 @@ INK, MUTED, RULE, CLEAN, PAINTED, PREDICTED, CANVAS = list(VARIABLES.values())[:
 SERIES = (PAINTED, PREDICTED, VARIABLES["third"], VARIABLES["fourth"])
 
 WIDTH_IN, HEIGHT_IN = 5.2, 3.0
-_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 BEHIND_M = 20.0
-_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +55,8 @@ class Chart:
     """One picture and its words.
 
     Args:
-        svg: to be put into the page as it is.
-        caption: what it shows.
+        svg: the picture, to be put into the page as it is.
+        caption: the sentences below it.
     """
 
     svg: Markup
@@ -69,9 +67,9 @@ def svg_of(figure: Figure, name: str, description: str) -> Markup:
     """A figure as an SVG element for a page.
 
     Args:
-        figure: drawn in stand-in colours (`VARIABLES`).
-        name: makes its inner names differ from those of the page's other charts.
-        description: read out instead of the picture.
+        figure: the figure, drawn in stand-in colours (`VARIABLES`).
+        name: a word that makes its inner names differ from those of the page's other charts.
+        description: what is read out instead of the picture.
     """
     out = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "text.parse_math": False}):
@@ -99,15 +97,13 @@ def metres_past(episode: Episode, canvas: CanvasPlacement) -> Float[np.ndarray, 
 
 def steering(clean: Episode, painted: Episode, fidelity: Fidelity | None, canvas: CanvasPlacement) -> Chart:
     """Steering of the clean drive, what the surrogate predicts, and what the car did over the paint."""
-    figure, axes = _axes("metres past the canvas’ near edge", "steering (right > 0)")
-    _mark_canvas(axes, canvas)
+    figure, axes = _past_canvas("steering (right > 0)", canvas)
     at, predicted = metres_past(clean, canvas), painted.paint.predicted
-    for episode, colour, style, label in (
-        (clean, CLEAN, _STYLES[0], "bare road"),
-        (painted, PAINTED, _STYLES[0], "over the paint, predicted" if predicted else "driven over the paint"),
+    for episode, colour, label in (
+        (clean, CLEAN, "bare road"),
+        (painted, PAINTED, "over the paint, predicted" if predicted else "driven over the paint"),
     ):
-        where = metres_past(episode, canvas)[:-1]
-        axes.plot(where, episode.steer, color=colour, linewidth=1.8, linestyle=style, label=label)
+        axes.plot(metres_past(episode, canvas)[:-1], episode.steer, color=colour, linewidth=1.8, label=label)
     words = "Steering without paint and over it"
     if fidelity is not None:
         steps = fidelity.frame_number
@@ -118,15 +114,12 @@ def steering(clean: Episode, painted: Episode, fidelity: Fidelity | None, canvas
         ):
             axes.plot(at[steps[kept]], values[kept], style, color=PREDICTED, markersize=3.6, label=label)
         words += ", and what the surrogate predicts along the clean path"
-    axes.set_xlim(-HORIZON_M - 2, canvas.length_m + BEHIND_M)
-    _legend(axes, columns=2)
-    return Chart(svg_of(figure, "steering", words), words + ". The shaded stretch is the canvas.")
+    return _finished(figure, axes, "steering", words, until_m=canvas.length_m + BEHIND_M)
 
 
 def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacement) -> Chart:
     """How far beside the clean path the car was over the paint: a colour a weather, a line a start."""
-    figure, axes = _axes("metres past the canvas’ near edge", "metres right of the clean path")
-    _mark_canvas(axes, canvas)
+    figure, axes = _past_canvas("metres right of the clean path", canvas)
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     names = list(dict.fromkeys(name for name, _, _ in drives))
     width = 1.8 if len(drives) == len(names) else 1.1
@@ -135,54 +128,38 @@ def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacem
         beside = -lateral_m(path_of(clean), path_of(painted))
         k, label = names.index(name), labels.pop(name, None)
         where, colour = metres_past(painted, canvas), SERIES[k % len(SERIES)]
-        axes.plot(where, beside, color=colour, linestyle=_STYLES[k % 4], linewidth=width, label=label)
-    axes.set_xlim(-HORIZON_M - 2, None)
-    _legend(axes, columns=2)
+        axes.plot(where, beside, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=width, label=label)
     predicted = any(painted.paint.predicted for _, _, painted in drives)
     words = f"Distance from the clean path along the drive, alone on the road{', predicted' if predicted else ''}"
-    return Chart(svg_of(figure, "offsets", words), words + ". The shaded stretch is the canvas.")
+    return _finished(figure, axes, "offsets", words)
 
 
 def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
     """The chosen pattern's predicted path beside the one that was driven."""
-    figure, axes = _axes("metres past the canvas’ near edge", "metres right of the clean path")
-    _mark_canvas(axes, canvas)
+    figure, axes = _past_canvas("metres right of the clean path", canvas)
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     ahead = np.array([math.cos(canvas.yaw_rad), math.sin(canvas.yaw_rad)])
     for path, label, colour, style in (
-        (prediction.predicted_xy, "predicted in the recorded world", PREDICTED, _STYLES[1]),
-        (prediction.driven_xy, "driven", PAINTED, _STYLES[0]),
+        (prediction.predicted_xy, "predicted in the recorded world", PREDICTED, LINE_STYLES[1]),
+        (prediction.driven_xy, "driven", PAINTED, LINE_STYLES[0]),
     ):
         where = (path - (canvas.x_m, canvas.y_m)) @ ahead + canvas.length_m / 2
         beside = -lateral_m(prediction.clean_xy, path)
         axes.plot(where, beside, color=colour, linestyle=style, linewidth=1.8, label=label)
-    axes.set_xlim(-HORIZON_M - 2, None)
-    _legend(axes, columns=1)
     words = (
         f"Where the recorded world said the pattern takes the car, and where it went: deviation "
         f"{prediction.predicted_m:.2f} m predicted, {prediction.driven_m:.2f} m driven"
     )
-    return Chart(svg_of(figure, "foretold", words), words + ". The shaded stretch is the canvas.")
+    return _finished(figure, axes, "foretold", words, columns=1)
 
 
 def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], objective: str) -> Chart:
     """The search: every start thin, the best so far of each group bold."""
-    figure, axes = _axes("iteration", f"{objective}, {_UNITS.get(objective, 'its own unit')}")
-    steps = np.arange(1, len(history) + 1)
-    for k, name in enumerate(groups):
-        colour = SERIES[k % len(SERIES)]
-        axes.plot(steps, history[:, k], color=colour, alpha=0.35, linewidth=0.8)
-        best = np.maximum.accumulate(history[:, k].max(axis=1))
-        axes.plot(steps, best, color=colour, linestyle=_STYLES[k % 4], linewidth=2.0, label=f"best of {name}")
-    axes.axhline(0.0, color=MUTED, linewidth=0.6)
+    figure, axes = _axes("iteration", in_units(objective))
+    draw_search(axes, history, groups, SERIES, MUTED)
     _legend(axes, columns=1)
     words = "What the search gained on composited frames, every start and the best of each group"
     return Chart(svg_of(figure, "search", words), words + ".")
-
-
-def told(events: Sequence[Event]) -> list[tuple[str, str, str]]:
-    """Events as time, kind and detail in words."""
-    return [(f"{event.time_s:.1f} s", in_words(event.kind), event.detail) for event in events]
 
 
 def _axes(x: str, y: str) -> tuple[Figure, Axes]:
@@ -199,8 +176,19 @@ def _axes(x: str, y: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _mark_canvas(axes: Axes, canvas: CanvasPlacement) -> None:
+def _past_canvas(y: str, canvas: CanvasPlacement) -> tuple[Figure, Axes]:
+    """Axes over the metres driven past the canvas, which is shaded."""
+    figure, axes = _axes("metres past the canvas’ near edge", y)
     axes.axvspan(0.0, canvas.length_m, color=CANVAS, alpha=0.16, linewidth=0)
+    return figure, axes
+
+
+def _finished(
+    figure: Figure, axes: Axes, name: str, words: str, *, until_m: float | None = None, columns: int = 2
+) -> Chart:
+    axes.set_xlim(-HORIZON_M - 2, until_m)
+    _legend(axes, columns=columns)
+    return Chart(svg_of(figure, name, words), words + ". The shaded stretch is the canvas.")
 
 
 def _legend(axes: Axes, *, columns: int) -> None:

@@ -4,21 +4,51 @@ from __future__ import annotations
 
 import base64
 import io
+import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
+import numpy as np
+from jaxtyping import UInt8
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
+
+from roadproof.report.formatting import aside_in_words, in_words, mean_in_words, range_in_words, spread_in_words
 
 
 def environment() -> Environment:
     """The templates of pages. Everything shown is escaped; a name that is not there is an error."""
-    return Environment(
+    templates = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    filters: dict[str, Callable[..., object]] = {
+        "aside": aside_in_words,
+        "data": _data,
+        "degrees": math.degrees,
+        "form": format,
+        "jpeg": partial(_picture, kind="JPEG"),
+        "mean": mean_in_words,
+        "png": partial(_picture, kind="PNG"),
+        "range": range_in_words,
+        "spread": spread_in_words,
+        "words": in_words,
+    }
+    cast("dict[str, Any]", templates.filters).update(filters)
+    return templates
+
+
+def _data(content: bytes, kind: str) -> str | None:
+    return data_url(kind, content)
+
+
+def _picture(pixels: UInt8[np.ndarray, "h w 3"], *, kind: str) -> str:
+    return encoded(Image.fromarray(pixels), kind)
 
 
 def encoded(image: Image.Image, kind: str) -> str:

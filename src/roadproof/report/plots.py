@@ -1,4 +1,4 @@
-"""Plots of an attack, drawn without a screen and without global state."""
+"""Pictures of an attack, drawn without a screen and without global state."""
 
 from __future__ import annotations
 
@@ -6,90 +6,93 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from roadproof.attacks import AttackResult, ShownDrive
 from roadproof.io.files import write_atomically
 
-_SIDES = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
+LINE_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
+_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m"}
+_COLOURS = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
 _INK = "#222222"
 
 
-def search_curves(history: Float[np.ndarray, "i g r"], groups: Sequence[str], path: Path) -> None:
-    """Divergence against iterations: every restart thin, the best so far of each group bold.
+def draw_attack(result: AttackResult, shown: Sequence[ShownDrive], folder: Path) -> None:
+    """Draw the search as search.png, and every drive of the winner's group as film-DRIVE.png.
 
     Args:
-        history: mean steering shift a frame at every iteration, group and restart.
-        groups: their names.
-        path: the PNG to write.
+        result: what the attack found.
+        shown: those drives without and with the pattern (`attacks.show_pattern`).
+        folder: where the pictures go.
 
     Raises:
-        OutputError: the picture cannot be written.
+        OutputError: a picture cannot be written.
     """
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    steps = np.arange(1, len(history) + 1)
-    for index, (name, colour) in enumerate(zip(groups, _SIDES, strict=False)):
-        axes.plot(steps, history[:, index], color=colour, alpha=0.3, linewidth=0.8)
-        best = np.maximum.accumulate(history[:, index].max(axis=1))
-        axes.plot(steps, best, color=colour, linewidth=2.2, label=f"{name}: {best[-1]:.2f}")
-    axes.axhline(0.0, color=_INK, linewidth=0.6)
+    draw_search(axes, result.history, tuple(result.by_group), _COLOURS)
     axes.set_xlabel("iteration")
-    axes.set_ylabel("mean steering shift a frame\n(surrogate, steer units)")
-    axes.legend(frameon=False, title="best of each group")
+    axes.set_ylabel(in_units(result.objective))
+    axes.legend(frameon=False)
     _finish(axes)
-    save(figure, path)
+    save(figure, folder / "search.png")
+    for drive in shown:
+        save(_film_strip(drive), folder / f"film-{drive.name}.png")
 
 
-def film_strip(
-    clean: UInt8[np.ndarray, "f h w 3"],
-    painted: UInt8[np.ndarray, "f h w 3"],
-    clean_steer: Float[np.ndarray, " f"],
-    painted_steer: Float[np.ndarray, " f"],
-    path: Path,
-    *,
-    title: str,
-    columns: int = 6,
+def draw_search(
+    axes: Axes, history: Float[np.ndarray, "i g r"], groups: Sequence[str], colours: Sequence[str], ink: str = _INK
 ) -> None:
-    """Clean frames above, the same with the pattern below, and what the controller answers to every frame.
+    """Draw what a search gained: every start thin, the best so far of each group bold.
 
     Args:
-        clean: recorded frames of one drive.
-        painted: the same, composited.
-        clean_steer: the controller's answers to them; positive = right.
-        painted_steer: its answers to the composited ones.
-        path: the PNG to write.
-        title: a line above.
-        columns: frames shown, spread evenly over the drive.
-
-    Raises:
-        OutputError: the picture cannot be written.
+        axes: the axes to draw on.
+        history: the value of the objective at every iteration, of every group and start.
+        groups: the names of the groups.
+        colours: the colours of the groups, in turn.
+        ink: the colour of the line at zero.
     """
-    shown = np.unique(np.linspace(0, len(clean) - 1, min(columns, len(clean))).round().astype(int))
+    steps = np.arange(1, len(history) + 1)
+    for k, name in enumerate(groups):
+        colour = colours[k % len(colours)]
+        axes.plot(steps, history[:, k], color=colour, alpha=0.35, linewidth=0.8)
+        best = np.maximum.accumulate(history[:, k].max(axis=1))
+        label = f"best of {name}: {best[-1]:.2f}"
+        axes.plot(steps, best, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=2.0, label=label)
+    axes.axhline(0.0, color=ink, linewidth=0.6)
+
+
+def in_units(objective: str) -> str:
+    """The name of an objective with its unit, as an axis shows it."""
+    return f"{objective}, {_UNITS.get(objective, 'its own unit')}"
+
+
+def _film_strip(drive: ShownDrive, columns: int = 6) -> Figure:
+    """Clean frames above, the same with the pattern below, and what the controller answers to every frame."""
+    shown = np.unique(np.linspace(0, len(drive.clean) - 1, columns).round().astype(int))
+    rows = (("clean", drive.clean, drive.clean_steer), ("painted", drive.painted, drive.painted_steer))
     figure = Figure(figsize=(2.3 * len(shown) + 0.6, 4.6), layout="constrained")
+    title = f"{drive.name}: predicted steering on composited frames, mean shift {drive.mean_shift:+.2f}"
     figure.suptitle(title, fontsize=11)
     grid = figure.add_gridspec(3, len(shown), height_ratios=(1, 1, 1.5))
     for column, frame in enumerate(shown):
-        for row, (pictures, steer) in enumerate(((clean, clean_steer), (painted, painted_steer))):
+        for row, (name, pictures, steer) in enumerate(rows):
             axes = figure.add_subplot(grid[row, column])
             axes.imshow(pictures[frame], interpolation="nearest")
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.set(xticks=[], yticks=[], ylabel="" if column else name)
             axes.set_title(f"frame {frame}: steer {steer[frame]:+.2f}", fontsize=8)
-            if column == 0:
-                axes.set_ylabel(("clean", "painted")[row])
     axes = figure.add_subplot(grid[2, :])
-    frames = np.arange(len(clean))
-    axes.plot(frames, clean_steer, color=_INK, label="clean")
-    axes.plot(frames, painted_steer, color=_SIDES[1], linewidth=2, label="painted")
-    axes.fill_between(frames, clean_steer, painted_steer, color=_SIDES[1], alpha=0.15)
+    frames = np.arange(len(drive.clean))
+    axes.plot(frames, drive.clean_steer, color=_INK, label="clean")
+    axes.plot(frames, drive.painted_steer, color=_COLOURS[1], linewidth=2, label="painted")
+    axes.fill_between(frames, drive.clean_steer, drive.painted_steer, color=_COLOURS[1], alpha=0.15)
     axes.axhline(0.0, color=_INK, linewidth=0.6)
-    axes.set_xlabel("frame with the canvas in view")
-    axes.set_ylabel("steer (right > 0)")
+    axes.set(xlabel="frame with the canvas in view", ylabel="steer (right > 0)")
     axes.legend(frameon=False)
     _finish(axes)
-    save(figure, path)
+    return figure
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -6,7 +6,7 @@ RUN/attack/                    what the attack found (`roadproof.attacks`)
 RUN/selection/                 optional: its candidates, driven (`pipeline.selection`)
 RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.pipeline.rerecording`)
 RUN/evaluation/                what driving over it showed (`driving.evaluation`)
-RUN/prediction.npz             optional: the path foretold beside the driven one (`pipeline.prediction`)
+RUN/prediction.npz             optional: the predicted path beside the driven one (`pipeline.prediction`)
 RUN/pattern.json               optional: the pattern that was chosen in the end
 RUN/run.json                   optional: what the stages took (`roadproof.pipeline.stage_costs`)
 RUN/commands.txt               optional: the commands that made it, one a line
@@ -14,9 +14,10 @@ RUN/commands.txt               optional: the commands that made it, one a line
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import chain, count, takewhile
 from pathlib import Path
+from typing import Any
 
 from roadproof.attacks import AttackResult
 from roadproof.calibration.report import CalibrationReport, load_report
@@ -29,11 +30,11 @@ from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.arrays import read_archive
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.fidelity import Fidelity
+from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import StageCost, read_cost
 from roadproof.recordings import RecordingSet, load_recordings
-from roadproof.report.film import FILM, POSTER, STRIP, Strip
 from roadproof.simulators.protocol import PatternImage
 
 
@@ -42,15 +43,15 @@ class Judged:
     """An evaluation with what is shown of it.
 
     Args:
-        evaluation: its numbers.
-        paint: what was painted.
-        shown: the trial shown in pictures.
-        clean: its drive without paint.
-        painted: its drive with it.
-        by_weather: every weather's drives alone, without and with paint.
+        evaluation: the drives that were judged.
+        paint: the canvas as it was painted.
+        shown: the trial that is shown in pictures.
+        clean: the shown drive without paint.
+        painted: the shown drive over the paint.
+        by_weather: the drives without others on the road, each with its weather, without and with paint.
         fidelity: composites against renders, where they were compared.
-        film: the two drives side by side, MP4.
-        poster: one image of it, JPEG.
+        film: the two drives side by side as MP4, where there is a film.
+        poster: one image of it as JPEG.
         strip: pictures of the passage.
     """
 
@@ -71,17 +72,17 @@ class Run:
     """What a run folder holds; None for a stage that is not there.
 
     Args:
-        folder: the run.
-        drives: as recorded.
+        folder: the run folder.
+        drives: the drives as they were recorded.
         recordings: the calibrated set.
         calibration: what the calibration says of itself.
         attack: the attack's result.
-        selections: candidates that were driven, of the search and of each round, in that order.
+        selections: the candidates that were driven, of the search and of each round, in that order.
         judged: the evaluation.
         prediction: where the recorded world said the chosen pattern takes the car, beside where it went.
-        pattern: that was chosen in the end; the attack's own where the run says nothing else.
-        cost: of each stage since the run began; empty where the run keeps no ledger.
-        commands: that made it, where they were kept.
+        pattern: the pattern that was chosen in the end; the attack's own where the run says nothing else.
+        cost: what each stage took since the run began; empty where the run keeps no account of it.
+        commands: the commands that made the run, where they were kept.
     """
 
     folder: Path
@@ -95,6 +96,41 @@ class Run:
     pattern: Pattern | None
     cost: dict[str, StageCost]
     commands: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """The name of the scenario; of the folder where no stage names one."""
+        if self.judged is not None:
+            return self.judged.evaluation.scenario.name
+        return self.drives.settings.scenario.name if self.drives else self.folder.resolve().name
+
+    @property
+    def costs(self) -> list[dict[str, Any]]:
+        """Simulator calls, seconds and the controller's frames of each stage; None where they were not noted."""
+        frames = {} if self.attack is None else {"attack": self.attack.cost.controller_frames}
+        if self.cost:
+            spent = {stage: asdict(cost) for stage, cost in self.cost.items() if cost != StageCost()}
+        else:
+            spent = self._noted()
+        return [{"stage": stage} | cost | {"frames": frames.get(stage)} for stage, cost in spent.items()]
+
+    def _noted(self) -> dict[str, dict[str, Any]]:
+        """What the stages themselves say they took, where the run keeps no account of it."""
+        spent: dict[str, dict[str, Any]] = {}
+        recorded = 0
+        if self.drives is not None:
+            recorded = self.drives.calls
+            spent["record"] = {"simulator_calls": recorded, "seconds": None}
+        if self.calibration is not None:
+            # Its own count includes recording.
+            calls = self.calibration.calls - recorded
+            spent["calibrate"] = {"simulator_calls": calls, "seconds": self.calibration.seconds}
+        if self.attack is not None:
+            spent["attack"] = {"simulator_calls": 0, "seconds": self.attack.cost.seconds}
+        if self.judged is not None:
+            judged = self.judged.evaluation
+            spent["evaluate"] = {"simulator_calls": judged.simulator_calls, "seconds": judged.seconds}
+        return spent
 
 
 def read_run(folder: Path) -> Run:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from roadproof.datatypes import Ending
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.intervals import mean_95
+from roadproof.report.formatting import UNKNOWN, in_words, mean_in_words
 from roadproof.report.run import Run
-from roadproof.report.words import mean_in_words
 
 SWAYED_M = 0.5
 """Half a metre aside and a car of ordinary width is over the line of an ordinary lane."""
@@ -18,17 +19,25 @@ SWAYED_M = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What came out.
+    """What came out of a run.
 
     Args:
         key: "fails", "swayed", "holds", "unfit", "foreseen", "predicted" or "recorded".
-        title: the same in two or three words.
+        title: the verdict in two or three words.
         sentence: the whole finding.
     """
 
     key: str
     title: str
     sentence: str
+
+
+class KeyFigure(NamedTuple):
+    """One number beside the verdict, with what it is and what to know of it."""
+
+    value: str
+    label: str
+    note: str
 
 
 def verdict(run: Run) -> Verdict:
@@ -108,3 +117,45 @@ def _driven(evaluation: Evaluation) -> Verdict:
         f"{who} keeps its path on {where}: at most {furthest:.2f} m aside (deviation {deviation:.2f} m), and in none "
         f"of {n} drives more infractions than on the bare road.",
     )
+
+
+def key_figures(run: Run) -> list[KeyFigure]:
+    """The numbers beside the verdict; of driving alone, or predicted and called so."""
+    if run.judged is None:
+        return []
+    evaluation = run.judged.evaluation
+    predicted = ", predicted" if evaluation.predicted else ""
+    alone, traffic = (evaluation.of(traffic=each) for each in (False, True))
+    trials = [*alone, *traffic]
+    furthest = max(trials, key=lambda trial: abs(trial.lateral_m))
+    side = "left" if furthest.lateral_m > 0 else "right"
+    deviations = [trial.deviation_m for trial in alone]
+    paths = [
+        KeyFigure(
+            f"{abs(furthest.lateral_m):.2f} m",
+            f"furthest from the clean path{predicted}",
+            f"to the {side}, {in_words(furthest.weather)}",
+        ),
+        KeyFigure(
+            f"{np.median(deviations):.2f} m",
+            f"median deviation{predicted}",
+            f"the paper’s measure, {min(deviations):.2f} to {max(deviations):.2f} over {len(alone)} drives alone",
+        ),
+    ]
+    if evaluation.predicted:
+        return [*paths, KeyFigure(UNKNOWN, "infractions", "recordings have no map")]
+    failed, before = sum(bool(t.points) for t in trials), sum(bool(t.clean_points) for t in trials)
+    points, clean_points = zip(*((t.points or 0.0, t.clean_points or 0.0) for t in traffic or alone), strict=True)
+    return [
+        *paths,
+        KeyFigure(
+            f"{np.mean(points):.1f}",
+            "penalty points a drive",
+            f"{np.mean(clean_points):.1f} on the bare road{', in traffic' if traffic else ''}",
+        ),
+        KeyFigure(
+            f"{sum(t.leaves_lane for t in trials)} of {len(trials)}",
+            "drives leave the lane",
+            f"{failed} with infractions, {before} on the bare road",
+        ),
+    ]

@@ -15,11 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+from roadproof.report.formatting import in_words
 from roadproof.report.study.blocks import compared, overall
 from roadproof.report.study.folder import Found, History
 from roadproof.report.study.results import Results
 from roadproof.report.study.statistics import mean_over_scenarios
-from roadproof.report.words import in_words
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from roadproof.driving.intervals import Mean
+from roadproof.report.formatting import MISSING, in_words
 from roadproof.report.study.blocks import DEVIATION, LEFT_LANE, PENALTY, Block, Metric, overall, reference, rivals
 from roadproof.report.study.notes import note
 from roadproof.report.study.results import Method, Results
 from roadproof.report.study.statistics import Paired, mean_over_scenarios, paired
 from roadproof.report.study.table import Cell, Estimate, Heading, Table, slug
-from roadproof.report.words import MISSING, in_words
 from roadproof.scenarios import KINDS
 
 SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}

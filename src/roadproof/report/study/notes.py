@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from roadproof.report.formatting import in_words
 from roadproof.report.study.blocks import PENALTY, Block
 from roadproof.report.study.results import Results
-from roadproof.report.words import in_words
 
 SHOWN_GAPS = 3
 ENOUGH = 10

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import roadproof
 from roadproof.io.files import write_atomically
+from roadproof.report.formatting import in_words
 from roadproof.report.html import data_url, environment
 from roadproof.report.plots import save
 from roadproof.report.study.blocks import DEVIATION, PENALTY
@@ -24,7 +25,6 @@ from roadproof.report.study.pictures import gallery, in_weathers, trajectories
 from roadproof.report.study.results import BLACK, Method, Record, Results, results_of
 from roadproof.report.study.table import Table, in_latex, in_markdown, markdown_text
 from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
-from roadproof.report.words import in_words
 
 
 def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Sequence[Record] = ()) -> Path:

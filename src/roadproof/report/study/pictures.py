@@ -13,13 +13,12 @@ from matplotlib.patches import Rectangle
 from roadproof.driving.deviation import Path2D
 from roadproof.errors import ScenarioError
 from roadproof.patterns import raster
-from roadproof.report.asphalt import on_asphalt
+from roadproof.report.formatting import in_words
+from roadproof.report.road_view import Ground, around_canvas, draw_road, on_asphalt
 from roadproof.report.study.blocks import compared, reference
 from roadproof.report.study.charts import INK, MUTED, Picture, legend, plain, style
 from roadproof.report.study.folder import Found
 from roadproof.report.study.results import JobId, Results
-from roadproof.report.top_view import Ground, around_canvas, draw_road
-from roadproof.report.words import in_words
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import KINDS

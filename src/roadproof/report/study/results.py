@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from roadproof.errors import StudyError
+from roadproof.report.formatting import in_words
 from roadproof.report.study.statistics import Case
-from roadproof.report.words import in_words
 
 Record: TypeAlias = Mapping[Any, Any]
 """A row of rows.parquet."""

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 
 from roadproof.driving.intervals import Mean
 from roadproof.errors import StudyError
+from roadproof.report.formatting import MISSING
 from roadproof.report.study.blocks import DEVIATION, Metric
 from roadproof.report.study.charts import INK, MUTED, Picture, plain
 from roadproof.report.study.results import Record
 from roadproof.report.study.statistics import Case, mean_over_scenarios
 from roadproof.report.study.table import Cell, Estimate, Heading, Table, slug
-from roadproof.report.words import MISSING
 
 _COLUMNS = ("found_on", "driven_by", "scenario", "figures", "method", "seed", "deviation_m", "points")
 

@@ -1,0 +1,39 @@
+"""Names and numbers as people read them."""
+
+from __future__ import annotations
+
+from roadproof.calibration.report import Spread
+from roadproof.driving.evaluation import Row
+from roadproof.driving.intervals import Mean
+
+MISSING = "–"
+UNKNOWN = "not known"
+
+
+def in_words(name: str) -> str:
+    """A weather, a kind of scenario or of event as people write it: "clear-noon" is clear noon."""
+    return name.replace("-", " ")
+
+
+def mean_in_words(mean: Mean | None, digits: int) -> str:
+    """A mean with half the width of its 95 % interval, "1.33 ± 0.21"; without it where there was one run."""
+    if mean is None:
+        return MISSING
+    if mean.high is None:
+        return f"{mean.value:.{digits}f}"
+    return f"{mean.value:.{digits}f} ± {mean.high - mean.value:.{digits}f}"
+
+
+def range_in_words(row: Row) -> str:
+    """The deviations of a row of drives in metres: the median, and in brackets the least and the most."""
+    return f"{row.median_m:.2f} ({row.least_m:.2f}–{row.most_m:.2f})"
+
+
+def aside_in_words(left_m: float) -> str:
+    """How far a car is beside a path, left positive: "1.40 m left"."""
+    return f"{abs(left_m):.2f} m {'left' if left_m > 0 else 'right'}" if abs(left_m) >= 0.005 else "on its path"
+
+
+def spread_in_words(spread: Spread | None) -> str:
+    """A mean and in brackets the 95th percentile, in pixels: "0.20 (0.40)"."""
+    return MISSING if spread is None else f"{spread.mean:.2f} ({spread.p95:.2f})"
