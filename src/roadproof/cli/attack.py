@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import ControllerSpec, Device, Figures, choice, number
+from roadproof.cli import options
+from roadproof.cli.options import argument, number, unset
+from roadproof.cli.output import say
 from roadproof.limits import MANY, MAX_SEED
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult, ShownDrive
-    from roadproof.search_space import SearchSpace
+    from roadproof.attacks import AttackResult
 
 
 def attack(
-    recordings: Annotated[Path, typer.Argument(help="Folder with a set of recorded drives.", show_default=False)],
-    controller: ControllerSpec,
-    figures: Figures = 5,
+    recordings: Annotated[Path, argument("Folder with a set of recorded drives.")],
+    controller: options.ControllerSpec,
+    figures: options.Figures = 5,
     family: Annotated[
         str, typer.Option(help="Where figures may lie: published, published-canvas-centre or free.")
     ] = "published",
@@ -30,18 +31,13 @@ def attack(
     ] = None,
     objective: Annotated[
         str | None,
-        typer.Option(
-            help="deviation: metres aside, driven in the recordings; steering: shift on recorded frames, as published."
-            "  [default: deviation where the set has poses and both sides]",
-            show_default=False,
+        unset(
+            "deviation: metres aside, driven in the recordings; steering: shift on recorded frames, as published."
+            "  [default: deviation where the set has poses and both sides]"
         ),
     ] = None,
     groups: Annotated[
-        str | None,
-        typer.Option(
-            help="Drives attacked together: clean+right,clean+left, or all.  [default: by method]",
-            show_default=False,
-        ),
+        str | None, unset("Drives attacked together: clean+right,clean+left, or all.  [default: by method]")
     ] = None,
     method: Annotated[
         str,
@@ -51,8 +47,7 @@ def attack(
         ),
     ] = "gradopt",
     iterations: Annotated[
-        int | None,
-        number("gradopt: last steps.  [default: 100; 32 for a deviation]", 1, MANY, show_default=False),
+        int | None, number("gradopt: last steps.  [default: 100; 32 for a deviation]", 1, MANY, show_default=False)
     ] = None,
     restarts: Annotated[
         int | None,
@@ -64,10 +59,7 @@ def attack(
         ),
     ] = None,
     masks: Annotated[
-        str | None,
-        typer.Option(
-            help="published: binary, as the code, or antialiased, as the text.  [default: binary]", show_default=False
-        ),
+        str | None, unset("published: binary, as the code, or antialiased, as the text.  [default: binary]")
     ] = None,
     calls: Annotated[
         int | None, number("Without gradients: patterns tried.  [default: 1000]", 1, MANY, show_default=False)
@@ -76,15 +68,14 @@ def attack(
         int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
     ] = 100,
     seed: Annotated[int, number("Of the random starts.", 0, MAX_SEED)] = 0,
-    device: Device = "cpu",
+    device: options.Device = "cpu",
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/attack"),
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import OBJECTIVES, method_of, show_pattern
+    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern
     from roadproof.attacks import attack as run
-    from roadproof.attacks.groups import parse_groups
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import require_usable
@@ -92,12 +83,13 @@ def attack(
     from roadproof.coverage import Shape
     from roadproof.io.locks import hold
     from roadproof.recordings import Push, load_recordings
+    from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
 
     space = SearchSpace(
         figures=figures,
-        family=choice(family, "family", FAMILIES),
-        shape=Shape(choice(shape, "shape", tuple(Shape))),
+        family=options.choice(family, "family", FAMILIES),
+        shape=Shape(options.choice(shape, "shape", tuple(Shape))),
         colour=not black,
         albedo=albedo,
         max_painted_share=max_painted_share,
@@ -108,18 +100,13 @@ def attack(
     drives = load_recordings(recordings)
     pushed = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in drives.recordings}
     driven_in = method != "published" and drives.is_placed and pushed
-    word = choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
+    word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
     chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
-    require_usable(
-        attacked,
-        size=(drives.view.height_px, drives.view.width_px),
-        device=device,
-        drives=False,
-        gradients=searched.by_gradient,
-    )
+    size = (drives.view.height_px, drives.view.width_px)
+    require_usable(attacked, size=size, device=device, drives=False, gradients=searched.by_gradient)
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(OBJECTIVES[word])) as on_step:
         result = run(
@@ -137,32 +124,12 @@ def attack(
         )
     result.save(out)
     winner = next(group for group in chosen if str(group) == result.group)
-    shown = show_pattern(result.pattern, drives, attacked, winner, device=device)
-    _draw(result, shown, out)
+    draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
     checkpoint.unlink(missing_ok=True)
-    _summarise(result, space, out)
+    _summarise(result, out)
 
 
-def _draw(result: AttackResult, shown: tuple[ShownDrive, ...], out: Path) -> None:
-    """The search's curves, and one film strip for each drive of the winner's group."""
-    from roadproof.report import film_strip, search_curves
-
-    search_curves(result.history, tuple(result.by_group), out / "search.png")
-    for drive in shown:
-        film_strip(
-            drive.clean,
-            drive.painted,
-            drive.clean_steer,
-            drive.painted_steer,
-            out / f"film-{drive.name}.png",
-            title=f"{drive.name}: predicted steering on composited frames, mean shift {drive.mean_shift:+.2f}",
-        )
-
-
-def _summarise(result: AttackResult, space: SearchSpace, out: Path) -> None:
-    from rich.console import Console
-
-    say = Console(soft_wrap=True, highlight=False).print
+def _summarise(result: AttackResult, out: Path) -> None:
     sides = ", ".join(f"{name} {value:+.3f}" for name, value in result.by_group.items())
     shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
     if result.predicted_m is not None:
@@ -171,12 +138,12 @@ def _summarise(result: AttackResult, space: SearchSpace, out: Path) -> None:
             f"{result.predicted_m:.2f} m of deviation predicted ({least:.2f} to {most:.2f} over small errors of "
             f"steering), nothing was driven for real; {shift}"
         )
-    say(f"Strongest for {result.group}: {shift}")
-    say(f"Best {result.objective} of each group: {sides}")
     say(
-        f"{space.figures} figures, {result.method.word}: {result.history.shape[2]} × {len(result.history)} last steps; "
-        f"{result.cost.controller_frames} frames in {result.cost.seconds:.0f} s"
+        f"Strongest for {result.group}: {shift}",
+        f"Best {result.objective} of each group: {sides}",
+        f"{result.space.figures} figures, {result.method.word}: {result.history.shape[2]} × {len(result.history)} last "
+        f"steps; {result.cost.controller_frames} frames in {result.cost.seconds:.0f} s",
     )
     for check in result.checks:
         say(f"  {'ok ' if check.passed else 'BAD'} {check.name}: {check.finding}{check.advice and '; ' + check.advice}")
-    say(f"Results in {out}: pattern.json, pattern.png, result.json, search.png, film-*.png", markup=False)
+    say(f"Results in {out}: pattern.json, pattern.png, result.json, search.png, film-*.png")

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import choice
+from roadproof.cli.options import argument, choice
+from roadproof.cli.output import say
 
 if TYPE_CHECKING:
     from roadproof.calibration import CalibrationReport
 
 
 def calibrate(
-    folder: Annotated[
-        Path, typer.Argument(help="A run that `roadproof record` made, or a folder of such runs.", show_default=False)
-    ],
+    folder: Annotated[Path, argument("A run that `roadproof record` made, or a folder of such runs.")],
     method: Annotated[
         str,
         typer.Option(
@@ -68,9 +67,6 @@ def calibrate(
 
 
 def _summarise(report: CalibrationReport, run: Path) -> None:
-    from rich.console import Console
-
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     say(f"{run.name}, {report.method}: {report.calls} simulator calls, recording included, {report.seconds:.0f} s")
     if report.colour_residual is not None:
         say(f"  colours fit within {report.colour_residual:.1f} of 255 levels on average")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import number
+from roadproof.cli.options import number, unset
 
 if TYPE_CHECKING:
     from roadproof.simulators.checks import Check
@@ -35,9 +35,7 @@ def serve(
     map_file: Annotated[
         list[Path] | None, typer.Option("--map", help="OpenDRIVE file to offer besides town and second.")
     ] = None,
-    first: Annotated[
-        str | None, typer.Option(help="Map at the start; else the first of --map, or town.", show_default=False)
-    ] = None,
+    first: Annotated[str | None, unset("Map at the start; else the first of --map, or town.")] = None,
 ) -> None:
     """Serve the embedded town to unmodified CARLA 0.9.16 clients, without a GPU."""
     # Panda3D and msgpack are extras.
@@ -81,7 +79,7 @@ def scenario(
     goal: Annotated[int, typer.Argument(help="Number of the spawn point it leads to.")],
     out: Annotated[Path, typer.Option(help="TOML file to write.")] = Path("carla.toml"),
     canvas_at_m: Annotated[float, number("From the start to the middle of the canvas.", 0.0, 10_000.0)] = 25.0,
-    name: Annotated[str | None, typer.Option(help="Of the scenario; else MAP-START-GOAL.", show_default=False)] = None,
+    name: Annotated[str | None, unset("Of the scenario; else MAP-START-GOAL.")] = None,
     map_name: Annotated[
         str | None, typer.Option("--map", help="Map of the server; else the one it has loaded.", show_default=False)
     ] = None,

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import CONTROLLERS, Cars, Pedestrians, ScenarioFile, WeatherName, choice, number
+from roadproof.cli import options
+from roadproof.cli.options import number
+from roadproof.cli.output import say
 from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
@@ -16,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def check_controller(
-    spec: Annotated[str, typer.Argument(help=f"What is checked: {CONTROLLERS}")],
-    scenarios: ScenarioFile = None,
-    weather: WeatherName = "clear-noon",
-    cars: Cars = 0,
-    pedestrians: Pedestrians = 0,
+    spec: Annotated[str, typer.Argument(help=f"What is checked: {options.CONTROLLERS}")],
+    scenarios: options.ScenarioFile = None,
+    weather: options.WeatherName = "clear-noon",
+    cars: options.Cars = 0,
+    pedestrians: options.Pedestrians = 0,
     processes: Annotated[int, number("Simulators that drive at once; 0: one a core.", 0, MAX_PROCESSES)] = 0,
     drive: Annotated[bool, typer.Option(help="Also drive the scenarios.")] = True,
 ) -> None:
@@ -29,11 +31,8 @@ def check_controller(
     from roadproof.controllers import check_controller as check
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import DRIVES
-    from roadproof.datatypes import Weather
-    from roadproof.scenarios import BUILTIN_FILE, load_scenarios
 
-    sky = Weather(choice(weather, "weather", tuple(Weather)))
-    driven = load_scenarios(scenarios or BUILTIN_FILE)
+    sky, driven = options.weather_of(weather), options.scenarios_of(scenarios)
     controller = load_controller(spec)
     report = check(controller, size=controller.input_size or (88, 200))
     _say_promises(report)
@@ -57,18 +56,12 @@ def check_controller(
 
 
 def _say_promises(report: ControllerReport) -> None:
-    from rich.console import Console
-
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     for check in report.checks:
         verdict, advice = ("ok ", "") if check.passed else ("BAD", f"; {check.advice}")
         say(f"{verdict} {check.name}: {check.found}{advice}")
 
 
 def _say_scores(scored: list[tuple[Trial, DrivingScore]]) -> None:
-    from rich.console import Console
-
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     scores = [score for _, score in scored]
     clean, turns = sum(score.clean for score in scores), sum(score.turns for score in scores)
     say(

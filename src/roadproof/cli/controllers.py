@@ -4,27 +4,26 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
+from roadproof.cli.options import argument
+from roadproof.cli.output import table
 
 
 def controllers(
-    name: Annotated[str | None, typer.Argument(help="One of them, to read its card.", show_default=False)] = None,
+    name: Annotated[str | None, argument("One of them, to read its card.")] = None,
 ) -> None:
     """List the shipped controllers, or show the card of one."""
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
     from roadproof.controllers.shipped import model_card, shipped_names, shipped_weights
 
     if name is None:
-        table = Table("name", "network", "size", "what it is", box=box.SIMPLE)
+        shown = table(("name", "network", "size", "what it is"))
         for each in shipped_names():
             card = model_card(each)
             size = f"{shipped_weights(each).stat().st_size / 1e6:.1f} MB"
-            table.add_row(*map(Text, (each, card.network, size, card.summary)))
-        Console().print(table)
+            shown.add_row(*map(Text, (each, card.network, size, card.summary)))
+        Console().print(shown)
         return
     card = model_card(name)
     say = Console(highlight=False, markup=False).print

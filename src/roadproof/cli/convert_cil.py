@@ -7,17 +7,18 @@ from typing import Annotated
 
 import typer
 
+from roadproof.cli.options import argument
+
 
 def convert_cil(
     checkpoint: Annotated[
         Path,
-        typer.Argument(
-            help="An .npz file with one array a TensorFlow variable, or, with TensorFlow, a checkpoint's name without "
-            ".index.",
-            show_default=False,
+        argument(
+            "An .npz file with one array a TensorFlow variable, or, with TensorFlow, a checkpoint's name without "
+            ".index."
         ),
     ],
-    out: Annotated[Path, typer.Argument(help=".safetensors file to write.", show_default=False)],
+    out: Annotated[Path, argument(".safetensors file to write.")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Convert the checkpoint of CARLA's imitation learning agent, which the paper attacks, to weights."""

@@ -10,42 +10,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import (
-    BudgetName,
-    ControllerSpec,
-    Device,
-    Figures,
-    Processes,
-    ScenarioFile,
-    ScenarioName,
-    SimulatorSpec,
-    check_processes,
-    choice,
-    number,
-    weathers_of,
-)
+from roadproof.cli import options
+from roadproof.cli.options import number
+from roadproof.cli.output import say
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
-    from roadproof.controllers import Controller
     from roadproof.pipeline.stress_test import StressTest
-    from roadproof.simulators.protocol import Simulator
 
 
 def demo(
-    scenario: ScenarioName = "left-03",
-    scenarios: ScenarioFile = None,
-    controller: ControllerSpec = "pilotnet",
-    budget: BudgetName = "quick",
+    scenario: options.ScenarioName = "left-03",
+    scenarios: options.ScenarioFile = None,
+    controller: options.ControllerSpec = "pilotnet",
+    budget: options.BudgetName = "quick",
     rounds: Annotated[int, number("Rounds of searching on along the way that the attacked car took.", 0, 100)] = 0,
     attack_weathers: Annotated[
         str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
     ] = "clear-noon",
-    figures: Figures = 5,
+    figures: options.Figures = 5,
     seed: Annotated[int, number("Of recording, search and traffic.", 0, MAX_SEED)] = 0,
-    simulator: SimulatorSpec = "town",
-    device: Device = "cpu",
-    processes: Processes = 1,
+    simulator: options.SimulatorSpec = "town",
+    device: options.Device = "cpu",
+    processes: options.Processes = 1,
     out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
         "out/demo"
     ),
@@ -58,34 +45,31 @@ def demo(
     from roadproof.io.locks import hold
     from roadproof.pipeline.budget import BUDGETS
     from roadproof.pipeline.stress_test import stress_test
-    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
-    tested = find_scenario(scenario, load_scenarios(scenarios or BUILTIN_FILE))
-    check_processes(processes, simulator)
-    spent = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
-    spent = replace(spent, rounds=rounds, attack_weathers=weathers_of(attack_weathers, "attack-weathers"))
+    tested = options.scenario_of(scenario, scenarios)
+    options.check_processes(processes, simulator)
+    spent = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
+    spent = replace(spent, rounds=rounds, attack_weathers=options.weathers_of(attack_weathers, "attack-weathers"))
     space = SearchSpace(figures=figures)
     hold(out)
     who = load_controller(controller, device=device)
-    with open_simulator(simulator) as world:
-        with stages() as show:
-            result = stress_test(
-                world,
-                who,
-                tested,
-                out,
-                budget=spent,
-                space=space,
-                seed=seed,
-                controller_name=controller,
-                device=device,
-                another=partial(open_simulator, simulator),
-                processes=processes,
-                on_progress=show,
-            )
-        _film(world, who, result, out)
+    with open_simulator(simulator) as world, stages() as show:
+        result = stress_test(
+            world,
+            who,
+            tested,
+            out,
+            budget=spent,
+            space=space,
+            seed=seed,
+            controller_name=controller,
+            device=device,
+            another=partial(open_simulator, simulator),
+            processes=processes,
+            on_progress=show,
+        )
     given = {
         "scenario": scenario,
         "controller": controller,
@@ -104,34 +88,13 @@ def demo(
     _report(result, out)
 
 
-def _film(world: Simulator, controller: Controller, result: StressTest, out: Path) -> None:
-    """The clean and the painted drive side by side; composited frames beside the rendered ones."""
-    from roadproof.drives import load_drives
-    from roadproof.driving.evaluation import load_paint
-    from roadproof.pipeline.fidelity import compare_with_rendered, rendered_frames
-    from roadproof.recordings import load_recordings
-    from roadproof.report.film import film_trial
-
-    place, evaluation = out / "evaluation", result.evaluation
-    film_trial(world, evaluation, load_paint(place), place)
-    recordings = load_recordings(out / "recordings")
-    clean = recordings.recordings[0]
-    driven = load_drives(out / "record").drives[0].episode
-    rendered = rendered_frames(world, evaluation.scenario, driven, result.pattern, clean.frame_number)
-    compared = compare_with_rendered(result.pattern, recordings, controller, rendered, drive=clean.name)
-    compared.save(place / "fidelity.npz")
-
-
 def _report(result: StressTest, out: Path) -> None:
-    from rich.console import Console
-
     from roadproof.pipeline.stage_costs import StageCost
     from roadproof.report.page import write_report
     from roadproof.report.run import read_run
     from roadproof.report.verdict import verdict
 
     page = write_report(out)
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     say(verdict(read_run(out)).sentence)
     if (foretold := result.prediction) is not None:
         say(

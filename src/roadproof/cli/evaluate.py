@@ -8,43 +8,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import (
-    Device,
-    DriverSpec,
-    Processes,
-    ScenarioFile,
-    ScenarioOrRecorded,
-    WorldSpec,
-    check_processes,
-    driver_of,
-    number,
-    weathers_of,
-)
-from roadproof.cli.worlds import check_driver, open_world, recorded_in, scenario_asked, stretch_of
+from roadproof.cli import options
+from roadproof.cli.options import argument, number, unset
+from roadproof.cli.output import say, table
+from roadproof.cli.worlds import open_world, world_asked
+from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD, MAX_SEED
 
 if TYPE_CHECKING:
-    from roadproof.controllers import Controller
-    from roadproof.driving.evaluation import Evaluation, Row
-    from roadproof.patterns import Pattern
+    from roadproof.driving.evaluation import Evaluation
     from roadproof.pipeline.fidelity import Fidelity
-    from roadproof.recordings import RecordingSet
-    from roadproof.simulators.protocol import Simulator
 
 
 def evaluate(
-    pattern: Annotated[
-        Path, typer.Argument(help="pattern.json of an attack, or a 400×400 picture.", show_default=False)
-    ],
-    controller: DriverSpec = "cil",
-    scenario: ScenarioOrRecorded = None,
-    scenarios: ScenarioFile = None,
+    pattern: Annotated[Path, argument("pattern.json of an attack, or a 400×400 picture.")],
+    controller: options.DriverSpec = "cil",
+    scenario: options.ScenarioOrRecorded = None,
+    scenarios: options.ScenarioFile = None,
     weathers: Annotated[
-        str | None,
-        typer.Option(
-            help="Weathers, with commas between; the paper's four by default, or that of the recordings.",
-            show_default=False,
-        ),
+        str | None, unset("Weathers, with commas between; the paper's four by default, or that of the recordings.")
     ] = None,
     starts: Annotated[
         int,
@@ -66,15 +48,12 @@ def evaluate(
     cars: Annotated[int, number("Other cars in those.", 0, MAX_CROWD)] = 20,
     pedestrians: Annotated[int, number("People about in those.", 0, MAX_CROWD)] = 20,
     random: Annotated[int, number("Random patterns to compare with.", 0, 1000)] = 0,
-    recordings: Annotated[
-        Path | None,
-        typer.Option(help="The set attacked, to compare composites with what is rendered.", show_default=False),
-    ] = None,
+    recordings: Annotated[Path | None, unset("The set attacked, to compare composites with what is rendered.")] = None,
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
-    processes: Processes = 1,
-    simulator: WorldSpec = "town",
+    processes: options.Processes = 1,
+    simulator: options.WorldSpec = "town",
     seed: Annotated[int, number("Of the first run with traffic; the others count on.", 0, MAX_SEED)] = 0,
-    device: Device = "cpu",
+    device: options.Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
         "out/evaluation"
     ),
@@ -86,21 +65,20 @@ def evaluate(
     from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange
-    from roadproof.errors import PatternError
     from roadproof.io.locks import hold
     from roadproof.patterns import load_pattern, read_paint
+    from roadproof.pipeline.fidelity import measure_fidelity
+    from roadproof.pipeline.film import film_trial
     from roadproof.recordings import load_recordings
 
-    inside = recorded_in(simulator)
-    asked = scenario_asked(inside, scenario, scenarios)
-    skies = PAPER_WEATHERS if inside is None else (inside.weather,)
+    where = world_asked(simulator, device, controller, scenario, scenarios)
+    skies = PAPER_WEATHERS if where.recorded is None else (where.recorded.weather,)
     if weathers is not None:
-        skies = weathers_of(weathers, "weathers")
-    if inside is not None:
-        check_driver(controller)
+        skies = options.weathers_of(weathers, "weathers")
+    if where.recorded is not None:
         _check_recorded(runs, recordings)
-        cars = pedestrians = 0
-    check_processes(processes, simulator)
+        runs = cars = pedestrians = 0
+    options.check_processes(processes, simulator)
     begun = StartRange(**dict(zip(StartRange.__slots__, start_range, strict=True)))
     figures = load_pattern(pattern) if pattern.suffix == ".json" else None
     paint = read_paint(pattern)
@@ -108,9 +86,8 @@ def evaluate(
         raise PatternError(f"{pattern} is a picture; --random and --recordings need the pattern.json of an attack")
     recorded = None if recordings is None else load_recordings(recordings)
     hold(out)
-    who = driver_of(controller, device)
-    with open_world(simulator, device) as world:
-        driven = stretch_of(world, asked)
+    who = options.driver_of(controller, device)
+    with where.open() as (world, driven):
         with progress(f"Driving {driven.name}", 100, "%, {:.0f} drives") as show:
             evaluation = run(
                 partial(open_world, simulator, device) if processes > 1 else world,
@@ -122,7 +99,7 @@ def evaluate(
                 weathers=skies,
                 starts=starts,
                 start_range=begun,
-                runs=runs if runs is not None else 10 if inside is None else 0,
+                runs=10 if runs is None else runs,
                 cars=cars,
                 pedestrians=pedestrians,
                 seed=seed,
@@ -131,13 +108,11 @@ def evaluate(
                 on_drive=lambda done, total: show(100 * done // total, done),
             )
         if film:
-            from roadproof.report.film import film_trial
-
             film_trial(world, evaluation, paint, out)
         fidelity = None
         if recorded is not None and figures is not None and isinstance(who, Controller):
-            fidelity = _compared(world, who, evaluation, figures, recorded, out)
-    _summarise(evaluation, fidelity, recorded, out)
+            fidelity = measure_fidelity(world, who, driven, figures, recorded, out, weather=skies[0], device=device)
+    _summarise(evaluation, fidelity, out, compared=recorded is not None)
 
 
 def _check_recorded(runs: int | None, recordings: Path | None) -> None:
@@ -146,84 +121,43 @@ def _check_recorded(runs: int | None, recordings: Path | None) -> None:
     Raises:
         RoadproofError: traffic, or renders to compare with, are asked for.
     """
-    from roadproof.errors import RoadproofError
-
     if runs:
         raise RoadproofError(f"--runs is {runs}, but recordings hold no others on the road; expected 0")
     if recordings is not None:
         raise RoadproofError("--recordings compares with what a simulator renders; nothing is rendered in recordings")
 
 
-def _compared(
-    world: Simulator, who: Controller, evaluation: Evaluation, figures: Pattern, recorded: RecordingSet, out: Path
-) -> Fidelity | None:
-    """The surrogate's frames beside the simulator's, where the set was recorded on this clean drive."""
-    from roadproof.driving.rollout import rollout
-    from roadproof.pipeline.fidelity import compare_with_rendered, is_drive_of, rendered_frames
+def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, compared: bool) -> None:
+    from roadproof.report.formatting import UNKNOWN, mean_in_words, range_in_words
 
-    clean = rollout(world, who, evaluation.scenario, weather=evaluation.weathers[0])
-    drive = next((each for each in recorded.recordings if each.push == "clean"), None)
-    if drive is None or not is_drive_of(drive, clean):
-        return None
-    rendered = rendered_frames(world, evaluation.scenario, clean, figures, drive.frame_number)
-    fidelity = compare_with_rendered(figures, recorded, who, rendered, drive=drive.name)
-    fidelity.save(out / "fidelity.npz")
-    return fidelity
-
-
-def _infractions(row: Row) -> list[str]:
-    from roadproof.report.words import mean_in_words
-
-    return [mean_in_words(row.points, 1), mean_in_words(row.clean_points, 1)]
-
-
-def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, recorded: RecordingSet | None, out: Path) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    from roadproof.report.words import UNKNOWN, mean_in_words
-
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    foreseen = evaluation.predicted
-    title = "Predicted: composited into recorded frames, nothing was driven for real" if foreseen else None
-    table = Table(
-        "pattern",
-        "weather",
-        "with",
-        box=box.SIMPLE,
-        title=title,
-        title_justify="left",
-        caption="deviation: median (least–most); aside: furthest; clean: points on the bare road",
-        caption_justify="left",
-    )
-    driven = ("deviation m", "aside m", "left lane", "points", "clean")
-    predicted = ("predicted m", "aside m", "left lane", "infractions")
-    for column in ("drives", *(predicted if foreseen else driven)):
-        table.add_column(column, justify="right", no_wrap=True)
+    columns, title = ("drives", "deviation m", "aside m", "left lane", "points", "clean"), None
+    if evaluation.predicted:
+        columns = ("drives", "predicted m", "aside m", "left lane", "infractions")
+        title = "Predicted: composited into recorded frames, nothing was driven for real"
+    note = "deviation: median (least–most); aside: furthest; clean: points on the bare road"
+    shown = table(("pattern", "weather", "with"), columns, title=title, note=note)
     for row in evaluation.rows():
-        traffic = "traffic" if row.traffic else "nobody"
-        table.add_row(
+        points = [mean_in_words(row.points, 1), mean_in_words(row.clean_points, 1)]
+        shown.add_row(
             row.pattern,
             row.weather or "all",
-            traffic,
+            "traffic" if row.traffic else "nobody",
             str(row.count),
-            f"{row.median_m:.2f} ({row.least_m:.2f}–{row.most_m:.2f})",
+            range_in_words(row),
             mean_in_words(row.lateral_m, 2),
             f"{row.left_lane:.0%}",
-            *([UNKNOWN] if row.failed is None else _infractions(row)),
+            *([UNKNOWN] if row.failed is None else points),
         )
-    console.print(table)
+    say(shown)
     if fidelity is not None:
         found = fidelity.agreement
-        console.print(
+        say(
             f"Surrogate on {found.frames} frames of {fidelity.drive}: {found.paint_error:.1f} of 255 levels off in the "
             f"paint, steering shift {found.predicted_shift:+.3f} predicted, {found.rendered_shift:+.3f} rendered"
         )
-    elif recorded is not None:
-        console.print("The recordings are not of this clean drive, so composites were not compared with renders")
-    console.print(
-        f"{evaluation.drives} {'predicted ' if foreseen else ''}drives, paint {evaluation.paint}, "
-        f"{evaluation.seconds:.0f} s; "
-        f"results in {out}: evaluation.json, episodes"
+    elif compared:
+        say("The recordings are not of this clean drive, so composites were not compared with renders")
+    say(
+        f"{evaluation.drives} {'predicted ' if evaluation.predicted else ''}drives, paint {evaluation.paint}, "
+        f"{evaluation.seconds:.0f} s; results in {out}: evaluation.json, episodes"
     )

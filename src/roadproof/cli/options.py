@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.datatypes import Weather
     from roadproof.driving.rollout import Policy
+    from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
@@ -25,9 +26,9 @@ def number(about: str, least: int | float, most: int | float, *, show_default: b
     """An option that is a number in a range, which its help states; of a list, each is.
 
     Args:
-        about: what it is, for the help.
-        least: it may be.
-        most: it may be.
+        about: what the number is, for the help.
+        least: the smallest value.
+        most: the largest value.
         show_default: whether the help shows the default.
     """
 
@@ -40,6 +41,16 @@ def number(about: str, least: int | float, most: int | float, *, show_default: b
         return cast("Any", value)
 
     return typer.Option(help=f"{about}  [{least:,} to {most:,}]", show_default=show_default, callback=check)
+
+
+def unset(about: str) -> Any:  # noqa: ANN401
+    """An option without a value of its own, so that the help shows no default."""
+    return typer.Option(help=about, show_default=False)
+
+
+def argument(about: str) -> Any:  # noqa: ANN401
+    """An argument that must be given."""
+    return typer.Argument(help=about, show_default=False)
 
 
 CONTROLLERS = (
@@ -59,16 +70,9 @@ BudgetName: TypeAlias = Annotated[
 ]
 ScenarioName: TypeAlias = Annotated[str, typer.Option(help="One of those that `roadproof scenarios` lists.")]
 ScenarioOrRecorded: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        help="One of those that `roadproof scenarios` lists; left-03 by default, or that of the recordings.",
-        show_default=False,
-    ),
+    str | None, unset("One of those that `roadproof scenarios` lists; left-03 by default, or that of the recordings.")
 ]
-ScenarioFile: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(help="TOML file with scenarios of your own; else the built-in 40.", show_default=False),
-]
+ScenarioFile: TypeAlias = Annotated[Path | None, unset("TOML file with scenarios of your own; else the built-in 40.")]
 WeatherName: TypeAlias = Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")]
 SimulatorSpec: TypeAlias = Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")]
 WorldSpec: TypeAlias = Annotated[
@@ -115,15 +119,46 @@ def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:
     raise RoadproofError(f"--{option} is {value!r}, expected one of {', '.join(allowed)}{hint}")
 
 
+def scenarios_of(file: Path | None) -> tuple[Scenario, ...]:
+    """The scenarios of a file, or the built-in ones.
+
+    Raises:
+        ScenarioError: the file is missing or damaged.
+    """
+    from roadproof.scenarios import BUILTIN_FILE, load_scenarios
+
+    return load_scenarios(file or BUILTIN_FILE)
+
+
+def scenario_of(name: str, file: Path | None) -> Scenario:
+    """The scenario of a name, from a file or the built-in ones.
+
+    Raises:
+        ScenarioError: the file is missing or damaged, or holds none of this name; the message names the nearest.
+    """
+    from roadproof.scenarios import find_scenario
+
+    return find_scenario(name, scenarios_of(file))
+
+
+def weather_of(name: str, option: str = "weather") -> Weather:
+    """The weather of a name.
+
+    Raises:
+        RoadproofError: there is none of this name; the message names the nearest.
+    """
+    from roadproof.datatypes import Weather
+
+    return Weather(choice(name, option, tuple(Weather)))
+
+
 def weathers_of(names: str, option: str) -> tuple[Weather, ...]:
     """The weathers of a list with commas between.
 
     Raises:
         RoadproofError: one of them is none; the message names the nearest.
     """
-    from roadproof.datatypes import Weather
-
-    return tuple(Weather(choice(name.strip(), option, tuple(Weather))) for name in names.split(","))
+    return tuple(weather_of(name.strip(), option) for name in names.split(","))
 
 
 def driver_of(spec: str, device: str) -> Controller | Callable[[MappedSimulator], Policy]:

@@ -7,17 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import (
-    BudgetName,
-    Device,
-    DriverSpec,
-    ScenarioFile,
-    SimulatorSpec,
-    WeatherName,
-    choice,
-    driver_of,
-    number,
-)
+from roadproof.cli import options
+from roadproof.cli.options import argument, number, unset
+from roadproof.cli.output import say
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
@@ -25,42 +17,29 @@ if TYPE_CHECKING:
 
 
 def record(
-    names: Annotated[
-        list[str], typer.Argument(help="Scenarios; `roadproof scenarios` lists them.", show_default=False)
-    ],
-    scenarios: ScenarioFile = None,
-    driver: DriverSpec = "expert",
-    weather: WeatherName = "clear-noon",
-    budget: BudgetName = "quick",
-    trajectories: Annotated[
-        int | None,
-        typer.Option(
-            help="T, how many drives: 1, 3, 5 or 7.  [default: the budget's]",
-            show_default=False,
-        ),
-    ] = None,
+    names: Annotated[list[str], argument("Scenarios; `roadproof scenarios` lists them.")],
+    scenarios: options.ScenarioFile = None,
+    driver: options.DriverSpec = "expert",
+    weather: options.WeatherName = "clear-noon",
+    budget: options.BudgetName = "quick",
+    trajectories: Annotated[int | None, unset("T, how many drives: 1, 3, 5 or 7.  [default: the budget's]")] = None,
     scheme: Annotated[
         str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
     ] = "group",
     deviation_m: Annotated[
         list[float] | None,
-        typer.Option(
-            help="How far drives are pushed aside; several are taken in turn.  [default: the budget's]",
-            show_default=False,
-        ),
+        unset("How far drives are pushed aside; several are taken in turn.  [default: the budget's]"),
     ] = None,
     noise_deg: Annotated[
-        tuple[int, int] | None,
-        typer.Option(help="Push by noise on the steering instead, least and most, as published.", show_default=False),
+        tuple[int, int] | None, unset("Push by noise on the steering instead, least and most, as published.")
     ] = None,
     horizon_m: Annotated[float, number("Keep frames from so far before the canvas.", 1.0, 1000.0)] = 25.0,
     frames: Annotated[
-        int | None,
-        number("Keep at most so many a drive.  [default: the budget's]", 1, 10_000, show_default=False),
+        int | None, number("Keep at most so many a drive.  [default: the budget's]", 1, 10_000, show_default=False)
     ] = None,
     seed: Annotated[int, number("Of the perturbations.", 0, MAX_SEED)] = 0,
-    simulator: SimulatorSpec = "town",
-    device: Device = "cpu",
+    simulator: options.SimulatorSpec = "town",
+    device: options.Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
 ) -> None:
     """Record drives past the canvas: clean, and pushed to the side. A second call goes on where the first ended."""
@@ -68,22 +47,19 @@ def record(
     from dataclasses import replace
 
     from roadproof.cli.progress import progress
-    from roadproof.datatypes import Weather
     from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError, ScenarioError
     from roadproof.io.files import inside
     from roadproof.io.locks import hold
     from roadproof.pipeline.budget import BUDGETS
-    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.simulators.loading import open_simulator
 
-    known = load_scenarios(scenarios or BUILTIN_FILE)
-    chosen = [find_scenario(name, known) for name in dict.fromkeys(names)]
-    sky = Weather(choice(weather, "weather", tuple(Weather)))
+    chosen = [options.scenario_of(name, scenarios) for name in dict.fromkeys(names)]
+    sky = options.weather_of(weather)
     if noise_deg is not None and deviation_m:
         raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to push drives aside")
-    usual = BUDGETS[choice(budget, "budget", tuple(BUDGETS))]
+    usual = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
     perturbation = usual.trajectories.perturbation
     if deviation_m:
         perturbation = Swerve(tuple(deviation_m))
@@ -91,7 +67,7 @@ def record(
         perturbation = SteeringNoise(*noise_deg)
     wanted = Trajectories(
         count=usual.trajectories.count if trajectories is None else trajectories,
-        scheme=Scheme(choice(scheme, "scheme", tuple(Scheme))),
+        scheme=Scheme(options.choice(scheme, "scheme", tuple(Scheme))),
         perturbation=perturbation,
     )
     kept = usual.window.frames if frames is None else frames
@@ -99,7 +75,7 @@ def record(
     places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
     for place in places.values():
         hold(place)
-    who = driver_of(driver, device)
+    who = options.driver_of(driver, device)
 
     with open_simulator(simulator) as world:
         for scenario in chosen:
@@ -120,9 +96,6 @@ def record(
 
 
 def _summarise(drives: Drives, run: Path) -> None:
-    from rich.console import Console
-
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     say(f"{drives.settings.scenario.name}, {drives.settings.weather}: {drives.calls} drives, kept in {run / 'record'}")
     for drive in drives.drives:
         steps = f"steps {drive.frame_number[0]} to {drive.frame_number[-1]}"

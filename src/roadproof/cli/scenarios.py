@@ -5,33 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from roadproof.cli.options import ScenarioFile
+from roadproof.cli import options
+from roadproof.cli.options import unset
+from roadproof.cli.output import say, table
 
 
 def scenarios(
-    file: ScenarioFile = None,
-    out: Annotated[Path | None, typer.Option(help="Picture to draw them to on their map.", show_default=False)] = None,
+    file: options.ScenarioFile = None,
+    out: Annotated[Path | None, unset("Picture to draw them to on their map.")] = None,
 ) -> None:
     """List the scenarios, and draw them on their map."""
     # Matplotlib takes a second to import; `--help` should not.
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
     from roadproof.errors import ScenarioError
     from roadproof.roads.maps import load_map, scenario_route
-    from roadproof.scenarios import BUILTIN_FILE, load_scenarios
 
-    listed = load_scenarios(file or BUILTIN_FILE)
-    table = Table("name", "kind", "map", box=box.SIMPLE)
-    for column in ("route m", "to canvas m", "canvas m", "limit s"):
-        table.add_column(column, justify="right")
+    listed = options.scenarios_of(file)
+    shown = table(("name", "kind", "map"), ("route m", "to canvas m", "canvas m", "limit s"))
     for scenario in listed:
         route, canvas = scenario_route(scenario, load_map(scenario.map_name)), scenario.canvas
-        table.add_row(
+        shown.add_row(
             Text(scenario.name),
             scenario.kind,
             Text(Path(scenario.map_name).name),
@@ -40,8 +34,7 @@ def scenarios(
             f"{canvas.width_m:.1f} × {canvas.length_m:.1f}",
             f"{scenario.time_limit_s:.0f}",
         )
-    console = Console(soft_wrap=True)
-    console.print(table)
+    say(shown)
     if out is None:
         return
     from roadproof.report.scenario_map import draw_scenarios
@@ -52,4 +45,4 @@ def scenarios(
             f"the scenarios lie on {len(maps)} maps ({', '.join(maps)}); draw those of one map at a time"
         )
     draw_scenarios(listed, load_map(maps[0]), out)
-    console.print(f"Drawn to {out}", markup=False, highlight=False)
+    say(f"Drawn to {out}")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from roadproof.cli.options import ControllerSpec, Device, WorldSpec, number
+from roadproof.cli import options
+from roadproof.cli.options import argument, number
+from roadproof.cli.output import say
 from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def select(
-    run: Annotated[Path, typer.Argument(help="A run that was recorded, calibrated and attacked.", show_default=False)],
-    controller: ControllerSpec,
+    run: Annotated[Path, argument("A run that was recorded, calibrated and attacked.")],
+    controller: options.ControllerSpec,
     best: Annotated[int, number("How many of the attack's candidates are driven, once each.", 1, 1000)] = 6,
-    simulator: WorldSpec = "town",
-    device: Device = "cpu",
+    simulator: options.WorldSpec = "town",
+    device: options.Device = "cpu",
 ) -> None:
     """Drive over the best candidates of an attack, which composites rank only coarsely, and keep the strongest.
 
@@ -67,9 +67,6 @@ def select(
 
 
 def _summarise(selection: Selection, found: AttackResult, run: Path) -> None:
-    from rich.console import Console
-
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     driven = "predicted drive" if selection.predicted else "driven"
     for k, each in enumerate(selection.driven):
         shift = found.candidates[each.rank - 1].surrogate_shift

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from roadproof.cli.options import number
+from roadproof.cli.options import number, unset
+from roadproof.cli.output import say
 from roadproof.limits import MANY, MAX_PROCESSES, MAX_SEED
 
 
@@ -16,10 +17,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of drives, checkpoints and the controller.")] = Path("out/train"),
     network: Annotated[str, typer.Option(help="cil or pilotnet.")] = "cil",
     width: Annotated[float, number("CIL: factor on channels and units.", 0.01, 16.0)] = 1.0,
-    start: Annotated[
-        str | None,
-        typer.Option(help="Weights file or shipped controller to go on from; else fresh weights.", show_default=False),
-    ] = None,
+    start: Annotated[str | None, unset("Weights file or shipped controller to go on from; else fresh weights.")] = None,
     drives: Annotated[int, number("Drives of the expert.", 1, MANY)] = 260,
     painted_drives: Annotated[int, number("Drives of the expert over random paint, besides.", 0, MANY)] = 0,
     pasted: Annotated[float, number("Share of the pictures with rectangles pasted on the road.", 0.0, 1.0)] = 0.0,
@@ -35,8 +33,6 @@ def train(
 ) -> None:
     """Collect drives, learn from them, let the network drive, learn from that; goes on where it was interrupted."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from rich.console import Console
-
     from roadproof.cli.progress import stages
     from roadproof.io.locks import hold
     from roadproof.training.recipe import Recipe, follow, gather
@@ -57,7 +53,6 @@ def train(
     )
     hold(out)
     at_once = processes or os.cpu_count() or 1
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     with stages() as on_stage:
         if collect_only:
             shards = gather(recipe, out, processes=at_once, on_stage=on_stage)

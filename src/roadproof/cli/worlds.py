@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from roadproof.cli.options import scenario_of
 from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
-    from roadproof.recorded.simulator import RecordedSimulator
+    from roadproof.recorded import RecordedSimulator
     from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
-    from roadproof.simulators.protocol import Simulator
 
 RECORDED = "recorded:"
 
@@ -25,27 +25,73 @@ class Recorded:
     """Recordings that are driven in.
 
     Args:
-        folder: of the set.
-        scenario: that was recorded, where the set lies in a run that says so.
-        weather: at which; a set alone does not say it, and its light is called clear-noon.
+        folder: the folder of the set.
+        scenario: the scenario that was recorded, where the set lies in a run that says so.
+        weather: the weather it was recorded in; a set alone does not say it, and its light is called clear-noon.
     """
 
     folder: Path
     scenario: Scenario | None
     weather: Weather
 
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """Where a verb drives.
+
+    Args:
+        spec: "town", "carla://HOST:PORT" or "recorded:FOLDER".
+        device: where a recorded world makes its pictures.
+        recorded: the recordings that are driven in; None in a simulator.
+        scenario: what is driven; None for the recorded stretch itself.
+    """
+
+    spec: str
+    device: str
+    recorded: Recorded | None
+    scenario: Scenario | None
+
     @contextmanager
-    def open(self, device: str = "cpu") -> Generator[RecordedSimulator]:
-        """The recorded world, for a with-block.
+    def open(self) -> Generator[tuple[MappedSimulator | RecordedSimulator, Scenario]]:
+        """Open it for a with-block, which gets the simulator and the scenario; a recorded one begins where the
+        recordings do.
 
         Raises:
-            RecordingError: the set is missing, damaged, or says too little to drive in.
-        """
-        from roadproof.recorded.simulator import RecordedSimulator
-        from roadproof.recordings import load_recordings
+            RoadproofError: the simulator is not there, or the recordings say too little to drive in.
+        """  # noqa: D205
+        from roadproof.recorded import RecordedSimulator
 
-        with RecordedSimulator(load_recordings(self.folder), weather=self.weather, device=device) as world:
-            yield world
+        with open_world(self.spec, self.device) as world:
+            if isinstance(world, RecordedSimulator):
+                there = world.scenario
+                yield world, there if self.scenario is None else replace(self.scenario, start=there.start)
+            else:
+                assert self.scenario is not None
+                yield world, self.scenario
+
+
+def world_asked(spec: str, device: str, driver: str, name: str | None, file: Path | None) -> World:
+    """The world of a verb's options.
+
+    Args:
+        spec: what `--simulator` names.
+        device: what `--device` names.
+        driver: what `--controller` names.
+        name: the scenario that was named, if any; by default that of the recordings, or left-03.
+        file: a file with scenarios of the user's own; the built-in ones by default.
+
+    Raises:
+        RoadproofError: there are no such recordings, or the expert is to drive in them.
+        ScenarioError: there is no scenario of this name, or the file is damaged.
+    """
+    recorded = recorded_in(spec)
+    if recorded is not None and name is None and file is None:
+        scenario = recorded.scenario
+    else:
+        scenario = scenario_of(name or "left-03", file)
+    if recorded is not None and driver == "expert":
+        raise RoadproofError("the expert needs a map, which recordings do not have; give a --controller")
+    return World(spec, device, recorded, scenario)
 
 
 def recorded_in(spec: str) -> Recorded | None:
@@ -82,50 +128,15 @@ def open_world(spec: str, device: str = "cpu") -> Generator[MappedSimulator | Re
     Raises:
         RoadproofError: there is none of this name, or what it needs is not there.
     """
-    recorded = recorded_in(spec)
-    if recorded is not None:
-        with recorded.open(device) as world:
-            yield world
-        return
+    from roadproof.recorded import RecordedSimulator
+    from roadproof.recordings import load_recordings
     from roadproof.simulators.loading import open_simulator
 
-    with open_simulator(spec) as world:
+    inside = recorded_in(spec)
+    opened = (
+        open_simulator(spec)
+        if inside is None
+        else RecordedSimulator(load_recordings(inside.folder), weather=inside.weather, device=device)
+    )
+    with opened as world:
         yield world
-
-
-def scenario_asked(recorded: Recorded | None, name: str | None, file: Path | None) -> Scenario | None:
-    """The scenario to drive; None where it is the recorded stretch itself, which nobody named.
-
-    Args:
-        recorded: what is driven in, where that is recordings.
-        name: that was given.
-        file: with scenarios of the user's own; the built-in ones by default.
-
-    Raises:
-        ScenarioError: there is none of this name, or the file is damaged.
-    """
-    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
-
-    if recorded is not None and name is None and file is None:
-        return recorded.scenario
-    return find_scenario(name or "left-03", load_scenarios(file or BUILTIN_FILE))
-
-
-def stretch_of(world: Simulator, scenario: Scenario | None) -> Scenario:
-    """A scenario, or where none was asked for, that of the recordings; in these it begins where they do."""
-    from roadproof.recorded.simulator import RecordedSimulator
-
-    if isinstance(world, RecordedSimulator):
-        return world.scenario if scenario is None else replace(scenario, start=world.scenario.start)
-    assert scenario is not None
-    return scenario
-
-
-def check_driver(controller: str) -> None:
-    """Refuse to drive in recordings with whom they give too little.
-
-    Raises:
-        RoadproofError: it is the expert.
-    """
-    if controller == "expert":
-        raise RoadproofError("the expert needs a map, which recordings do not have; give a --controller")
