@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+from roadproof.report.plots import LINES, style_axes
 from roadproof.report.words import in_words
 from roadproof.study.history import Course
 from roadproof.study.kept_jobs import KeptJob
@@ -23,7 +24,6 @@ from roadproof.study.statistics import mean_over_scenarios
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.4)), (0, (6, 2, 1, 2)))
 INK, MUTED, RULE = "#1c2126", "#575e66", "#dcd9d1"
 
 
@@ -62,7 +62,8 @@ def by_figures(results: Results) -> Picture:
         axes.set_xticks(range(len(results.figures)), results.figures)
         axes.set_xlim(-0.5, len(results.figures) - 0.5)
         axes.set_ylim(bottom=0.0)
-        label(axes, "K, figures of the pattern", f"{block.metric.title.lower()}, {block.metric.unit}")
+        named = f"{block.metric.title.lower()}, {block.metric.unit}"
+        style_axes(axes, "K, figures of the pattern", named, text=MUTED, lines=MUTED, grid=RULE)
     legend(figure)
     how = f"penalty {'in traffic' if results.overall[1].traffic else 'alone on the road'}"
     return Picture(
@@ -112,12 +113,13 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
             axes: Axes = grid[row, column]
             for method, own in courses[figures].items():
                 at = [np.asarray(getattr(course, field), np.float64) for course in own]
-                reached = [np.asarray(course.best, np.float64) for course in own]
-                _draw_course(axes, at, reached, plain(method), style(results, method))
+                best = [np.asarray(course.best, np.float64) for course in own]
+                _draw_course(axes, at, best, plain(method), style(results, method))
             axes.set_xscale("log")
             _plain_ticks(axes)
             axes.set_ylim(bottom=0.0)
-            label(axes, name, "deviation of the best so far, m" if column == 0 else "")
+            reached = "deviation of the best so far, m" if column == 0 else ""
+            style_axes(axes, name, reached, text=MUTED, lines=MUTED, grid=RULE)
             if row == 0:
                 axes.set_title(f"K = {figures}", fontsize=10, color=INK)
     legend(figure)
@@ -164,20 +166,9 @@ def _aligned(
     return x, np.stack(steps)
 
 
-def label(axes: Axes, x: str, y: str) -> None:
-    """The house's axes."""
-    axes.set_xlabel(x, color=MUTED, fontsize=9)
-    axes.set_ylabel(y, color=MUTED, fontsize=9)
-    axes.tick_params(colors=MUTED, labelsize=9, length=3, width=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(MUTED)
-    axes.grid(axis="y", color=RULE, linewidth=0.6)
-    axes.set_axisbelow(True)
-
-
-def legend(figure: Figure, extra: Mapping[str, Any] | None = None) -> None:
+def legend(figure: Figure) -> None:
     """One legend for all axes, above them."""
-    entries: dict[str, Any] = dict(extra or {})
+    entries: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
         for handle, name in zip(handles, labels, strict=True):

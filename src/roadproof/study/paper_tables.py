@@ -44,12 +44,12 @@ def _against(results: Results, ours: str, theirs: str, name: str) -> list[Table]
     home, busy, alone = results.home, results.has(traffic=True), not results.has(traffic=False)
 
     def table(kind: str, title: str, blocks: Sequence[Block]) -> Table:
-        return compare_table(results, ours, theirs, blocks, f"{kind}-{name}", f"{ours} and {theirs}: {title}")
+        return _compare_table(results, ours, theirs, blocks, f"{kind}-{name}", f"{ours} and {theirs}: {title}")
 
     differences = f"{ours} and {theirs}: differences pair by pair"
     tables = [
         table("overall", f"all scenarios, {in_words(home)}", results.overall),
-        paired_table(results, ours, theirs, results.overall, f"paired-{name}", differences),
+        _paired_table(results, ours, theirs, results.overall, f"paired-{name}", differences),
     ]
     kinds = [kind for kind in KINDS if kind in results.kinds.values()]
     if len(kinds) > 1:
@@ -79,17 +79,8 @@ def _penalty_at(results: Results, weather: str, busy: bool) -> Block:
     return Block(heading, PENALTY, weather, traffic)
 
 
-def compare_table(results: Results, ours: str, theirs: str, blocks: Sequence[Block], name: str, title: str) -> Table:
-    """The paper's layout: for each K and block theirs, ours, and the share of cases in which ours is at least theirs.
-
-    Args:
-        results: of the study.
-        ours: name of the method that is said to be better.
-        theirs: name of the other.
-        blocks: side by side.
-        name: of the table.
-        title: of the table.
-    """
+def _compare_table(results: Results, ours: str, theirs: str, blocks: Sequence[Block], name: str, title: str) -> Table:
+    """The paper's layout: for each K and block theirs, ours, and in how many cases ours is at least theirs."""
     rows: list[tuple[Cell, ...]] = []
     for figures in results.figures:
         cells: list[Cell] = [figures]
@@ -110,17 +101,8 @@ def compare_table(results: Results, ours: str, theirs: str, blocks: Sequence[Blo
     )
 
 
-def paired_table(results: Results, ours: str, theirs: str, blocks: Sequence[Block], name: str, title: str) -> Table:
-    """Mean differences with intervals, ties, and Wilcoxon's test, for each K and for all together.
-
-    Args:
-        results: of the study.
-        ours: name of the first method.
-        theirs: name of the other, whose values are taken from those of the first.
-        blocks: one below the other.
-        name: of the table.
-        title: of the table.
-    """
+def _paired_table(results: Results, ours: str, theirs: str, blocks: Sequence[Block], name: str, title: str) -> Table:
+    """Mean differences with intervals, ties, and Wilcoxon's test, for each K and for all together."""
     rows: list[tuple[Cell, ...]] = []
     for block in blocks:
         wanted = [*results.figures, *([None] if len(results.figures) > 1 else [])]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -182,9 +183,8 @@ def _grid(
         return None
     figure = Figure(figsize=size_in, layout="constrained")
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False)
-    for row, column in np.ndindex(len(rows), len(titles)):
-        axes: Axes = grid[row, column]
-        job, shown = rows[row][column], pictures[row][column]
+    for row, column in product(range(len(rows)), range(len(titles))):
+        axes, job, shown = grid[row, column], rows[row][column], pictures[row][column]
         axes.set(xticks=[], yticks=[])
         axes.spines[:].set_visible(False)
         if row == 0:

@@ -9,7 +9,7 @@ import json
 import sys
 import tomllib
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -89,32 +89,41 @@ class StartPlan(StartRange):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Job:
+class Conditions:
+    """Whom patterns are found against, and how they are judged.
+
+    Args:
+        controller: spec of the controller (`controllers.loading`).
+        weathers: of the drives that judge; patterns are found in the first.
+        traffic: cars and people beside those drives; None for drives alone.
+        starts: where those drives begin.
+        simulator: spec of the simulator (`simulators.loading`).
+    """
+
+    controller: str
+    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
+    traffic: TrafficPlan | None = None
+    starts: StartPlan = StartPlan()
+    simulator: str = "town"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Job(Conditions):
     """One pattern to be found and evaluated; independent of every other.
 
     Args:
-        controller: its spec.
-        scenario: where.
-        figures: K, or "1-b".
-        method: how.
+        scenario: where it is painted.
+        figures: K, or "1-b" for one black figure.
+        method: how it is found.
         seed: of the recording and the search.
-        weathers: of the evaluation; found in the first.
-        traffic: of the evaluation, or None.
-        starts: of the evaluation.
-        simulator: its spec, see `simulators.loading`.
         weights: digest of the file that the controller's spec names, or of the source of a function of yours; empty
             for one that comes with the package.
     """
 
-    controller: str
     scenario: Scenario
     figures: int | str
     method: MethodPlan
     seed: int
-    weathers: tuple[Weather, ...]
-    traffic: TrafficPlan | None
-    starts: StartPlan = StartPlan()
-    simulator: str = "town"
     weights: str = ""
 
     @property
@@ -128,34 +137,24 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Study:
+class Study(Conditions):
     """Scenarios × K × methods × seeds, evaluated in some weathers, with and without traffic.
 
     Args:
-        controller: its spec.
         scenarios: the stretches of road on which every method finds its patterns.
         figures: K, or "1-b" for one black figure.
         methods: how patterns are found.
         seeds: of recording and search.
-        weathers: of the evaluation; patterns are found in the first.
-        traffic: of the evaluation, or None.
-        starts: of the evaluation.
-        simulator: its spec.
         reference: name of the method that tables compare with the others; None for the first.
 
     Raises:
         StudyError: a list is empty, something stands in it twice, or a value makes no sense.
     """
 
-    controller: str
     scenarios: tuple[Scenario, ...]
     figures: tuple[int | str, ...]
     methods: tuple[MethodPlan, ...]
     seeds: tuple[int, ...] = (0,)
-    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
-    traffic: TrafficPlan | None = None
-    starts: StartPlan = StartPlan()
-    simulator: str = "town"
     reference: str | None = None
 
     def __post_init__(self) -> None:
@@ -186,21 +185,12 @@ class Study:
     @property
     def jobs(self) -> tuple[Job, ...]:
         """Every combination, scenario by scenario."""
-        weights = _digest(self.controller)
+        shared: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Conditions)}
+        shared["weights"] = _digest(self.controller)
+        combinations = product(self.scenarios, self.figures, self.methods, self.seeds)
         return tuple(
-            Job(
-                controller=self.controller,
-                scenario=scenario,
-                figures=figures,
-                method=method,
-                seed=seed,
-                weathers=self.weathers,
-                traffic=self.traffic,
-                starts=self.starts,
-                simulator=self.simulator,
-                weights=weights,
-            )
-            for scenario, figures, method, seed in product(self.scenarios, self.figures, self.methods, self.seeds)
+            Job(scenario=scenario, figures=figures, method=method, seed=seed, **shared)
+            for scenario, figures, method, seed in combinations
         )
 
 
