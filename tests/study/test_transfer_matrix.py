@@ -6,7 +6,7 @@ from roadproof.errors import StudyError
 from roadproof.report.plots import save
 from roadproof.study.results import PENALTY
 from roadproof.study.table import Estimate
-from roadproof.study.transfer_matrix import transfer_map, transfer_matrix, transfer_table
+from roadproof.study.transfer_matrix import transfer_map, transfer_table
 
 
 def drive(found_on, controller, deviation_m, scenario="left-01", **changed):
@@ -35,7 +35,7 @@ DRIVES = [
 
 
 def test_the_matrix_is_found_on_by_driven_by():
-    table = transfer_table(transfer_matrix(DataFrame(DRIVES)))
+    table = transfer_table(DataFrame(DRIVES))
     assert [heading.text for heading in table.header[1]] == ["found on", "cil", "pilotnet", "robust"]
     shown = [[cell.value if isinstance(cell, Estimate) else cell for cell in row] for row in table.rows]
     assert shown == [["cil", "1.50", "0.50", "0.25"], ["pilotnet", "0.30", "1.50", "–"]]
@@ -45,13 +45,13 @@ def test_the_matrix_is_found_on_by_driven_by():
 
 
 def test_the_penalty_has_a_matrix_of_its_own():
-    table = transfer_table(transfer_matrix(DataFrame(DRIVES), PENALTY))
+    table = transfer_table(DataFrame(DRIVES), PENALTY)
     assert table.rows[0][1].value == "3.00"
     assert table.name == "transfer-infraction-penalty"
 
 
 def test_the_heat_map_is_a_picture(tmp_path):
-    picture = transfer_map(transfer_matrix(DataFrame(DRIVES)))
+    picture = transfer_map(DataFrame(DRIVES))
     save(picture.figure, tmp_path / "map.png")
     with Image.open(tmp_path / "map.png") as drawn:
         assert drawn.size[0] > 300
@@ -65,10 +65,10 @@ def test_the_heat_map_is_a_picture(tmp_path):
 )
 def test_rows_that_make_no_matrix_are_named(rows, message):
     with pytest.raises(StudyError, match=message):
-        transfer_matrix(DataFrame(rows))
+        transfer_table(DataFrame(rows))
 
 
 def test_one_source_of_patterns_is_not_the_worst_of_any():
-    table = transfer_table(transfer_matrix(DataFrame([each for each in DRIVES if each["found_on"] == "cil"])))
+    table = transfer_table(DataFrame([each for each in DRIVES if each["found_on"] == "cil"]))
     assert not any(cell.best for cell in table.rows[0][1:])
     assert "bold" not in table.note

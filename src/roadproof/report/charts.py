@@ -25,7 +25,6 @@ from roadproof.driving.evaluation import path_of
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
-from roadproof.report.plots import LINES, draw_search, style_axes
 from roadproof.report.words import in_words
 
 VARIABLES = {
@@ -48,6 +47,7 @@ INK, MUTED, RULE, CLEAN, PAINTED, PREDICTED, CANVAS = list(VARIABLES.values())[:
 SERIES = (PAINTED, PREDICTED, VARIABLES["third"], VARIABLES["fourth"])
 
 WIDTH_IN, HEIGHT_IN = 5.2, 3.0
+_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 BEHIND_M = 20.0
 _UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m"}
 
@@ -103,8 +103,8 @@ def steering(clean: Episode, painted: Episode, fidelity: Fidelity | None, canvas
     _mark_canvas(axes, canvas)
     at, predicted = metres_past(clean, canvas), painted.paint.predicted
     for episode, colour, style, label in (
-        (clean, CLEAN, LINES[0], "bare road"),
-        (painted, PAINTED, LINES[0], "over the paint, predicted" if predicted else "driven over the paint"),
+        (clean, CLEAN, _STYLES[0], "bare road"),
+        (painted, PAINTED, _STYLES[0], "over the paint, predicted" if predicted else "driven over the paint"),
     ):
         where = metres_past(episode, canvas)[:-1]
         axes.plot(where, episode.steer, color=colour, linewidth=1.8, linestyle=style, label=label)
@@ -135,7 +135,7 @@ def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacem
         beside = -lateral_m(path_of(clean), path_of(painted))
         k, label = names.index(name), labels.pop(name, None)
         where, colour = metres_past(painted, canvas), SERIES[k % len(SERIES)]
-        axes.plot(where, beside, color=colour, linestyle=LINES[k % 4], linewidth=width, label=label)
+        axes.plot(where, beside, color=colour, linestyle=_STYLES[k % 4], linewidth=width, label=label)
     axes.set_xlim(-HORIZON_M - 2, None)
     _legend(axes, columns=2)
     predicted = any(painted.paint.predicted for _, _, painted in drives)
@@ -150,8 +150,8 @@ def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     ahead = np.array([math.cos(canvas.yaw_rad), math.sin(canvas.yaw_rad)])
     for path, label, colour, style in (
-        (prediction.predicted_xy, "predicted in the recorded world", PREDICTED, LINES[1]),
-        (prediction.driven_xy, "driven", PAINTED, LINES[0]),
+        (prediction.predicted_xy, "predicted in the recorded world", PREDICTED, _STYLES[1]),
+        (prediction.driven_xy, "driven", PAINTED, _STYLES[0]),
     ):
         where = (path - (canvas.x_m, canvas.y_m)) @ ahead + canvas.length_m / 2
         beside = -lateral_m(prediction.clean_xy, path)
@@ -168,7 +168,12 @@ def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
 def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], objective: str) -> Chart:
     """The search: every start thin, the best so far of each group bold."""
     figure, axes = _axes("iteration", f"{objective}, {_UNITS.get(objective, 'its own unit')}")
-    draw_search(axes, history, [f"best of {name}" for name in groups], SERIES)
+    steps = np.arange(1, len(history) + 1)
+    for k, name in enumerate(groups):
+        colour = SERIES[k % len(SERIES)]
+        axes.plot(steps, history[:, k], color=colour, alpha=0.35, linewidth=0.8)
+        best = np.maximum.accumulate(history[:, k].max(axis=1))
+        axes.plot(steps, best, color=colour, linestyle=_STYLES[k % 4], linewidth=2.0, label=f"best of {name}")
     axes.axhline(0.0, color=MUTED, linewidth=0.6)
     _legend(axes, columns=1)
     words = "What the search gained on composited frames, every start and the best of each group"
@@ -183,7 +188,13 @@ def told(events: Sequence[Event]) -> list[tuple[str, str, str]]:
 def _axes(x: str, y: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
     axes = figure.add_subplot()
-    style_axes(axes, x, y, text=MUTED, lines=RULE, grid=RULE)
+    axes.set_xlabel(x, color=MUTED, fontsize=9)
+    axes.set_ylabel(y, color=MUTED, fontsize=9)
+    axes.tick_params(colors=MUTED, labelsize=9, length=3, width=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(RULE)
+    axes.grid(axis="y", color=RULE, linewidth=0.5)
+    axes.set_axisbelow(True)
     axes.margins(x=0.01)
     return figure, axes
 

@@ -1,10 +1,9 @@
-"""Plots of an attack, and what all charts have in common; drawn without a screen and without global state."""
+"""Plots of an attack, drawn without a screen and without global state."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,8 +14,6 @@ from roadproof.io.files import write_atomically
 
 _SIDES = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
 _INK = "#222222"
-LINES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
-"""Line styles that tell series apart without their colours."""
 
 
 def search_curves(history: Float[np.ndarray, "i g r"], groups: Sequence[str], path: Path) -> None:
@@ -32,52 +29,17 @@ def search_curves(history: Float[np.ndarray, "i g r"], groups: Sequence[str], pa
     """
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axes = figure.add_subplot()
-    draw_search(axes, history, [f"{name}: {best:.2f}" for name, best in zip(groups, history.max((0, 2)), strict=True)])
+    steps = np.arange(1, len(history) + 1)
+    for index, (name, colour) in enumerate(zip(groups, _SIDES, strict=False)):
+        axes.plot(steps, history[:, index], color=colour, alpha=0.3, linewidth=0.8)
+        best = np.maximum.accumulate(history[:, index].max(axis=1))
+        axes.plot(steps, best, color=colour, linewidth=2.2, label=f"{name}: {best[-1]:.2f}")
     axes.axhline(0.0, color=_INK, linewidth=0.6)
     axes.set_xlabel("iteration")
     axes.set_ylabel("mean steering shift a frame\n(surrogate, steer units)")
     axes.legend(frameon=False, title="best of each group")
     _finish(axes)
     save(figure, path)
-
-
-def draw_search(
-    axes: Axes, history: Float[np.ndarray, "i g r"], labels: Sequence[str], colours: Sequence[str] = _SIDES
-) -> None:
-    """Every start of a search thin, the best so far of each group bold.
-
-    Args:
-        axes: to draw on.
-        history: value at every iteration, group and start.
-        labels: of the groups.
-        colours: of the groups, in turn.
-    """
-    steps = np.arange(1, len(history) + 1)
-    for k, label in enumerate(labels):
-        colour = colours[k % len(colours)]
-        axes.plot(steps, history[:, k], color=colour, alpha=0.3, linewidth=0.8)
-        best = np.maximum.accumulate(history[:, k].max(axis=1))
-        axes.plot(steps, best, color=colour, linestyle=LINES[k % len(LINES)], linewidth=2.0, label=label)
-
-
-def style_axes(axes: Axes, x: str, y: str, *, text: str, lines: str, grid: str) -> None:
-    """Name axes in small letters, with two spines and a grid that stays behind the data.
-
-    Args:
-        axes: to style.
-        x: name of the x axis.
-        y: name of the y axis.
-        text: colour of names and ticks.
-        lines: colour of both spines.
-        grid: colour of the grid.
-    """
-    axes.set_xlabel(x, color=text, fontsize=9)
-    axes.set_ylabel(y, color=text, fontsize=9)
-    axes.tick_params(colors=text, labelsize=9, length=3, width=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(lines)
-    axes.grid(axis="y", color=grid, linewidth=0.5)
-    axes.set_axisbelow(True)
 
 
 def film_strip(

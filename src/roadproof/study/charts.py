@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from roadproof.report.plots import LINES, style_axes
 from roadproof.report.words import in_words
 from roadproof.study.history import Course
 from roadproof.study.kept_jobs import KeptJob
@@ -24,6 +23,7 @@ from roadproof.study.statistics import mean_over_scenarios
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.4)), (0, (6, 2, 1, 2)))
 INK, MUTED, RULE = "#1c2126", "#575e66", "#dcd9d1"
 
 
@@ -63,7 +63,7 @@ def by_figures(results: Results) -> Picture:
         axes.set_xlim(-0.5, len(results.figures) - 0.5)
         axes.set_ylim(bottom=0.0)
         named = f"{block.metric.title.lower()}, {block.metric.unit}"
-        style_axes(axes, "K, figures of the pattern", named, text=MUTED, lines=MUTED, grid=RULE)
+        _label(axes, "K, figures of the pattern", named)
     legend(figure)
     how = f"penalty {'in traffic' if results.overall[1].traffic else 'alone on the road'}"
     return Picture(
@@ -119,7 +119,7 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
             _plain_ticks(axes)
             axes.set_ylim(bottom=0.0)
             reached = "deviation of the best so far, m" if column == 0 else ""
-            style_axes(axes, name, reached, text=MUTED, lines=MUTED, grid=RULE)
+            _label(axes, name, reached)
             if row == 0:
                 axes.set_title(f"K = {figures}", fontsize=10, color=INK)
     legend(figure)
@@ -164,6 +164,16 @@ def _aligned(
     x = np.unique(np.geomspace(max(first, 1e-3), max(last, 1e-3), 400))
     steps = [own[(np.searchsorted(at, x, side="right") - 1).clip(0)] for at, own in zip(axes, values, strict=True)]
     return x, np.stack(steps)
+
+
+def _label(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, color=MUTED, fontsize=9)
+    axes.set_ylabel(y, color=MUTED, fontsize=9)
+    axes.tick_params(colors=MUTED, labelsize=9, length=3, width=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
+    axes.grid(axis="y", color=RULE, linewidth=0.6)
+    axes.set_axisbelow(True)
 
 
 def legend(figure: Figure) -> None:

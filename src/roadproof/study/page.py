@@ -26,7 +26,7 @@ from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, res
 from roadproof.study.rows import Frame
 from roadproof.study.table import Table, in_latex, in_markdown, markdown_text
 from roadproof.study.table_notes import counted
-from roadproof.study.transfer_matrix import transfer_map, transfer_matrix, transfer_table
+from roadproof.study.transfer_matrix import transfer_map, transfer_table
 
 
 def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = None) -> Path:
@@ -48,13 +48,13 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     check_jobs(rows)
     jobs = read_jobs(folder, rows)
     results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder))
-    matrices = [] if transfer is None else [transfer_matrix(transfer, metric) for metric in (DEVIATION, PENALTY)]
+    driven = [] if transfer is None else [(transfer, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))
-    shown = (*drawn, gallery(results, jobs), in_weathers(results, jobs), *map(transfer_map, matrices))
+    shown = (*drawn, gallery(results, jobs), in_weathers(results, jobs), *(transfer_map(*each) for each in driven))
     pictures = [picture for picture in shown if picture is not None]
     for picture in pictures:
         save(picture.figure, out / "figures" / f"{picture.name}.png")
-    tables = [*paper_tables(results), *map(transfer_table, matrices)]
+    tables = [*paper_tables(results), *(transfer_table(*each) for each in driven)]
     # A list of what was missing does not outlive the gaps.
     (out / f"{GAPS}.tex").unlink(missing_ok=True)
     for table in tables:

@@ -9,7 +9,7 @@ import json
 import sys
 import tomllib
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -106,6 +106,11 @@ class Conditions:
     starts: StartPlan = StartPlan()
     simulator: str = "town"
 
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The conditions alone, by name."""
+        return {each.name: getattr(self, each.name) for each in fields(Conditions)}
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Job(Conditions):
@@ -185,11 +190,10 @@ class Study(Conditions):
     @property
     def jobs(self) -> tuple[Job, ...]:
         """Every combination, scenario by scenario."""
-        shared: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(Conditions)}
-        shared["weights"] = _digest(self.controller)
+        more: dict[str, Any] = {"weights": _digest(self.controller), **self.shared}
         combinations = product(self.scenarios, self.figures, self.methods, self.seeds)
         return tuple(
-            Job(scenario=scenario, figures=figures, method=method, seed=seed, **shared)
+            Job(scenario=scenario, figures=figures, method=method, seed=seed, **more)
             for scenario, figures, method, seed in combinations
         )
 
@@ -230,19 +234,14 @@ def _check_harmless(study: Study) -> None:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Stated:
+class _Stated(Conditions):
     """A plan as its file says it."""
 
-    controller: str
     scenarios: tuple[str, ...]
     figures: tuple[int | str, ...]
     method: tuple[dict[str, Any], ...]
     scenario_file: str | None = None
     seeds: tuple[int, ...] = (0,)
-    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
-    traffic: dict[str, Any] | None = None
-    starts: dict[str, Any] = field(default_factory=dict[str, Any])
-    simulator: str = "town"
     reference: str | None = None
 
 
@@ -253,22 +252,20 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
         raise StudyError(
             f"version is {version!r}, expected {FORMAT_VERSION}; version 1 had other keys, see docs/studies.md"
         )
-    stated = build(_Stated, content, "the study")
+    tables = {"traffic": TrafficPlan, "starts": StartPlan}
+    built = {name: build(tables[name], content[name], name) for name in tables if isinstance(content.get(name), dict)}
+    stated = build(_Stated, content | built, "the study")
     listed = stated.scenario_file
     own = BUILTIN_FILE if listed is None else folder / listed
     if listed is not None and not own.resolve().is_relative_to(folder.resolve()):
         raise StudyError(f"scenario_file {listed!r} leaves the study's folder; put it beside the study")
     return Study(
-        controller=stated.controller,
         scenarios=_chosen(stated.scenarios, load_scenarios(own)),
         figures=stated.figures,
         methods=tuple(map(method_plan, stated.method)),
         seeds=stated.seeds,
-        weathers=stated.weathers,
-        traffic=None if stated.traffic is None else build(TrafficPlan, stated.traffic, "traffic"),
-        starts=build(StartPlan, stated.starts, "starts"),
-        simulator=stated.simulator,
         reference=stated.reference,
+        **stated.shared,
     )
 
 
