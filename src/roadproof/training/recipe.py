@@ -48,7 +48,7 @@ class Recipe:
     Args:
         network: "cil" or "pilotnet" (the conditional one).
         width: CIL's factor on channels and units.
-        seed: of ways, traffic, knocks, weights, batches.
+        seed: of scenarios, traffic, disturbances, weights, batches.
         start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
         drives: of the expert.
         painted_drives: of the expert over random paint, besides.
@@ -110,7 +110,7 @@ class Recipe:
             drives=self.round_drives,
             seed=self.seed + 1000 * number,
             controller=str(controller),
-            knocked=0.5,
+            disturbed=0.5,
             painted=0.5 if self.painted_drives else 0.0,
         )
 

@@ -6,7 +6,7 @@ import queue
 
 from roadproof.simulators.carla.actors import Crowd
 from roadproof.simulators.carla.session import Session, carla
-from roadproof.simulators.tracker.body import Contact
+from roadproof.simulators.tracker.judge import Contact
 
 
 class Collisions:

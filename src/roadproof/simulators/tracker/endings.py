@@ -51,4 +51,9 @@ class Endings:
             return Ending.STANDS
         if stood_s >= BLOCKED_S:
             return Ending.BLOCKED
-        return Ending.TIME_LIMIT if time_s >= self._limit_s - 1e-9 else None
+        return Ending.TIME_LIMIT if time_is_up(time_s, self._limit_s) else None
+
+
+def time_is_up(time_s: float, limit_s: float) -> bool:
+    """Whether a time limit is reached, whatever the rounding of steps."""
+    return time_s >= limit_s - 1e-9

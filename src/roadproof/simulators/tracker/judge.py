@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Event, EventKind, VehicleState
 from roadproof.roads.roadmap import RoadMap, Surface
-from roadproof.simulators.tracker.body import LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
+
+LENGTH_M, WIDTH_M, HEIGHT_M = 4.5, 1.9, 1.45
+WHEELBASE_M, TRACK_M = 2.8, 1.6
+"""Measures of the driven car."""
 
 PERSON_RADIUS_M = 0.3
 REARM_S = 1.0
@@ -20,6 +24,14 @@ _COLLISIONS = {
     "vehicle": EventKind.COLLISION_VEHICLE,
     "pedestrian": EventKind.COLLISION_PEDESTRIAN,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """The car touches something: what kind of thing, and which one."""
+
+    kind: str
+    name: str
 
 
 class Judge:

@@ -1,4 +1,4 @@
-"""What drives to learn from are made of: random ways through a map, and the knocks that make recovery worth recording.
+"""Random scenarios to learn from, and the disturbances that make the expert's recovery worth recording.
 
 Convention:
     Offsets and headings are positive to the left, `steer` to the right, as everywhere.
@@ -55,18 +55,18 @@ def random_scenario(
     command: Command = Command.FOLLOW,
     displacement: Displacement | None = None,
 ) -> Scenario:
-    """A random way through a map, 60 to 150 m long, with a canvas at a random place on it.
+    """A random route through a map, 60 to 150 m long, with a canvas at a random place on it.
 
     Args:
         roads: the map.
         map_name: its name.
         generator: where the randomness comes from.
         name: of the scenario.
-        command: one of the junctions on the way asks for it; follow asks for nothing.
+        command: one of the junctions on the route asks for it; follow asks for nothing.
         displacement: how the car starts; None starts it at rest in the middle of its lane.
 
     Raises:
-        ScenarioError: the map has no such way.
+        ScenarioError: the map has no such route.
     """
     driving = [lane for lane in roads.lanes if lane.kind == "driving"]
     lengths = np.array([lane.length_m for lane in driving])
@@ -97,10 +97,10 @@ def random_scenario(
         except ScenarioError:
             continue
         return scenario
-    raise ScenarioError(f"no way of {LENGTHS_M[0]:.0f} m with the command {command.name} was found on map {map_name}")
+    raise ScenarioError(f"no route of {LENGTHS_M[0]:.0f} m with the command {command.name} was found on map {map_name}")
 
 
-class Knocks:
+class Disturbance:
     """Disturbs the controls of one drive: triangles on the steering, steps on the pedals, with pauses between them.
 
     Args:
