@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Control, Observation, VehicleState
+from roadproof.roads.polylines import interpolated
 from roadproof.roads.routes import Route
 from roadproof.traffic.agents import (
     CAR_LENGTH_M,
@@ -133,8 +134,8 @@ class Expert:
         route = self._route
         beyond = np.maximum(at - route.length_m, 0.0)
         end = float(route.headings_rad[-1])
-        x = np.interp(at, route.arclengths_m, route.points[:, 0]) + beyond * math.cos(end)
-        y = np.interp(at, route.arclengths_m, route.points[:, 1]) + beyond * math.sin(end)
+        x, y = interpolated(at, route.arclengths_m, route.points[:, :2]).T
+        x, y = x + beyond * math.cos(end), y + beyond * math.sin(end)
         free_m, leader = first_in_way(
             x[None],
             y[None],

@@ -10,11 +10,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from roadproof.datatypes import Command, Control, VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.lanes import Lane
 from roadproof.roads.maps import check_canvas, scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.roads.routes import Route
@@ -74,7 +74,7 @@ def random_scenario(
         lane = driving[int(generator.choice(len(driving), p=lengths / lengths.sum()))]
         at_m, reach_m = generator.uniform(0.0, lane.length_m), generator.uniform(*LENGTHS_M)
         goal = _walk(roads, lane.index, at_m, reach_m, generator)
-        start = _start(*_on(lane.centre, lane.stations_m, lane.headings_rad, at_m), displacement, generator)
+        start = _start(lane, at_m, displacement, generator)
         if goal is None or math.dist(goal, (start.x_m, start.y_m)) < 20.0:
             continue
         try:
@@ -152,26 +152,12 @@ def _walk(
     end = roads.lanes[lane]
     if end.junction is not None:
         return None
-    x, y, _ = _on(end.centre, end.stations_m, end.headings_rad, left_m)
+    x, y, *_ = end.at(left_m)
     return x, y
 
 
-def _on(
-    centre: Float[np.ndarray, "n 3"],
-    stations_m: Float[np.ndarray, " n"],
-    headings: Float[np.ndarray, " n"],
-    at_m: float,
-) -> tuple[float, float, float]:
-    return (
-        float(np.interp(at_m, stations_m, centre[:, 0])),
-        float(np.interp(at_m, stations_m, centre[:, 1])),
-        float(np.interp(at_m, stations_m, headings)),
-    )
-
-
-def _start(
-    x: float, y: float, yaw: float, displacement: Displacement | None, generator: np.random.Generator
-) -> VehicleState:
+def _start(lane: Lane, at_m: float, displacement: Displacement | None, generator: np.random.Generator) -> VehicleState:
+    x, y, _, yaw = lane.at(at_m)
     aside = turn = speed = 0.0
     if displacement is not None:
         d = displacement

@@ -64,7 +64,7 @@ def road_pieces(map_name: str, roads: RoadMap) -> tuple[Piece, ...]:
             if not inside.any() or float(np.ptp(lane.headings_rad[inside])) > STRAIGHT_RAD:
                 continue
             middle = begin + PIECE_M / 2
-            x, y, z = (float(np.interp(middle, lane.stations_m, lane.centre[:, axis])) for axis in range(3))
+            x, y, z, _ = lane.at(middle)
             heading = float(lane.headings_rad[inside].mean())
             left_m = (width_m - lane.width_m) / 2
             placement = CanvasPlacement(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.carla_server.wire import Pose6
 
@@ -20,8 +18,6 @@ def spawn_points(roads: RoadMap) -> list[Pose6]:
         if lane.kind != "driving" or lane.junction is not None:
             continue
         for k in range(int(lane.length_m // EVERY_M)):
-            s = (k + 0.5) * EVERY_M
-            x, y, z = (float(np.interp(s, lane.stations_m, lane.centre[:, axis])) for axis in range(3))
-            heading = float(np.interp(s, lane.stations_m, lane.headings_rad))
+            x, y, z, heading = lane.at((k + 0.5) * EVERY_M)
             places.append((x, -y, z + UP_M, 0.0, -math.degrees(heading), 0.0))
     return places

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from roadproof.roads.lanes import Lane
+from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder, Pose, Rgb
 from roadproof.simulators.town.models import PAINTS, Body, car
@@ -41,8 +42,7 @@ class Solid:
     @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
         """Its footprint, counter-clockwise."""
-        a, b = self.half_m
-        return self.pose.place(np.array([(-a, -b, 0), (a, -b, 0), (a, b, 0), (-a, b, 0)], float))[:, :2]
+        return edge_corners(self.pose, *self.half_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,13 +150,13 @@ class _Edge:
     def __init__(self, lane: Lane) -> None:
         self.lane = lane
         self.points = lane.right
-        self.stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lane.right, axis=0), axis=1))])
+        self.stations = polyline_stations(lane.right)
         self.length_m = float(self.stations[-1])
 
     def pose(self, station_m: float, right_m: float) -> Pose:
         """A place beside the edge, turned along it."""
         s = min(max(station_m, 0.3), self.length_m - 0.3)
-        (x0, x1), (y0, y1) = (np.interp([s - 0.3, s + 0.3], self.stations, self.points[:, k]).tolist() for k in (0, 1))
+        (x0, y0), (x1, y1) = interpolated(np.array([s - 0.3, s + 0.3]), self.stations, self.points[:, :2]).tolist()
         yaw = math.atan2(y1 - y0, x1 - x0)
         return Pose((x0 + x1) / 2, (y0 + y1) / 2, yaw).ahead(station_m - s, -right_m)
 
