@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +19,7 @@ from jaxtyping import Float
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.roads.polylines import interpolated
 from roadproof.roads.routes import Route
+from roadproof.simulators.protocol import OpenWorld
 from roadproof.traffic.agents import (
     CAR_LENGTH_M,
     CAR_WIDTH_M,
@@ -59,28 +59,8 @@ class Manner:
     sight_m: float = 4.5
 
 
-@runtime_checkable
-class OpenWorld(Protocol):
-    """A simulator that hides nothing of the drive under way; the town is one."""
-
-    @property
-    def route(self) -> Route:
-        """The way to the goal."""
-        ...
-
-    @property
-    def cars(self) -> Agents:
-        """The others now."""
-        ...
-
-    @property
-    def pedestrians(self) -> Agents:
-        """The people now."""
-        ...
-
-
 def expert(world: OpenWorld) -> Callable[[Observation], Control]:
-    """The expert as the driver of a `rollout`: gets in after the reset and drives what is under way."""
+    """The expert as the driver of a `rollout`: made after the reset, it drives what is under way."""
     driver = Expert(world.route)
     return lambda seen: driver.drive(seen.state, world.cars, world.pedestrians)
 

@@ -56,7 +56,7 @@ def test_a_sound_server_is_found_sound(port):
     assert tuple(told) == findings.checks
     assert "native: squares are seen within" in str(findings)
     assert "differ by up to 0.000 m and 0.00 levels" in str(findings)
-    assert str(findings).endswith("everything works")
+    assert str(findings).endswith("all checks passed")
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from roadproof.simulators.town.meshes import ORIGIN, Mesh, MeshBuilder, Pose, Rgb
+from roadproof.simulators.town.meshes import ORIGIN, Mesh, MeshBuilder, Pose, Rgb, lofted
 
 GLASS: Rgb = (0.13, 0.16, 0.19)
 SKY_IN_GLASS: Rgb = (0.36, 0.42, 0.48)
@@ -224,6 +224,4 @@ def _limb(
     angle = np.linspace(0, 2 * math.pi, 7)
     circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(7)])
     points = np.concatenate([circle * lower + bottom, circle * upper + top])
-    i = np.arange(6)
-    triangles = np.concatenate([np.stack([i, i + 1, i + 8], -1), np.stack([i, i + 8, i + 7], -1)])
-    builder.add(points, np.concatenate([circle, circle]), np.zeros((14, 2)), albedo, triangles)
+    builder.add(points, np.concatenate([circle, circle]), np.zeros((14, 2)), albedo, lofted(2, 6))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from roadproof.simulators.town.engine import VERTEX, Node, make_node
-from roadproof.simulators.town.meshes import Mesh
+from roadproof.simulators.town.meshes import Mesh, Pose
 from roadproof.simulators.town.weather import Sky
 
 
@@ -21,9 +21,8 @@ def shaded(mesh: Mesh, sky: Sky, sunlit: Float[np.ndarray, " n"]) -> UInt8[np.nd
 
 def turned(mesh: Mesh, yaw_rad: float) -> Mesh:
     """The mesh with its normals turned, for light."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Mesh(mesh.points, (mesh.normals @ rotation.T).round(4), mesh.uv, mesh.albedo, mesh.triangles)
+    normals = mesh.normals @ Pose(0.0, 0.0, yaw_rad).rotation.T
+    return replace(mesh, normals=normals.round(4))
 
 
 def rgba(colour: Float[np.ndarray, "n 3"], alpha: float = 1.0) -> UInt8[np.ndarray, "n 4"]:
