@@ -11,9 +11,8 @@ from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, Homography
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
-from roadproof.simulators.carla.actors import Crowd, place_driven, spawn_driven, vehicle_state
+from roadproof.simulators.carla.actors import Collisions, Crowd, place_driven, spawn_driven, vehicle_state
 from roadproof.simulators.carla.cameras import Camera
-from roadproof.simulators.carla.collisions import Collisions
 from roadproof.simulators.carla.inject import Paint, Scene
 from roadproof.simulators.carla.native import Ground, SeveralPiecesError, find_ground, lay
 from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch

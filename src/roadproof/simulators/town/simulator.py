@@ -67,15 +67,6 @@ class TownSimulator(RouteSimulator[_Drive]):
         """How patterns are put on the road: rendered with it."""
         return PaintKind.RENDERED
 
-    @property
-    def roads(self) -> RoadMap:
-        """The map of the current drive.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
-        return self.road_map(self._running().scenario.map_name)
-
     def road_map(self, name: str) -> RoadMap:
         """The map a scenario names; it needs no drive.
 

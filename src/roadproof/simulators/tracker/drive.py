@@ -13,8 +13,7 @@ from roadproof.roads.maps import scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Pictures
-from roadproof.simulators.tracker.endings import Endings, time_is_up
-from roadproof.simulators.tracker.judge import Contact, Judge
+from roadproof.simulators.tracker.judge import Contact, Endings, Judge, time_is_up
 from roadproof.traffic.agents import NOBODY, Agents
 from roadproof.traffic.traffic import Traffic
 

@@ -6,13 +6,14 @@ from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CameraModel, CropResize
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.roads.roadmap import RoadMap
 from roadproof.roads.routes import Route, RoutePosition
 from roadproof.scenarios import Scenario
-from roadproof.simulators.arguments import check_crop, check_pattern
 from roadproof.simulators.protocol import PatternImage, Pictures
 from roadproof.simulators.tracker.drive import DriveTracker, Request, RouteTracker
 from roadproof.traffic.agents import Agents
@@ -35,7 +36,11 @@ class TrackedSimulator(ABC, Generic[DriveT]):
     """
 
     def __init__(self, camera: CameraModel, input: CropResize, dt_s: float) -> None:  # noqa: A002
-        check_crop(camera, input)
+        if input.right_px > camera.width_px or input.bottom_px > camera.height_px:
+            raise SimulatorError(
+                f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
+                f"{camera.width_px}×{camera.height_px} pixels"
+            )
         self._camera, self._input, self._dt_s = camera, input, dt_s
         self._is_open = False
         self._drive: DriveT | None = None
@@ -95,7 +100,11 @@ class TrackedSimulator(ABC, Generic[DriveT]):
         """
         if not self._is_open:
             raise SimulatorError("the simulator is closed; use it in a with-block")
-        check_pattern(pattern)
+        shape = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
+        if pattern is not None and (pattern.shape != shape or pattern.dtype != np.uint8):
+            raise SimulatorError(
+                f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {shape} (RGBA)"
+            )
         request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, full_pictures)
         self._drive = self._begin(request)
         return self._observe(self._drive)
@@ -140,42 +149,29 @@ class TrackedSimulator(ABC, Generic[DriveT]):
 
 
 class RouteSimulator(TrackedSimulator[RouteDriveT]):
-    """A simulator with a map: its drives follow a route among traffic and are judged."""
+    """A simulator with a map: its drives follow a route among traffic and are judged.
+
+    Route, place, cars and pedestrians are those of the current drive; without one they raise a SimulatorError.
+    """
 
     @property
     def route(self) -> Route:
-        """The route of the current drive.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
+        """The way to the goal."""
         return self._running().route
 
     @property
     def place(self) -> RoutePosition:
-        """Where the car is along the route.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
+        """Where the car is along the route."""
         return self._running().place
 
     @property
     def cars(self) -> Agents:
-        """The other cars as they are now.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
+        """The other cars as they are now."""
         return self._running().cars
 
     @property
     def pedestrians(self) -> Agents:
-        """The people as they are now.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
+        """The people as they are now."""
         return self._running().pedestrians
 
     @abstractmethod
