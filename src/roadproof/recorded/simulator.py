@@ -169,7 +169,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         Raises:
             SimulatorError: there was no reset.
         """
-        return _told(self._world.bank.nearest(_poses(self._running().car)))
+        return _gap_of(self._world.bank.nearest(_poses(self._running().car)))
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px.
@@ -211,7 +211,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
         turned = math.remainder(asked.yaw_rad - here.yaw_rad, 2 * math.pi)
         right_m = s * dx - c * dy
-        if abs(c * dx + s * dy) > SAME_PLACE_M or not _told_of(right_m, turned).inside:
+        if abs(c * dx + s * dy) > SAME_PLACE_M or not RecordedGap(0.0, -right_m, turned).inside:
             return Start()
         return Start(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
 
@@ -228,7 +228,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         nearest = self._world.bank.nearest(poses)
         frame = self._frame(poses, nearest, drive.pattern)
         ending = None
-        if not _told(nearest).inside:
+        if not _gap_of(nearest).inside:
             ending = Ending.LEFT_RECORDED
         elif course.locate(poses).s_m >= course.arclength_m[course.first + course.count - 1]:
             ending = Ending.GOAL_REACHED
@@ -258,12 +258,8 @@ def _poses(car: Motion) -> Poses:
     return Poses(car.x_m, car.y_m, car.yaw_rad)
 
 
-def _told(gap: Gap) -> RecordedGap:
+def _gap_of(gap: Gap) -> RecordedGap:
     return RecordedGap(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
-
-
-def _told_of(right_m: float, turned_rad: float) -> RecordedGap:
-    return RecordedGap(0.0, -right_m, turned_rad)
 
 
 def _check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:

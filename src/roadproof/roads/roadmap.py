@@ -20,7 +20,7 @@ from roadproof.errors import ScenarioError
 from roadproof.roads.junctions import Corner, JunctionArea, junction_areas, triangulated
 from roadproof.roads.lanes import Lane, MarkLine, build_lanes
 from roadproof.roads.opendrive import read_opendrive
-from roadproof.roads.routes import Route, route_along, shortest_way
+from roadproof.roads.routes import Route, route_along, shortest_path
 from roadproof.roads.spatial import SegmentIndex, TriangleIndex
 
 MAX_EXTENT_M = 5000.0
@@ -159,7 +159,7 @@ class RoadMap:
         problem: ScenarioError | None = None
         for index, to_m in ends:
             try:
-                way = shortest_way(self.lanes, (begin.lane, begin.arclength_m), (index, to_m))
+                way = shortest_path(self.lanes, (begin.lane, begin.arclength_m), (index, to_m))
             except ScenarioError as error:
                 problem = error
                 continue

@@ -104,7 +104,7 @@ class Route:
         return x, y, z, float(np.interp(arclength_m, self.arclengths_m, self.headings_rad))
 
 
-def shortest_way(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[int, float]) -> tuple[int, ...]:
+def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[int, float]) -> tuple[int, ...]:
     """Lanes from a place (lane, arc length) to another, by A* over lane lengths with the straight line as its bound.
 
     Raises:

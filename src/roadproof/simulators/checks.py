@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -256,26 +257,9 @@ class _Kit:
         _expect(float(off.mean()) < COLOUR_TOLERANCE, f"grey paint is {off.mean():.1f} levels off linear on average")
         return f"grey paint is within {off.mean():.2f} levels of linear on average"
 
-    def _drive(
-        self,
-        control: Control,
-        *,
-        pattern: PatternImage | None = None,
-        weather: Weather = Weather.CLEAR_NOON,
-        cars: int = 0,
-        pedestrians: int = 0,
-        seed: int = 0,
-        full_pictures: bool = False,
-    ) -> list[Observation]:
-        first = self._simulator.reset(
-            self._scenario,
-            pattern=pattern,
-            weather=weather,
-            cars=cars,
-            pedestrians=pedestrians,
-            seed=seed,
-            full_pictures=full_pictures,
-        )
+    def _drive(self, control: Control, **asked: Any) -> list[Observation]:  # noqa: ANN401
+        """A short drive with one control; `asked` goes to its reset."""
+        first = self._simulator.reset(self._scenario, **asked)
         return [first, *(self._simulator.step(control) for _ in range(self._steps))]
 
     def _at_canvas(self, pattern: PatternImage | None) -> Observation:

@@ -23,12 +23,12 @@ AHEAD = Control(0.0, throttle=0.6)
 COLOURS = ((200, 40, 40), (40, 180, 40), (50, 60, 200), (220, 220, 220))
 
 
-def examine(simulator: CarlaSimulator, told: Callable[[Check], object] = lambda _: None) -> SimulatorReport:
+def examine(simulator: CarlaSimulator, on_check: Callable[[Check], object] = lambda _: None) -> SimulatorReport:
     """Drive a server, not yet connected, over a straight stretch of the map it has loaded.
 
     Args:
         simulator: not yet entered.
-        told: told of each check as it is made.
+        on_check: called with each check as it is made.
 
     Returns:
         Checks of connection, map, pictures, speed, repeatability, road, paint, native paint, traffic and clean-up.
@@ -39,7 +39,7 @@ def examine(simulator: CarlaSimulator, told: Callable[[Check], object] = lambda 
     def found(name: str, look: Callable[[], str]) -> bool:
         check = checked(name, look)
         checks.append(check)
-        told(check)
+        on_check(check)
         return check.passed
 
     server = _Examination(simulator)
