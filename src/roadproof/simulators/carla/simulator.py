@@ -194,6 +194,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
             lay(session, self._ground_of(scenario), request.pattern)
         set_weather(session, request.weather)
         drive.ego = spawn_driven(session, scenario.start)
+        # The others stand where they were spawned while the car settles.
         drive.crowd = None
         crowd = None if drive.traffic is None else Crowd(session, drive.traffic)
         # Lights would go on from where the last drive left them; each drive has to find them alike.
