@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,8 @@ from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
-from roadproof.io.files import read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.records import RecordFile
 
-FORMAT = "roadproof-calibration"
-FORMAT_VERSION = 1
 _GRID = 9
 
 
@@ -78,8 +74,10 @@ class CalibrationReport:
         Raises:
             OutputError: the file cannot be written.
         """
-        content = {"format": FORMAT, "version": FORMAT_VERSION, **asdict(self)}
-        write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+        REPORT_FILE.write(path, self)
+
+
+REPORT_FILE = RecordFile(CalibrationReport, "roadproof-calibration", 1, CalibrationError, "calibrate again")
 
 
 def load_report(path: Path) -> CalibrationReport:
@@ -88,8 +86,7 @@ def load_report(path: Path) -> CalibrationReport:
     Raises:
         CalibrationError: the file is missing or damaged.
     """
-    content = read_json(path, FORMAT, FORMAT_VERSION, CalibrationError)
-    return record(content, CalibrationReport, path, CalibrationError, "calibrate again")
+    return REPORT_FILE.read(path)
 
 
 def stated_errors_px(

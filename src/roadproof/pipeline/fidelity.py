@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +18,12 @@ from roadproof.datatypes import Control, Observation
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import EpisodeError, RecordingError
-from roadproof.io.arrays import read_record, write_archive
+from roadproof.io.records import RecordFile
 from roadproof.patterns import Pattern
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
-
-FORMAT = "roadproof-fidelity"
-FORMAT_VERSION = 1
-_ARRAYS = ("frame_number", "clean", "composited", "rendered", "clean_steer", "composited_steer", "rendered_steer")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -62,8 +58,7 @@ class Fidelity:
         Raises:
             OutputError: it cannot be written.
         """
-        header = {"format": FORMAT, "version": FORMAT_VERSION, "drive": self.drive, "agreement": asdict(self.agreement)}
-        write_archive(path, {name: getattr(self, name) for name in _ARRAYS}, header)
+        FIDELITY_FILE.write(path, self)
 
     @staticmethod
     def load(path: Path) -> Fidelity:
@@ -72,13 +67,10 @@ class Fidelity:
         Raises:
             EpisodeError: the file is missing, damaged or of another format.
         """
-        header, arrays = read_record(
-            path, _ARRAYS, EpisodeError, "evaluate again", format_version=(FORMAT, FORMAT_VERSION)
-        )
-        try:
-            return Fidelity(drive=str(header["drive"]), agreement=Agreement(**header["agreement"]), **arrays)
-        except (KeyError, TypeError, ValueError) as error:
-            raise EpisodeError(f"{path} is incomplete ({error!r}); evaluate again") from None
+        return FIDELITY_FILE.read(path)
+
+
+FIDELITY_FILE = RecordFile(Fidelity, "roadproof-fidelity", 1, EpisodeError, "evaluate again")
 
 
 def compare_with_rendered(
