@@ -90,7 +90,7 @@ def rows_of(cell: Cell) -> list[Row]:
             driver_name=cell.controller,
             folder=cell.folder / "record",
         )
-        calibrated = Calibrated.load(cell.folder)
+        calibrated = Calibrated.kept(cell.folder, drives, QUICK.calibration)
         if calibrated is None:
             calibrated = calibrate(town, drives, QUICK.calibration, folder=cell.folder / "calibration")
             calibrated.save(cell.folder)
@@ -101,6 +101,7 @@ def rows_of(cell: Cell) -> list[Row]:
             place = cell.folder / name
             found = kept_attack(
                 place / "attack",
+                {"method": repr(method), "objective": objective.name, "seed": cell.seed},
                 lambda checkpoint, objective=objective, method=method: attack(
                     calibrated.recordings,
                     controller,

@@ -132,7 +132,10 @@ def valid_file():
         (lambda c: c["figures"][0].update(rgb=[0, 0, 7]), r"\[0, 1\]"),
         (lambda c: c["figures"][0].update(width_px=-3), "above 0"),
         (lambda c: c["figures"][0].update(y_px=float("nan")), "NaN is no finite number"),
-        (lambda c: c["figures"][0].update(x_px=1e39), r"has 1e\+39, expected at most 100000 px or degrees - at `\$\[0\]`"),
+        (
+            lambda c: c["figures"][0].update(x_px=1e39),
+            r"has 1e\+39, expected at most 100000 px or degrees - at `\$\[0\]`",
+        ),
         (lambda c: c["figures"][0].update(x_px=10**400), "401 digits"),
         (lambda c: c.update(figures=c["figures"] * 65), "has 65 figures, expected at least one and 64 at most"),
         (lambda c: c.update(version=True), "version True, expected a whole number from 1"),

@@ -192,9 +192,7 @@ class _Figure:
     def __post_init__(self) -> None:
         # Far beyond the canvas a float32 could not tell where a figure is.
         if max(map(abs, self.box)) > _MOST_PX:
-            raise PatternError(
-                f"figure has {max(self.box, key=abs):g}, expected at most {_MOST_PX:g} px or degrees"
-            )
+            raise PatternError(f"figure has {max(self.box, key=abs):g}, expected at most {_MOST_PX:g} px or degrees")
         if min(self.rgb) < 0 or max(self.rgb) > 1 or self.width_px <= 0 or self.length_px <= 0:
             raise PatternError("figure needs rgb in [0, 1] and a width and length above 0")
 

@@ -200,7 +200,9 @@ DAMAGE = {
     "weather: Invalid enum value 'dry'": lambda header, _: header.update(weather="dry"),
     "it has no brake": lambda _, content: content.pop("brake"),
     "x_m of the episode has NaN": lambda _, content: content.update(x_m=content["x_m"] * np.nan),
-    "steer of the episode has shape \\(39,\\), expected \\(40,\\)": lambda _, content: content.update(steer=content["steer"][1:]),
+    "steer of the episode has shape \\(39,\\), expected \\(40,\\)": lambda _, content: content.update(
+        steer=content["steer"][1:]
+    ),
 }
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,10 +18,13 @@ from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
-from roadproof.attacks.methods import GradOpt
+from roadproof.attacks.methods import GradOpt, stored
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
-from roadproof.attacks.result import AttackResult, Candidate, Cost
+from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.controllers import Controller
+from roadproof.errors import RoadproofError
+from roadproof.io.identity import require_same
+from roadproof.io.records import plain
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -99,22 +104,48 @@ def attack(
     )
 
 
-def kept_attack(folder: Path, search: Callable[[Path], AttackResult]) -> AttackResult:
+def kept_attack(folder: Path, made_of: Mapping[str, object], search: Callable[[Path], AttackResult]) -> AttackResult:
     """A search that is done once: what it found is read from its folder where it is there already.
 
     Args:
-        folder: of the result.
+        folder: folder of the result.
+        made_of: what tells it from other searches, see `search_parts`.
         search: does it; gets the checkpoint to go on from.
 
     Raises:
-        RoadproofError: the result is damaged, or the search refuses.
+        RoadproofError: the result is damaged or another search's, or the search refuses.
         OutputError: the folder cannot be written.
     """
     checkpoint = folder / "search.safetensors"
     if not (folder / "result.json").exists():
-        search(checkpoint).save(folder)
+        search(checkpoint).save(folder, made_of)
     checkpoint.unlink(missing_ok=True)
+    before = RESULT_FILE.content(folder / "result.json").get("made_of")
+    require_same(folder, "a search", before, made_of, RoadproofError)
     return AttackResult.load(folder)
+
+
+def search_parts(
+    recordings: RecordingSet,
+    space: SearchSpace,
+    objective: Objective,
+    method: Method,
+    groups: Sequence[Group],
+    seed: int,
+) -> dict[str, object]:
+    """What tells a search from another, the controller aside; see `attack` for what they are."""
+    drives = hashlib.sha256()
+    for drive in recordings.recordings:
+        for values in (drive.frames, drive.frame_number, drive.image_from_canvas):
+            drives.update(np.ascontiguousarray(values).tobytes())
+    return {
+        "space": plain(space),
+        "objective": objective.name,
+        "method": stored(method),
+        "groups": list(map(str, groups)),
+        "seed": seed,
+        "recordings": drives.hexdigest(),
+    }
 
 
 def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, astuple, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -14,13 +15,9 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
-from roadproof.io.files import read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.records import RecordFile
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
-
-FORMAT = "roadproof-attack"
-FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -99,8 +96,12 @@ class AttackResult:
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: Path, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
+
+        Args:
+            folder: folder of the result.
+            made_of: what tells the search from another (`kept_attack`).
 
         Raises:
             OutputError: the folder cannot be written.
@@ -108,18 +109,18 @@ class AttackResult:
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
-        told: dict[str, Any] = asdict(self)
-        del told["pattern"]
-        told |= {
-            "candidates": [
-                [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
-            ],
-            "history": np.round(self.history.astype(float), 6).tolist(),
-            "method": stored(self.method),
-        }
-        kind = "surrogate and predicted: composited frames, not driving"
-        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, **told}
-        write_atomically(folder / "result.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+        rows = [
+            [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
+        ]
+        RESULT_FILE.write(
+            folder / "result.json",
+            self,
+            kind="surrogate and predicted: composited frames, not driving",
+            made_of=made_of or {},
+            candidates=rows,
+            history=np.round(self.history.astype(float), 6),
+            method=stored(self.method),
+        )
 
     @staticmethod
     def load(folder: Path) -> AttackResult:
@@ -128,29 +129,28 @@ class AttackResult:
         Raises:
             RoadproofError: a file is missing, damaged or of another format.
         """
-        path, remedy = folder / "result.json", "search again"
-        content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
-        told = record(content, _Stored, path, RoadproofError, remedy)
-        try:
-            history = np.array(told.history, dtype=np.float64)
-        except ValueError as error:
-            raise RoadproofError(f"{path} is incomplete or damaged ({error}); {remedy}") from None
-        candidates: list[Candidate] = []
-        for rank, each in enumerate(told.candidates, 1):
-            ranked = record(dict(zip(_Ranked.__slots__, each, strict=False)), _Ranked, path, RoadproofError, remedy)
-            candidates.append(Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), *astuple(ranked)))
-        return AttackResult(
-            pattern=load_pattern(folder / "pattern.json"),
-            candidates=tuple(candidates),
-            history=history,
-            method=_method(told, path, remedy),
-            **{name: getattr(told, name) for name in _Stored.__slots__ if name not in _MADE},
+        path = folder / "result.json"
+        content = RESULT_FILE.content(path)
+        own = replace(RESULT_FILE, kind=_OwnForm).made(path, content)
+        candidates = tuple(
+            Candidate(
+                load_pattern(folder / "candidates" / f"{rank}.json"),
+                each.group,
+                each.surrogate_shift,
+                each.predicted_m,
+                each.predicted_range_m,
+            )
+            for rank, each in enumerate(own.candidates, 1)
         )
+        pattern = load_pattern(folder / "pattern.json")
+        return RESULT_FILE.made(path, content, pattern=pattern, candidates=candidates, method=own.searched)
 
 
-@dataclass(frozen=True, slots=True)
-class _Ranked:
-    """A candidate but for its pattern; older results lack the last one or two."""
+RESULT_FILE = RecordFile(AttackResult, "roadproof-attack", 2, RoadproofError, "search again", elsewhere=("pattern",))
+
+
+class _Ranked(msgspec.Struct, array_like=True, frozen=True):
+    """A candidate but for its pattern, as a list; older results lack the last one or two."""
 
     group: str
     surrogate_shift: float
@@ -159,35 +159,21 @@ class _Ranked:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Stored:
-    """result.json; of version 1 with schedule and restarts instead of a method, and at first without an objective."""
+class _OwnForm:
+    """What result.json has in a form of its own; in version 1 schedule and restarts instead of a method."""
 
-    group: str
-    surrogate_shift: float
-    by_group: dict[str, float]
-    seed: int
-    candidates: list[list[Any]]
-    history: list[list[list[float]]]
-    cost: Cost
-    checks: tuple[Check, ...]
-    space: SearchSpace
+    candidates: tuple[_Ranked, ...]
     method: dict[str, Any] = field(default_factory=dict[str, Any])
     schedule: dict[str, Any] = field(default_factory=dict[str, Any])
     restarts: int = 0
-    objective: str = "steering shift"
-    predicted_m: float | None = None
-    predicted_range_m: tuple[float, float] | None = None
 
+    def __post_init__(self) -> None:
+        _ = self.searched  # says whether there is such a method
 
-_MADE = ("candidates", "history", "method", "schedule", "restarts")
-
-
-def _method(told: _Stored, path: Path, remedy: str) -> Method:
-    given = dict(told.method)
-    try:
-        if not given:
-            halving, iterations = bool(told.schedule.get("heats")), told.schedule.get("iterations")
-            return GradOpt(iterations=iterations, restarts=told.restarts, halving=halving)
-        return method_of(str(given.pop("method", "")), **given)
-    except RoadproofError as error:
-        raise RoadproofError(f"{path} is incomplete or damaged ({error}); {remedy}") from None
+    @property
+    def searched(self) -> Method:
+        if self.method:
+            given = dict(self.method)
+            return method_of(str(given.pop("method", "")), **given)
+        halving = bool(self.schedule.get("heats"))
+        return GradOpt(iterations=self.schedule.get("iterations"), restarts=self.restarts, halving=halving)

@@ -80,14 +80,14 @@ class Plan:
     Args:
         name: of its folder.
         push: to which side.
-        deviation_m: size of a swerve; 0 for a clean drive and for steering noise.
+        offset_m: largest offset of a swerve in metres; 0 for a clean drive and for steering noise.
         stream: numbers its random draws.
         weaves: whether it weaves from side to side.
     """
 
     name: str
     push: Push
-    deviation_m: float
+    offset_m: float
     stream: int
     weaves: bool = False
 
@@ -125,6 +125,39 @@ class Trajectories:
             for push in pushes
         )
         return (Plan(str(Push.CLEAN), Push.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StatedTrajectories:
+    """Trajectories as a file has them: flat, with the keys of one kind of perturbation alone.
+
+    Raises:
+        RecordingError: they are none.
+    """
+
+    count: int
+    scheme: Scheme
+    swerve_m: tuple[float, ...] | None = None
+    weave_m: tuple[float, ...] = ()
+    noise_deg: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        _ = self.trajectories  # says whether they can be
+
+    @staticmethod
+    def of(trajectories: Trajectories) -> dict[str, object]:
+        """What is written."""
+        how = trajectories.perturbation
+        stated: dict[str, object] = {"count": trajectories.count, "scheme": trajectories.scheme}
+        if isinstance(how, SteeringNoise):
+            return stated | {"noise_deg": (how.low_deg, how.high_deg)}
+        return stated | {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """What is meant."""
+        how = Swerve(self.swerve_m or (), self.weave_m) if self.noise_deg is None else SteeringNoise(*self.noise_deg)
+        return Trajectories(count=self.count, scheme=self.scheme, perturbation=how)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

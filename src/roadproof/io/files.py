@@ -162,8 +162,11 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+    def write(part: Path) -> None:
+        part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+    write_atomically(path, write)
 
 
 def _whole(text: str) -> int:
@@ -184,8 +187,8 @@ def parse_json(text: str) -> dict[str, Any]:
 
     Raises:
         TypeError: it is something else.
-        ValueError, RecursionError: it is not JSON, is too deep, or has a number that is none (NaN, infinity, hundreds of
-            digits).
+        ValueError, RecursionError: it is not JSON, is too deep, or has a number that is none (NaN, infinity, hundreds
+            of digits).
     """
     content: object = json.loads(text, parse_int=_whole, parse_float=_finite, parse_constant=_finite)
     if not isinstance(content, dict):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from os.path import commonprefix
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from roadproof.errors import RoadproofError
 
@@ -28,30 +27,31 @@ def digest(text: str) -> str:
 
 
 def require_same(
-    folder: Path, what: str, before: Mapping[str, Any], now: Mapping[str, Any], error: type[RoadproofError]
+    folder: Path, what: str, before: object, now: Mapping[str, object], error: type[RoadproofError]
 ) -> None:
     """Refuse to go on in a folder where something of other parts was begun.
 
     Args:
         folder: that was begun.
         what: it holds, for the message: "a run".
-        before: its parts, as JSON has them.
-        now: those of what is to be done in it. A part that `before` lacks entirely is not compared: the folder is older
-            than the word.
+        before: its parts, as JSON has them. A part that is not among them is not compared: the folder is older than
+            the word.
+        now: the parts of what is to be done in it.
         error: what to raise.
 
     Raises:
         error: a part differs; the message names the first, with what it was and what it is.
     """
-    for part, value in cast("dict[str, Any]", json.loads(json.dumps(now, default=str))).items():
-        if part not in before or before[part] == value:
+    known = cast("dict[str, object]", before) if isinstance(before, dict) else {}
+    for part, value in cast("dict[str, object]", json.loads(json.dumps(now, default=str))).items():
+        if part not in known or known[part] == value:
             continue
         if part == ANSWERS:
             raise error(
                 f"{folder} holds {what} of another controller, which answers otherwise, as before a training; choose "
                 "another folder, or remove it"
             )
-        name, was, now_is = _first_difference(part, before[part], value)
+        name, was, now_is = _first_difference(part, known[part], value)
         raise error(f"{folder} holds {what} with {name} {was}, now it is {now_is}; choose another folder, or remove it")
 
 
@@ -63,6 +63,7 @@ def _first_difference(name: str, before: object, now: object) -> tuple[str, str,
         return _first_difference(f"{name}.{key}", one.get(key), other.get(key))
     texts = [repr(before), repr(now)]
     if max(map(len, texts)) > _MOST_CHARACTERS:
-        same = max(len(commonprefix(texts)) - _MOST_CHARACTERS // 3, 0)
-        texts = [f"…{text[same : same + _MOST_CHARACTERS]}…" for text in texts]
+        same = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
+        first = max(same - _MOST_CHARACTERS // 3, 0)
+        texts = [f"…{text[first : first + _MOST_CHARACTERS]}…" for text in texts]
     return name, texts[0], texts[1]

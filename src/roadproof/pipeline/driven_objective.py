@@ -10,7 +10,6 @@ Both are taken of every drive; the one asked for is the value.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,14 +27,12 @@ from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import RecordFile
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator
 
-FORMAT = "roadproof-driven"
-FORMAT_VERSION = 1
 SHARE = 0.8
 """Of the clean drive's frames, over which the authors sum the steering."""
 
@@ -135,15 +132,20 @@ def _counted_frames(clean: Episode) -> int:
     return int(SHARE * clean.steer.size)
 
 
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Effects as their file has them: digest of the paint, steering, deviation."""
+
+    drives: tuple[tuple[str, float, float], ...]
+
+
+_FILE = RecordFile(_Known, "roadproof-driven", 1, RoadproofError, "remove it")
+
+
 def _read(path: Path) -> dict[str, Effect]:
-    stored = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
-    try:
-        return {str(key): Effect(float(steering), float(deviation)) for key, steering, deviation in stored["drives"]}
-    except (KeyError, TypeError, ValueError) as error:
-        raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove it") from None
+    return {key: Effect(steering, deviation) for key, steering, deviation in _FILE.read(path).drives}
 
 
 def _write(known: dict[str, Effect], path: Path) -> None:
-    drives = [[key, each.steering, each.deviation] for key, each in known.items()]
-    content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop", "drives": drives}
-    write_atomically(path, lambda part: part.write_text(json.dumps(content) + "\n"))
+    drives = tuple((key, each.steering, each.deviation) for key, each in known.items())
+    _FILE.write(path, _Known(drives), kind="closed loop")

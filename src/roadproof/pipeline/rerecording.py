@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, attack, kept_attack
+from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, attack, kept_attack, search_parts
 from roadproof.attacks.groups import Direction, Group, parse_groups
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.calibration import Method as Calibration
@@ -180,7 +180,7 @@ def _recorded(
     """The way that the last pattern took the car, without the paint and calibrated, and the drives that took."""
     drive = record_along(simulator, controller, clean, last.over_chosen(), name=place.name, folder=place)
     both = replace(clean, drives=(*clean.drives, drive))
-    calibrated = Calibrated.load(place)
+    calibrated = Calibrated.kept(place, both, method)
     if calibrated is None:
         # The clean drive's replays lie there already and are not driven again.
         calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration")
@@ -201,15 +201,17 @@ def _searched(
     tell: Callable[[int, str], None],
 ) -> AttackResult:
     """The search before, from where it and the rounds came to."""
+    method = _gone_on(found.method)
     return kept_attack(
         place,
+        search_parts(recordings, found.space, objective, method, groups, found.seed),
         lambda checkpoint: attack(
             recordings,
             controller,
             found.space,
             objective=objective,
             groups=groups,
-            method=_gone_on(found.method),
+            method=method,
             seed=found.seed,
             starts=starts,
             device=device,
