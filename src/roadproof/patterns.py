@@ -209,7 +209,7 @@ class _Figures:
             raise PatternError(f"it has {len(self.figures)} figures, expected at least one and {MAX_FIGURES} at most")
 
 
-_FILE = RecordFile(_Figures, "roadproof-pattern", 1, PatternError, "make it again")
+_FILE = RecordFile(kind=_Figures, name="roadproof-pattern", error=PatternError, remedy="make it again")
 
 
 def save_pattern(pattern: Pattern, path: Path) -> None:
@@ -221,8 +221,10 @@ def save_pattern(pattern: Pattern, path: Path) -> None:
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())
     figures = [
-        _Figure(shape, *box, (red, green, blue))
-        for shape, box, (red, green, blue) in zip(pattern.shapes, boxes, colours, strict=True)
+        _Figure(shape, x, y, width, length, rotation, (red, green, blue))
+        for shape, (x, y, width, length, rotation), (red, green, blue) in zip(
+            pattern.shapes, boxes, colours, strict=True
+        )
     ]
     _FILE.write(path, _Figures(tuple(figures)))
     picture = Image.fromarray(raster(pattern))

@@ -58,8 +58,10 @@ class Drive:
             raise RecordingError(f"count is {self.count}, expected 1 or more")
 
 
-OUTER = RecordFile(Outer, "roadproof-outer", 1, RoadproofError, "make it again")
-DRIVE = RecordFile(Drive, "drive", 2, RoadproofError, "make it again", elsewhere=("name",))
+OUTER = RecordFile(kind=Outer, name="roadproof-outer", error=RoadproofError, remedy="make it again")
+DRIVE = RecordFile(
+    kind=Drive, name="drive", version=2, error=RoadproofError, remedy="make it again", elsewhere=("name",)
+)
 SAMPLE = Drive(
     name="a",
     side=Side.RIGHT,
@@ -160,7 +162,7 @@ def test_what_an_archive_gets_wrong_is_named(tmp_path: Path, message: str) -> No
 
 def test_numbers_may_stand_alone_in_an_archive(tmp_path: Path) -> None:
     """Where it has no header, a field that is no array is an array of one number."""
-    file = RecordFile(Inner, "", 1, RoadproofError, "make it again", header=None)
+    file = RecordFile(kind=Inner, error=RoadproofError, remedy="make it again", header=None)
     file.write(tmp_path / "a.npz", Inner(2.5))
     assert file.read(tmp_path / "a.npz") == Inner(2.5)
     write_archive(tmp_path / "a.npz", {"metres": np.zeros(3)})

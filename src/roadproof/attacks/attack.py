@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -104,48 +104,70 @@ def attack(
     )
 
 
-def kept_attack(folder: Path, made_of: Mapping[str, object], search: Callable[[Path], AttackResult]) -> AttackResult:
+def kept_attack(
+    folder: Path,
+    recordings: RecordingSet,
+    controller: Controller,
+    space: SearchSpace,
+    *,
+    objective: Objective,
+    method: Method,
+    groups: Sequence[Group] | None = None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    starts: Sequence[Candidate] = (),
+    on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
+) -> AttackResult:
     """A search that is done once: what it found is read from its folder where it is there already.
 
     Args:
-        folder: folder of the result.
-        made_of: what tells it from other searches, see `search_parts`.
-        search: does it; gets the checkpoint to go on from.
+        folder: folder of the result; it keeps the running search too.
+        recordings: as in `attack`, like all that follow.
+        controller: on `device`.
+        space: the patterns allowed.
+        objective: what is made large.
+        method: how it is searched.
+        groups: drives attacked together.
+        seed: seed of everything random.
+        device: where to search.
+        starts: candidates to search on from.
+        on_step: called after every step.
 
     Raises:
-        RoadproofError: the result is damaged or another search's, or the search refuses.
+        RoadproofError: the result is damaged or of another search, or the search refuses.
         OutputError: the folder cannot be written.
     """
-    checkpoint = folder / "search.safetensors"
-    if not (folder / "result.json").exists():
-        search(checkpoint).save(folder, made_of)
-    checkpoint.unlink(missing_ok=True)
-    before = RESULT_FILE.content(folder / "result.json").get("made_of")
-    require_same(folder, "a search", before, made_of, RoadproofError)
-    return AttackResult.load(folder)
-
-
-def search_parts(
-    recordings: RecordingSet,
-    space: SearchSpace,
-    objective: Objective,
-    method: Method,
-    groups: Sequence[Group],
-    seed: int,
-) -> dict[str, object]:
-    """What tells a search from another, the controller aside; see `attack` for what they are."""
-    drives = hashlib.sha256()
+    frames = hashlib.sha256()
     for drive in recordings.recordings:
         for values in (drive.frames, drive.frame_number, drive.image_from_canvas):
-            drives.update(np.ascontiguousarray(values).tobytes())
-    return {
+            frames.update(np.ascontiguousarray(values).tobytes())
+    made_of = {
         "space": plain(space),
         "objective": objective.name,
         "method": stored(method),
-        "groups": list(map(str, groups)),
+        "groups": groups and list(map(str, groups)),
         "seed": seed,
-        "recordings": drives.hexdigest(),
+        "recordings": frames.hexdigest(),
     }
+    checkpoint, path = folder / "search.safetensors", folder / "result.json"
+    if path.exists():
+        require_same(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
+    else:
+        attack(
+            recordings,
+            controller,
+            space,
+            objective=objective,
+            method=method,
+            groups=groups,
+            seed=seed,
+            device=device,
+            starts=starts,
+            checkpoint=checkpoint,
+            on_step=on_step,
+        ).save(folder, made_of)
+    checkpoint.unlink(missing_ok=True)
+    return AttackResult.load(folder)
 
 
 def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:

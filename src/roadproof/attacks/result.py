@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
-from roadproof.io.records import RecordFile
+from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
 
@@ -109,17 +109,13 @@ class AttackResult:
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
-        rows = [
-            [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
-        ]
         RESULT_FILE.write(
             folder / "result.json",
             self,
-            kind="surrogate and predicted: composited frames, not driving",
             made_of=made_of or {},
-            candidates=rows,
-            history=np.round(self.history.astype(float), 6),
-            method=stored(self.method),
+            candidates=[
+                [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
+            ],
         )
 
     @staticmethod
@@ -131,22 +127,14 @@ class AttackResult:
         """
         path = folder / "result.json"
         content = RESULT_FILE.content(path)
-        own = replace(RESULT_FILE, kind=_OwnForm).made(path, content)
+        if "method" not in content:
+            content["method"] = _of_first_format(content)
+        ranked = _ROWS_FILE.made(path, content).candidates
         candidates = tuple(
-            Candidate(
-                load_pattern(folder / "candidates" / f"{rank}.json"),
-                each.group,
-                each.surrogate_shift,
-                each.predicted_m,
-                each.predicted_range_m,
-            )
-            for rank, each in enumerate(own.candidates, 1)
+            Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), *msgspec.structs.astuple(each))
+            for rank, each in enumerate(ranked, 1)
         )
-        pattern = load_pattern(folder / "pattern.json")
-        return RESULT_FILE.made(path, content, pattern=pattern, candidates=candidates, method=own.searched)
-
-
-RESULT_FILE = RecordFile(AttackResult, "roadproof-attack", 2, RoadproofError, "search again", elsewhere=("pattern",))
+        return RESULT_FILE.made(path, content, pattern=load_pattern(folder / "pattern.json"), candidates=candidates)
 
 
 class _Ranked(msgspec.Struct, array_like=True, frozen=True):
@@ -158,22 +146,40 @@ class _Ranked(msgspec.Struct, array_like=True, frozen=True):
     predicted_range_m: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _OwnForm:
-    """What result.json has in a form of its own; in version 1 schedule and restarts instead of a method."""
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """The candidates of result.json."""
 
     candidates: tuple[_Ranked, ...]
-    method: dict[str, Any] = field(default_factory=dict[str, Any])
-    schedule: dict[str, Any] = field(default_factory=dict[str, Any])
-    restarts: int = 0
 
-    def __post_init__(self) -> None:
-        _ = self.searched  # says whether there is such a method
 
-    @property
-    def searched(self) -> Method:
-        if self.method:
-            given = dict(self.method)
-            return method_of(str(given.pop("method", "")), **given)
-        halving = bool(self.schedule.get("heats"))
-        return GradOpt(iterations=self.schedule.get("iterations"), restarts=self.restarts, halving=halving)
+def _rounded(history: Float[np.ndarray, "i g r"]) -> Float[np.ndarray, "i g r"]:
+    return np.round(history.astype(float), 6)
+
+
+def _method(stated: dict[str, Any]) -> Method:
+    return method_of(str(stated.get("method", "")), **{name: stated[name] for name in stated if name != "method"})
+
+
+def _of_first_format(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The method, which was a schedule and a number of restarts."""
+    schedule: dict[str, Any] = content["schedule"] if isinstance(content.get("schedule"), dict) else {}
+    halving = bool(schedule.get("heats"))
+    stated = {"iterations": schedule.get("iterations"), "restarts": content.get("restarts"), "halving": halving}
+    return {"method": GradOpt.word} | stated
+
+
+RESULT_FILE = RecordFile(
+    kind=AttackResult,
+    name="roadproof-attack",
+    version=2,
+    error=RoadproofError,
+    remedy="search again",
+    elsewhere=("pattern", "candidates"),
+    forms={
+        "method": Form(dict[str, Any], stored, _method),
+        "history": Form(Float[np.ndarray, "i g r"], _rounded, _rounded),
+    },
+    notes={"kind": "surrogate and predicted: composited frames, not driving"},
+)
+_ROWS_FILE = RecordFile(kind=_Rows, error=RoadproofError, remedy="search again")

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
 from roadproof.calibration.replays import Replays, drive_digest
-from roadproof.calibration.report import REPORT_FILE, CalibrationReport, DriveReport, Spread, stated_errors_px
+from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
 from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
@@ -62,7 +62,7 @@ class Calibrated:
         Raises:
             OutputError: they cannot be written.
         """
-        REPORT_FILE.write(run / "calibration" / "report.json", self.report, made_of=self.made_of)
+        CalibrationReport.FILE.write(run / "calibration" / "report.json", self.report, made_of=self.made_of)
         save_recordings(self.recordings, run / "recordings")
 
     @staticmethod
@@ -81,8 +81,8 @@ class Calibrated:
         if not (run / "recordings").exists():
             return None
         path, now = run / "calibration" / "report.json", _parts(drives, method)
-        content = REPORT_FILE.content(path)
-        report = REPORT_FILE.made(path, content)
+        content = CalibrationReport.FILE.content(path)
+        report = CalibrationReport.FILE.made(path, content)
         before = content.get("made_of") or {"method": report.method}
         require_same(run / "recordings", "a calibration", before, now, CalibrationError)
         return Calibrated(load_recordings(run / "recordings"), report, now)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
-from roadproof.io.records import RecordFile
+from roadproof.io.records import RecordFile, Saved
 
 _GRID = 9
 
@@ -50,7 +49,7 @@ class DriveReport:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class CalibrationReport:
+class CalibrationReport(Saved):
     """How good a calibration is, and what it cost.
 
     Args:
@@ -68,25 +67,10 @@ class CalibrationReport:
     calls: int
     seconds: float
 
-    def save(self, path: Path) -> None:
-        """Write it as JSON.
 
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        REPORT_FILE.write(path, self)
-
-
-REPORT_FILE = RecordFile(CalibrationReport, "roadproof-calibration", 1, CalibrationError, "calibrate again")
-
-
-def load_report(path: Path) -> CalibrationReport:
-    """Read what `CalibrationReport.save` wrote.
-
-    Raises:
-        CalibrationError: the file is missing or damaged.
-    """
-    return REPORT_FILE.read(path)
+CalibrationReport.FILE = RecordFile(
+    kind=CalibrationReport, name="roadproof-calibration", error=CalibrationError, remedy="calibrate again"
+)
 
 
 def stated_errors_px(

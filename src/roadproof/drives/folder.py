@@ -9,21 +9,21 @@ A drive's folder is there when the drive is finished. Nothing is pickled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from roadproof.datatypes import VehicleState, Weather
-from roadproof.drives.trajectories import StatedTrajectories, Trajectories, Window
+from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
 from roadproof.io.files import write_folder_atomically
 from roadproof.io.identity import require_same
-from roadproof.io.records import RecordFile, plain
+from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Push, Track
 from roadproof.scenarios import Scenario
 
@@ -159,12 +159,10 @@ def write_settings(settings: Settings, folder: Path) -> None:
     path = folder / "record.json"
     if path.exists():
         before = _SETTINGS.content(path)
-        _settings(path, before)  # damage is named as such
-        now = {field.name: getattr(settings, field.name) for field in fields(settings)}
-        parts = plain(now | {"trajectories": StatedTrajectories.of(settings.trajectories)})
-        require_same(folder, "a recording", before, parts, RecordingError)
+        _SETTINGS.made(path, before)  # damage is named as such
+        require_same(folder, "a recording", before, _SETTINGS.stated(settings), RecordingError)
         return
-    _SETTINGS.write(path, settings, trajectories=StatedTrajectories.of(settings.trajectories))
+    _SETTINGS.write(path, settings)
 
 
 def write_drive(drive: Drive, folder: Path) -> None:
@@ -203,8 +201,7 @@ def load_drives(folder: Path) -> Drives:
     """
     if not (folder / "record.json").is_file():
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
-    path = folder / "record.json"
-    settings = _settings(path, _SETTINGS.content(path))
+    settings = _SETTINGS.read(folder / "record.json")
     plans = settings.trajectories.plans()
     drives = [read_drive(plan.name, folder) for plan in plans]
     missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]
@@ -213,19 +210,41 @@ def load_drives(folder: Path) -> Drives:
     return Drives(settings=settings, drives=tuple(drive for drive in drives if drive is not None))
 
 
-_SETTINGS = RecordFile(Settings, "roadproof-record", 1, RecordingError, "record it again")
-_DRIVE = RecordFile(
-    Drive, "", 1, RecordingError, "remove its folder and record it again", elsewhere=("name", "episode"), header="about"
+class _Trajectories(TypedDict):
+    """Trajectories in record.json: flat, with the keys of one kind of perturbation."""
+
+    count: int
+    scheme: Scheme
+    swerve_m: NotRequired[tuple[float, ...]]
+    weave_m: NotRequired[tuple[float, ...]]
+    noise_deg: NotRequired[tuple[int, int]]
+
+
+def _stated(trajectories: Trajectories) -> dict[str, object]:
+    how = trajectories.perturbation
+    stated: dict[str, object] = {"count": trajectories.count, "scheme": trajectories.scheme}
+    if isinstance(how, SteeringNoise):
+        return stated | {"noise_deg": (how.low_deg, how.high_deg)}
+    return stated | {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
+
+
+def _meant(stated: _Trajectories) -> Trajectories:
+    noise = stated.get("noise_deg")
+    how = SteeringNoise(*noise) if noise else Swerve(stated.get("swerve_m", ()), stated.get("weave_m", ()))
+    return Trajectories(count=stated["count"], scheme=stated["scheme"], perturbation=how)
+
+
+_SETTINGS = RecordFile(
+    kind=Settings,
+    name="roadproof-record",
+    error=RecordingError,
+    remedy="record it again",
+    forms={"trajectories": Form(_Trajectories, _stated, _meant)},
 )
-
-
-@dataclass(frozen=True, slots=True)
-class _OwnForm:
-    """What record.json has in a form of its own."""
-
-    trajectories: StatedTrajectories
-
-
-def _settings(path: Path, content: Mapping[str, object]) -> Settings:
-    stated = replace(_SETTINGS, kind=_OwnForm).made(path, content).trajectories
-    return _SETTINGS.made(path, content, trajectories=stated.trajectories)
+_DRIVE = RecordFile(
+    kind=Drive,
+    error=RecordingError,
+    remedy="remove its folder and record it again",
+    elsewhere=("name", "episode"),
+    header="about",
+)

@@ -128,39 +128,6 @@ class Trajectories:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class StatedTrajectories:
-    """Trajectories as a file has them: flat, with the keys of one kind of perturbation alone.
-
-    Raises:
-        RecordingError: they are none.
-    """
-
-    count: int
-    scheme: Scheme
-    swerve_m: tuple[float, ...] | None = None
-    weave_m: tuple[float, ...] = ()
-    noise_deg: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        _ = self.trajectories  # says whether they can be
-
-    @staticmethod
-    def of(trajectories: Trajectories) -> dict[str, object]:
-        """What is written."""
-        how = trajectories.perturbation
-        stated: dict[str, object] = {"count": trajectories.count, "scheme": trajectories.scheme}
-        if isinstance(how, SteeringNoise):
-            return stated | {"noise_deg": (how.low_deg, how.high_deg)}
-        return stated | {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
-
-    @property
-    def trajectories(self) -> Trajectories:
-        """What is meant."""
-        how = Swerve(self.swerve_m or (), self.weave_m) if self.noise_deg is None else SteeringNoise(*self.noise_deg)
-        return Trajectories(count=self.count, scheme=self.scheme, perturbation=how)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Window:
     """Which frames of a drive are kept.
 

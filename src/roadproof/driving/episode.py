@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from roadproof.datatypes import Ending, Event, VehicleState, Weather
 from roadproof.errors import EpisodeError
-from roadproof.io.records import RecordFile, check_arrays
+from roadproof.io.records import RecordFile, Saved, check_arrays
 from roadproof.simulators.protocol import PaintKind
 
 _UNITS = {
@@ -25,7 +24,7 @@ GIVEN = ("steer", "throttle", "brake")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Episode:
+class Episode(Saved):
     """One drive closed loop: n observations and the n − 1 controls between them.
 
     Args:
@@ -89,22 +88,11 @@ class Episode:
         """Where the car was at an observation, and how fast."""
         return VehicleState(*(float(getattr(self, name)[step]) for name in VehicleState.__slots__))
 
-    def save(self, path: Path) -> None:
-        """Write the episode to one file, all or nothing.
 
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        EPISODE_FILE.write(path, self, units=_UNITS)
-
-    @classmethod
-    def load(cls, path: Path) -> Episode:
-        """Read an episode written by `save`.
-
-        Raises:
-            EpisodeError: the file is missing, damaged, no episode, or of a newer version.
-        """
-        return EPISODE_FILE.read(path)
-
-
-EPISODE_FILE = RecordFile(Episode, "roadproof-episode", 1, EpisodeError, "check the path, or drive it again")
+Episode.FILE = RecordFile(
+    kind=Episode,
+    name="roadproof-episode",
+    error=EpisodeError,
+    remedy="check the path, or drive it again",
+    notes={"units": _UNITS},
+)

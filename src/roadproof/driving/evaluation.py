@@ -31,7 +31,7 @@ from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRa
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import check_name, write_atomically
-from roadproof.io.records import RecordFile
+from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
 from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
 from roadproof.simulators.protocol import PaintKind, PatternImage
@@ -226,8 +226,6 @@ class Evaluation:
             folder / "evaluation.json",
             self,
             kind=kind_of(self.paint),
-            units=_UNITS,
-            scenario=self.scenario.name,
             rows=self.rows(),
         )
 
@@ -247,7 +245,14 @@ class Evaluation:
         return EVALUATION_FILE.made(path, content, scenario=scenario)
 
 
-EVALUATION_FILE = RecordFile(Evaluation, "roadproof-evaluation", 1, EpisodeError, "evaluate again")
+EVALUATION_FILE = RecordFile(
+    kind=Evaluation,
+    name="roadproof-evaluation",
+    error=EpisodeError,
+    remedy="evaluate again",
+    forms={"scenario": Form(str, lambda scenario: scenario.name, lambda name: name)},
+    notes={"units": _UNITS},
+)
 
 
 def kind_of(paint: PaintKind) -> str:

@@ -61,7 +61,7 @@ def _first_difference(name: str, before: object, now: object) -> tuple[str, str,
         one, other = cast("dict[str, object]", before), cast("dict[str, object]", now)
         key = next(key for key in one | other if one.get(key) != other.get(key))
         return _first_difference(f"{name}.{key}", one.get(key), other.get(key))
-    texts = [repr(before), repr(now)]
+    texts = [repr(each) for each in cast("list[object]", [before, now])]
     if max(map(len, texts)) > _MOST_CHARACTERS:
         same = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
         first = max(same - _MOST_CHARACTERS // 3, 0)

@@ -1,8 +1,8 @@
 """Dataclasses in files: as JSON, or as an archive of arrays with a JSON header (.npz).
 
-    FILE = RecordFile(Prediction, "roadproof-prediction", 2, EpisodeError, "remove it to predict again")
-    FILE.write(path, prediction)
-    prediction = FILE.read(path)
+    FILE = RecordFile(kind=Report, name="roadproof-report", version=2, error=ReportError, remedy="make it again")
+    FILE.write(path, report)
+    report = FILE.read(path)
 
 Convention:
     Every field is kept under its own name: an enum by its value, a dataclass as an object, a tuple as a list, None as
@@ -14,11 +14,11 @@ Convention:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast, get_type_hints
+from typing import Any, ClassVar, Generic, Self, TypeVar, cast, get_type_hints
 
 import msgspec
 import numpy as np
@@ -29,10 +29,25 @@ from roadproof.io.arrays import HEADER, MOST_BYTES, read_record, write_archive
 from roadproof.io.files import one_line, read_json, write_json
 
 T = TypeVar("T")
-_WRONG = (msgspec.ValidationError, OverflowError, RecursionError, RoadproofError, TypeError, UnicodeError, ValueError)
+_WRONG = (KeyError, OverflowError, RecursionError, RoadproofError, TypeError, UnicodeError, ValueError)
 
 
 @dataclass(frozen=True, slots=True)
+class Form:
+    """How a field is kept where a file has it in another form than the dataclass.
+
+    Args:
+        kind: type of what the file holds.
+        stated: makes that of the field's value.
+        meant: makes the field's value of it; what it raises is damage of the file.
+    """
+
+    kind: Any
+    stated: Callable[[Any], object]
+    meant: Callable[[Any], object]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class RecordFile(Generic[T]):
     """How a dataclass is written to a file, and read from one that anyone may have made.
 
@@ -43,16 +58,20 @@ class RecordFile(Generic[T]):
         error: what is raised.
         remedy: what the user can do where a file is missing or damaged.
         elsewhere: fields that are not in this file; `read` takes them by name.
+        forms: fields that it has in a form of its own.
+        notes: what it says besides its fields, for people: units.
         header: name of an archive's JSON header; None where all its fields are arrays and numbers.
         most_bytes: that an archive may unpack to.
     """
 
     kind: type[T]
-    name: str
-    version: int
+    name: str = ""
+    version: int = 1
     error: type[RoadproofError]
     remedy: str
     elsewhere: tuple[str, ...] = ()
+    forms: Mapping[str, Form] = field(default_factory=dict[str, Form])
+    notes: Mapping[str, object] = field(default_factory=dict[str, object])
     header: str | None = HEADER
     most_bytes: int = MOST_BYTES
 
@@ -62,24 +81,30 @@ class RecordFile(Generic[T]):
         Args:
             path: of a JSON file where it ends in .json, else of an archive.
             value: the record.
-            **more: keys besides its fields, such as units, which are for people; or what is kept in place of a field.
+            **more: keys besides its fields and notes.
 
         Raises:
             OutputError: the file cannot be written.
         """
-        content: dict[str, Any] = {"format": self.name, "version": self.version} if self.name else {}
-        content |= {name: plain(each) for name, each in more.items()}
+        content = {"format": self.name, "version": self.version} if self.name else {}
+        content = cast("dict[str, Any]", plain({**content, **self.notes, **more}))
         members = self._members(path)
-        content |= {
-            name: plain(getattr(value, name))
-            for name in _types(self.kind)
-            if name not in (*members, *more, *self.elsewhere)
-        }
+        content |= self.stated(value, members)
         if path.suffix == ".json":
             write_json(path, content)
             return
-        header = {self.header: np.array(json.dumps(content, ensure_ascii=False))} if self.header else {}
-        write_archive(path, header | {name: getattr(value, name) for name in members})
+        arrays: dict[str, Any] = {name: getattr(value, name) for name in members}
+        if self.header is not None:
+            arrays[self.header] = np.array(json.dumps(content, ensure_ascii=False))
+        write_archive(path, arrays)
+
+    def stated(self, value: T, members: Sequence[str] = ()) -> dict[str, Any]:
+        """A record's fields as JSON has them, but for those that are members of an archive."""
+        names = [name for name in _types(self.kind) if name not in (*self.elsewhere, *members)]
+        values: dict[str, object] = {name: getattr(value, name) for name in names}
+        for name in self.forms.keys() & values.keys():
+            values[name] = self.forms[name].stated(values[name])
+        return cast("dict[str, Any]", plain(values))
 
     def read(self, path: Path, **elsewhere: object) -> T:
         """Read a record.
@@ -114,36 +139,53 @@ class RecordFile(Generic[T]):
         return stated | arrays
 
     def made(self, path: Path, content: Mapping[str, Any], **elsewhere: object) -> T:
-        """The record of what a file holds.
-
-        Args:
-            path: of the file, for messages.
-            content: see `content`.
-            **elsewhere: the fields that are not in it, or are to be taken in place of what it holds.
-
-        Raises:
-            error: a field is missing or of another type, or the dataclass refuses a value.
-        """
+        """The record of what a file holds; `path` and the errors are those of `read`, for what `content` gave."""
         values = dict(elsewhere)
         try:
-            for field in fields(cast("Any", self.kind)):
-                if field.name in elsewhere:
+            for each in fields(cast("Any", self.kind)):
+                name, form = each.name, self.forms.get(each.name)
+                if name in elsewhere:
                     continue
-                if field.name in content:
-                    values[field.name] = _typed(content[field.name], _types(self.kind)[field.name], field.name)
-                elif field.default is MISSING and field.default_factory is MISSING:
-                    raise ValueError(f"Object missing required field `{field.name}`")
+                if name in content:
+                    kind = _types(self.kind)[name] if form is None else form.kind
+                    typed = _typed(content[name], kind, name)
+                    values[name] = typed if form is None else form.meant(typed)
+                elif each.default is MISSING and each.default_factory is MISSING:
+                    raise ValueError(f"Object missing required field `{name}`")
             return self.kind(**values)
         except _WRONG as reason:
             raise self.error(f"{path} is incomplete or damaged ({one_line(reason)}); {self.remedy}") from None
 
     def _members(self, path: Path) -> tuple[str, ...]:
         """Fields that are arrays of the archive."""
-        if path.suffix == ".json":
-            return ()
-        types = _types(self.kind).items()
-        named = [name for name, kind in types if self.header is None or _is_array(kind)]
+        types = {} if path.suffix == ".json" else _types(self.kind)
+        named = [name for name, kind in types.items() if self.header is None or _is_array(kind)]
         return tuple(name for name in named if name not in self.elsewhere)
+
+
+class Saved:
+    """What a dataclass with a file of its own can do."""
+
+    __slots__ = ()
+    FILE: ClassVar[RecordFile[Any]]
+
+    def save(self, path: Path) -> None:
+        """Write it to one file, all or nothing.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        self.FILE.write(path, self)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            RoadproofError: the file is missing, damaged, of another format or a newer version; of the kind that its
+                values raise.
+        """
+        return cls.FILE.read(path)
 
 
 def plain(value: object) -> object:
@@ -177,7 +219,7 @@ def check_arrays(
 @cache
 def _types(kind: type) -> dict[str, Any]:
     hints = get_type_hints(kind)
-    return {field.name: hints[field.name] for field in fields(kind)}
+    return {each.name: hints[each.name] for each in fields(kind)}
 
 
 def _is_array(kind: object) -> bool:
@@ -195,7 +237,7 @@ def _typed(stored: Any, kind: Any, name: str) -> object:  # noqa: ANN401
     if isinstance(stored, np.ndarray):
         if stored.shape:
             raise ValueError(f"{name} of shape {stored.shape}, expected one number")
-        stored = stored.item()
+        stored = cast("Any", stored).item()
     try:
         made: object = msgspec.convert(stored, kind)
     except msgspec.ValidationError as reason:
@@ -219,11 +261,11 @@ def _array(values: np.ndarray, kind: Any, name: str) -> np.ndarray:  # noqa: ANN
 def _refuse_unknown(stored: Any, made: Any, name: str) -> None:  # noqa: ANN401
     """A camera with a field that nobody reads would be another camera."""
     if isinstance(stored, dict) and is_dataclass(made):
-        known = {field.name for field in fields(made)}
+        known = _types(type(made))
         for key, value in cast("dict[str, Any]", stored).items():
             if key not in known:
                 raise ValueError(f"{name} has an unknown field {key!r:.60}")
             _refuse_unknown(value, getattr(made, key), f"{name}.{key}")
-    elif isinstance(stored, list) and isinstance(made, (list, tuple)):
-        for one, other in zip(cast("list[Any]", stored), cast("tuple[Any, ...]", made), strict=True):
+    elif isinstance(made, (list, tuple)):
+        for one, other in zip(cast("list[object]", stored), cast("list[object]", made), strict=True):
             _refuse_unknown(one, other, name)

@@ -27,7 +27,7 @@ from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.records import RecordFile
+from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -84,7 +84,7 @@ class DrivenObjective:
         keep: Path | None = None,
     ) -> None:
         self._space, self._measure, self._keep = space, measure, keep
-        self._known = _read(keep) if keep is not None and keep.exists() else {}
+        self._known = _FILE.read(keep).drives if keep is not None and keep.exists() else {}
         self._canvas = scenario.canvas
 
         def drive(pattern: PatternImage | None, until: Callable[[Observation], bool] | None) -> Episode:
@@ -105,7 +105,7 @@ class DrivenObjective:
         if key not in self._known:
             self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._canvas)
             if self._keep is not None:
-                _write(self._known, self._keep)
+                _FILE.write(self._keep, _Kept(self._known))
         return self._known[key]
 
     def _enough(self) -> Callable[[Observation], bool]:
@@ -133,19 +133,22 @@ def _counted_frames(clean: Episode) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
-    """Effects as their file has them: digest of the paint, steering, deviation."""
+class _Kept:
+    """Effects by digest of the paint; a list of three values each in their file."""
 
-    drives: tuple[tuple[str, float, float], ...]
-
-
-_FILE = RecordFile(_Known, "roadproof-driven", 1, RoadproofError, "remove it")
+    drives: dict[str, Effect]
 
 
-def _read(path: Path) -> dict[str, Effect]:
-    return {key: Effect(steering, deviation) for key, steering, deviation in _FILE.read(path).drives}
-
-
-def _write(known: dict[str, Effect], path: Path) -> None:
-    drives = tuple((key, each.steering, each.deviation) for key, each in known.items())
-    _FILE.write(path, _Known(drives), kind="closed loop")
+_ROWS = Form(
+    tuple[tuple[str, float, float], ...],
+    lambda known: [(key, each.steering, each.deviation) for key, each in known.items()],
+    lambda rows: {key: Effect(*numbers) for key, *numbers in rows},
+)
+_FILE = RecordFile(
+    kind=_Kept,
+    name="roadproof-driven",
+    error=RoadproofError,
+    remedy="remove it",
+    forms={"drives": _ROWS},
+    notes={"kind": "closed loop"},
+)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from roadproof.datatypes import Control, Observation
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import EpisodeError, RecordingError
-from roadproof.io.records import RecordFile
+from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet
@@ -27,7 +26,7 @@ from roadproof.simulators.protocol import PatternImage, Simulator
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Fidelity:
+class Fidelity(Saved):
     """One recorded drive three times: as it was, with a pattern composited in, and with the pattern really there.
 
     Args:
@@ -52,25 +51,8 @@ class Fidelity:
     rendered_steer: Float[np.ndarray, " f"]
     agreement: Agreement
 
-    def save(self, path: Path) -> None:
-        """Write one NumPy archive with a JSON header.
 
-        Raises:
-            OutputError: it cannot be written.
-        """
-        FIDELITY_FILE.write(path, self)
-
-    @staticmethod
-    def load(path: Path) -> Fidelity:
-        """Read what `save` wrote.
-
-        Raises:
-            EpisodeError: the file is missing, damaged or of another format.
-        """
-        return FIDELITY_FILE.read(path)
-
-
-FIDELITY_FILE = RecordFile(Fidelity, "roadproof-fidelity", 1, EpisodeError, "evaluate again")
+Fidelity.FILE = RecordFile(kind=Fidelity, name="roadproof-fidelity", error=EpisodeError, remedy="evaluate again")
 
 
 def compare_with_rendered(

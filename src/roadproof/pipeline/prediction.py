@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,14 +13,14 @@ from roadproof.driving.deviation import passage
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.errors import EpisodeError
-from roadproof.io.records import RecordFile
+from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
 from roadproof.recorded.world import UNSURE, RecordedWorld
 from roadproof.recordings import RecordingSet
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Prediction:
+class Prediction(Saved):
     """One pattern, foretold and driven over.
 
     Args:
@@ -54,25 +53,14 @@ class Prediction:
         """Predicted minus driven deviation."""
         return self.predicted_m - self.driven_m
 
-    def save(self, path: Path) -> None:
-        """Write one NumPy archive with a JSON header.
 
-        Raises:
-            OutputError: it cannot be written.
-        """
-        PREDICTION_FILE.write(path, self)
-
-    @staticmethod
-    def load(path: Path) -> Prediction:
-        """Read what `save` wrote.
-
-        Raises:
-            EpisodeError: the file is missing, damaged or of another format.
-        """
-        return PREDICTION_FILE.read(path)
-
-
-PREDICTION_FILE = RecordFile(Prediction, "roadproof-prediction", 2, EpisodeError, "remove it to predict again")
+Prediction.FILE = RecordFile(
+    kind=Prediction,
+    name="roadproof-prediction",
+    version=2,
+    error=EpisodeError,
+    remedy="remove it to predict again",
+)
 
 
 def predict(

@@ -97,11 +97,10 @@ class Selection:
 
 
 SELECTION_FILE = RecordFile(
-    Selection,
-    "roadproof-selection",
-    1,
-    RoadproofError,
-    "remove its folder to choose again",
+    kind=Selection,
+    name="roadproof-selection",
+    error=RoadproofError,
+    remedy="remove its folder to choose again",
     elsewhere=("pattern", "predicted"),
 )
 

@@ -56,7 +56,7 @@ class _Run:
         _ = self.parts  # says whether they can be read
 
 
-_FILE = RecordFile(_Run, "roadproof-run", 1, RoadproofError, "remove it, the stages stay")
+_FILE = RecordFile(kind=_Run, name="roadproof-run", error=RoadproofError, remedy="remove it, the stages stay")
 
 
 class Ledger:

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, attack, kept_attack, search_parts
+from roadproof.attacks import AttackResult, kept_attack
 from roadproof.attacks.groups import Group, parse_groups
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
@@ -266,19 +266,15 @@ def _attack(run: _Run, recordings: RecordingSet, groups: tuple[Group, ...]) -> A
     steps = budget.method.steps(budget.objective)
     return kept_attack(
         run.folder / "attack",
-        search_parts(recordings, run.space, budget.objective, budget.method, groups, run.seed),
-        lambda checkpoint: attack(
-            recordings,
-            run.controller,
-            run.space,
-            objective=budget.objective,
-            method=budget.method,
-            groups=groups,
-            seed=run.seed,
-            device=run.device,
-            checkpoint=checkpoint,
-            on_step=lambda step, best: run.on_progress("Searching", step, steps, f"{best:.2f}"),
-        ),
+        recordings,
+        run.controller,
+        run.space,
+        objective=budget.objective,
+        method=budget.method,
+        groups=groups,
+        seed=run.seed,
+        device=run.device,
+        on_step=lambda step, best: run.on_progress("Searching", step, steps, f"{best:.2f}"),
     )
 
 

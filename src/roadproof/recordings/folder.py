@@ -12,7 +12,7 @@ Nothing is pickled, and no path in a file leaves the folder.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,12 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
+from roadproof.errors import ColourError, OutputError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_archive, read_array, write_archive
 from roadproof.io.files import inside, write_folder_atomically
 from roadproof.io.pictures import read_picture
-from roadproof.io.records import RecordFile
+from roadproof.io.records import Form, RecordFile
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 from roadproof.recordings.recording import Push, Recording, RecordingSet
 from roadproof.recordings.track import Track
@@ -65,31 +65,43 @@ class _Manifest:
     canvas_px: int = CANVAS_SIZE_PX
     camera: CameraModel
     crop_resize: CropResize
-    colour: dict[str, Any]
-    canvas: dict[str, float] | None = None
+    colour: ColourTransform
+    canvas: CanvasPlacement | None = None
     drives: tuple[_Drive, ...]
 
     def __post_init__(self) -> None:
         if self.canvas_px != CANVAS_SIZE_PX:
             raise RecordingError(f"canvas_px is {self.canvas_px}, expected {CANVAS_SIZE_PX}; scale homographies")
-        names = [field.name for field in fields(CanvasPlacement)]
-        if self.canvas is not None and (
-            set(self.canvas) != set(names) or not all(abs(value) < 1e9 for value in self.canvas.values())
-        ):
-            raise RecordingError(f"canvas is {self.canvas!r:.200}, expected finite numbers for {', '.join(names)}")
 
 
-_MANIFEST = RecordFile(_Manifest, "roadproof-recordings", 1, RecordingError, _AGAIN)
+def _canvas(stated: dict[str, float] | None) -> CanvasPlacement | None:
+    names = [each.name for each in fields(CanvasPlacement)]
+    if stated is None:
+        return None
+    if set(stated) != set(names) or not all(abs(value) < 1e9 for value in stated.values()):
+        raise RecordingError(f"canvas is {stated!r:.200}, expected finite numbers for {', '.join(names)}")
+    return CanvasPlacement(**stated)
+
+
+_MANIFEST = RecordFile(
+    kind=_Manifest,
+    name="roadproof-recordings",
+    error=RecordingError,
+    remedy=_AGAIN,
+    forms={
+        "colour": Form(dict[str, Any], ColourTransform.to_dict, ColourTransform.from_dict),
+        "canvas": Form(dict[str, float] | None, lambda canvas: canvas, _canvas),
+    },
+    notes={"units": _UNITS},
+)
 _PER_FRAME = RecordFile(
-    Recording,
-    "",
-    1,
-    RecordingError,
-    _AGAIN,
+    kind=Recording,
+    error=RecordingError,
+    remedy=_AGAIN,
     elsewhere=("name", "push", "frames", "maps", "track"),
     header=None,
 )
-_TRACK = RecordFile(Track, "", 1, RecordingError, _AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
+_TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
 
 
 def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = False) -> None:
@@ -109,7 +121,7 @@ def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = F
     def write(part: Path) -> None:
         for recording in recordings.recordings:
             _write_drive(recording, part / recording.name, compact=compact)
-        _MANIFEST.write(part / "recordings.json", _manifest(recordings), units=_UNITS)
+        _MANIFEST.write(part / "recordings.json", _manifest(recordings))
 
     write_folder_atomically(folder, write)
 
@@ -119,8 +131,8 @@ def _manifest(recordings: RecordingSet) -> _Manifest:
         origin=recordings.origin,
         camera=recordings.camera,
         crop_resize=recordings.view,
-        colour=recordings.colour.to_dict(),
-        canvas=recordings.canvas and asdict(recordings.canvas),
+        colour=recordings.colour,
+        canvas=recordings.canvas,
         drives=tuple(_Drive(name=each.name, push=each.push, frames=len(each.frames)) for each in recordings.recordings),
     )
 
@@ -154,20 +166,14 @@ def load_recordings(folder: Path) -> RecordingSet:
         raise RecordingError(f"no folder {folder}; expected a set of recordings with a recordings.json")
     if not (folder / "recordings.json").is_file():
         raise RecordingError(f"{folder} has no recordings.json; expected a set of recordings made by roadproof")
-    path = folder / "recordings.json"
-    manifest = _MANIFEST.read(path)
-    try:
-        colour = ColourTransform.from_dict(manifest.colour)
-        canvas = manifest.canvas and CanvasPlacement(**manifest.canvas)
-    except (ColourError, GeometryError) as error:
-        raise RecordingError(f"{path}: {error}") from None
+    manifest = _MANIFEST.read(folder / "recordings.json")
     return RecordingSet(
         camera=manifest.camera,
         view=manifest.crop_resize,
-        colour=colour,
-        recordings=tuple(_read_drive(folder, drive, colour.response) for drive in manifest.drives),
+        colour=manifest.colour,
+        recordings=tuple(_read_drive(folder, drive, manifest.colour.response) for drive in manifest.drives),
         origin=manifest.origin,
-        canvas=canvas or None,
+        canvas=manifest.canvas,
     )
 
 
