@@ -31,7 +31,10 @@ def test_evaluation_json_holds_all_that_its_points_are_made_of(tmp_path):
     trials = json.loads((tmp_path / "evaluation.json").read_text())["trials"]
     assert len(trials) == 6
     for trial in trials:
-        painted, clean = ([Event.of(stored) for stored in trial[name]] for name in ("events", "clean_events"))
+        painted, clean = (
+            [Event(EventKind(each["kind"]), each["time_s"], each["detail"]) for each in trial[name]]
+            for name in ("events", "clean_events")
+        )
         assert (len(painted), len(clean)) == (8, 2)
         assert trial["points"] == infraction_points(painted) == POINTS
         assert trial["clean_points"] == infraction_points(clean) == 6.0

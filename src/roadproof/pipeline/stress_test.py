@@ -17,13 +17,12 @@ weather but the first in RUN/WEATHER/, as those of the first are in RUN.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, attack, kept_attack
+from roadproof.attacks import AttackResult, kept_attack
 from roadproof.attacks.groups import Group, parse_groups
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
@@ -34,6 +33,7 @@ from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import Opening, evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
+from roadproof.io.identity import ANSWERS
 from roadproof.io.locks import working_in
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
@@ -142,10 +142,7 @@ def stress_test(
 
 def _stages(run: _Run, simulator: Opening | Simulator, processes: int) -> StressTest:
     """All of them, one after another; the simulator, or what opens one for each process, is the evaluation's."""
-    # What tells this run from another.
-    told = (asdict(run.scenario), repr(run.budget), asdict(run.space), run.seed, run.controller_name)
-    who = identity_of(run.controller, (run.simulator.input.height_px, run.simulator.input.width_px))
-    ledger = Ledger(run.folder, json.dumps(told, default=str), STAGES, paint=run.simulator.paint, controller=who)
+    ledger = Ledger(run.folder, run.made_of, STAGES)
     on_progress = run.on_progress
 
     def tell(stage: str, done: int, total: int, word: str) -> None:
@@ -210,6 +207,20 @@ class _Run:
     device: str
     on_progress: OnProgress
 
+    @property
+    def made_of(self) -> dict[str, object]:
+        """What tells this run from another."""
+        size = self.simulator.input.height_px, self.simulator.input.width_px
+        return {
+            "scenario": self.scenario,
+            "budget": repr(self.budget),
+            "space": self.space,
+            "seed": self.seed,
+            "controller": self.controller_name,
+            ANSWERS: identity_of(self.controller, size),
+            "paint": self.simulator.paint,
+        }
+
     def folder_of(self, number: int) -> Path:
         """Where the drives of a weather are."""
         return self.folder / self.budget.recorded_in[number] if number else self.folder
@@ -234,7 +245,7 @@ def _record(run: _Run, number: int) -> Drives:
 
 def _calibrate(run: _Run, number: int, drives: Drives) -> Calibrated:
     place = run.folder_of(number)
-    done = Calibrated.load(place)
+    done = Calibrated.kept(place, drives, run.budget.calibration)
     if done is not None:
         return done
     each = replays_needed(drives, run.budget.calibration)
@@ -255,18 +266,15 @@ def _attack(run: _Run, recordings: RecordingSet, groups: tuple[Group, ...]) -> A
     steps = budget.method.steps(budget.objective)
     return kept_attack(
         run.folder / "attack",
-        lambda checkpoint: attack(
-            recordings,
-            run.controller,
-            run.space,
-            objective=budget.objective,
-            method=budget.method,
-            groups=groups,
-            seed=run.seed,
-            device=run.device,
-            checkpoint=checkpoint,
-            on_step=lambda step, best: run.on_progress("Searching", step, steps, f"{best:.2f}"),
-        ),
+        recordings,
+        run.controller,
+        run.space,
+        objective=budget.objective,
+        method=budget.method,
+        groups=groups,
+        seed=run.seed,
+        device=run.device,
+        on_step=lambda step, best: run.on_progress("Searching", step, steps, f"{best:.2f}"),
     )
 
 
