@@ -29,8 +29,8 @@ from roadproof.datatypes import Command, Weather
 from roadproof.io.files import write_atomically
 from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario, builtin_scenarios
+from roadproof.training.random_scenarios import random_scenario
 from roadproof.training.scores import DrivingScore, Trial, score_drives
-from roadproof.training.ways import random_scenario
 
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 AGENTS = 20

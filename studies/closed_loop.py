@@ -220,7 +220,7 @@ def share_drives(cell: Cell, *place: str) -> None:
 
 def _pushed(cell: Cell, name: str) -> list[float]:
     """How far the recorded drives were aside."""
-    return [round(drive.deviation_m, 2) for drive in load_drives(cell.folder / name / "record").drives]
+    return [round(drive.offset_m, 2) for drive in load_drives(cell.folder / name / "record").drives]
 
 
 def _noon(result: StressTest) -> list[float]:

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from roadproof.io.files import write_atomically
-from roadproof.report.study.charts import COLOURS, MARKERS, MUTED, RULE
+from roadproof.study.charts import COLOURS, MARKERS, MUTED, RULE
 
 WAYS = {
     "random": "two\nrandom",

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 
 import roadproof
-from roadproof.attacks import GradOpt, Objective, PathDeviation, SteeringShift, attack, kept_attack
+from roadproof.attacks import GradOpt, Objective, PathDeviation, SteeringShift, kept_attack
 from roadproof.calibration import Calibrated, calibrate
 from roadproof.drives import record
 from roadproof.driving.evaluate import evaluate
@@ -90,7 +90,7 @@ def rows_of(cell: Cell) -> list[Row]:
             driver_name=cell.controller,
             folder=cell.folder / "record",
         )
-        calibrated = Calibrated.load(cell.folder)
+        calibrated = Calibrated.kept(cell.folder, drives, QUICK.calibration)
         if calibrated is None:
             calibrated = calibrate(town, drives, QUICK.calibration, folder=cell.folder / "calibration")
             calibrated.save(cell.folder)
@@ -101,15 +101,12 @@ def rows_of(cell: Cell) -> list[Row]:
             place = cell.folder / name
             found = kept_attack(
                 place / "attack",
-                lambda checkpoint, objective=objective, method=method: attack(
-                    calibrated.recordings,
-                    controller,
-                    space,
-                    objective=objective,
-                    method=method,
-                    seed=cell.seed,
-                    checkpoint=checkpoint,
-                ),
+                calibrated.recordings,
+                controller,
+                space,
+                objective=objective,
+                method=method,
+                seed=cell.seed,
             )
             selection = select_by_driving(
                 town,

@@ -1,4 +1,4 @@
-"""A `roadproof carla serve` in a process of its own, and a small map for it."""
+"""A `roadproof carla serve` in a process of its own, and a small map, a drive on it and cameras for it."""
 
 import contextlib
 import os
@@ -10,7 +10,24 @@ import subprocess
 import sys
 import time
 
+from roadproof.datatypes import VehicleState
+from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
+from roadproof.scenarios import Scenario
+
 START_S = 300.0
+CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
+INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)
+SMALL = CameraModel(width_px=80, height_px=60, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
+SMALL_INPUT = CropResize(left_px=0, top_px=12, right_px=80, bottom_px=51, width_px=80, height_px=39)
+STREET = Scenario(
+    name="street",
+    kind="straight",
+    map_name="street",
+    start=VehicleState(20.0, -1.75, 0.0, 0.0, 0.0),
+    goal_m=(140.0, -1.75),
+    canvas=CanvasPlacement(x_m=50.0, y_m=0.0, width_m=6.0),
+    time_limit_s=30.0,
+)
 
 
 def straight_map(folder, length_m=160.0):

@@ -1,9 +1,12 @@
 """A study of four scenarios whose means can be done in the head."""
 
-from roadproof.report.study.results import Method
+from pandas import DataFrame
 
-GRADOPT = Method(name="GradOpt", search="gradopt", trajectories=3, scheme="group")
-BO = Method(name="BO", search="published-bo")
+from roadproof.study.kept_jobs import StatedMethod
+from roadproof.study.results import results_of
+
+GRADOPT = StatedMethod(name="GradOpt", search="gradopt", trajectories=3, scheme="group")
+BO = StatedMethod(name="BO", search="published-bo")
 
 
 def row(scenario="left-01", figures="1", method="GradOpt", seed=0, **changed):
@@ -59,3 +62,8 @@ def hand_made_records():
         for weather in ("clear-noon", "rainy-noon")
         for run in range(3)
     ]
+
+
+def results(rows, methods=(), named=None):
+    """The numbers of a list of rows."""
+    return results_of(DataFrame(rows), methods, named)

@@ -11,9 +11,10 @@ from roadproof.datatypes import Weather
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import builtin_scenarios
+from roadproof.study.folder import write_result, write_table
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan
 from roadproof.study.plan import Study, TrafficPlan
-from roadproof.study.rows import JobResult, failed, job_columns, write_result, write_table
+from roadproof.study.rows import JobResult, failed, job_columns
 
 METHODS = (
     GradOptPlan(name="GradOpt", objective="steering", trajectories=3),

@@ -14,7 +14,7 @@ from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
 from roadproof.coverage import Shape
 from roadproof.datatypes import Ending, Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window
-from roadproof.drives.drives import Settings, write_drive, write_settings
+from roadproof.drives.folder import Settings, write_drive, write_settings
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation, judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT

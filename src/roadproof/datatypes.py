@@ -8,10 +8,8 @@ Convention:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -109,15 +107,6 @@ class Event:
     kind: EventKind
     time_s: float
     detail: str = ""
-
-    @staticmethod
-    def of(stored: Mapping[str, Any]) -> Event:
-        """An event as `dataclasses.asdict` and JSON leave it.
-
-        Raises:
-            KeyError, TypeError, ValueError: something is missing or wrong.
-        """
-        return Event(EventKind(stored["kind"]), float(stored["time_s"]), str(stored["detail"]))
 
 
 class Ending(StrEnum):

@@ -8,11 +8,10 @@ Convention:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import numpy as np
 import torch
@@ -23,16 +22,13 @@ from torch import Tensor
 from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
-from roadproof.io.files import read_json, write_atomically
+from roadproof.io.files import write_atomically
 from roadproof.io.pictures import read_picture
+from roadproof.io.records import RecordFile
 from roadproof.limits import MAX_FIGURES
-
-FORMAT = "roadproof-pattern"
-FORMAT_VERSION = 1
 
 _MIDDLE = CANVAS_SIZE_PX / 2
 _MOST_PX = 1e5
-_BOX_NAMES = ("x_px", "y_px", "width_px", "length_px", "rotation_deg")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,6 +173,45 @@ def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray,
     return rgba.T.reshape(size_px, size_px, 4).numpy()
 
 
+@dataclass(frozen=True, slots=True)
+class _Figure:
+    """A figure as its file has it."""
+
+    shape: Shape
+    x_px: float
+    y_px: float
+    width_px: float
+    length_px: float
+    rotation_deg: float
+    rgb: tuple[float, float, float]
+
+    @property
+    def box(self) -> tuple[float, ...]:
+        return self.x_px, self.y_px, self.width_px, self.length_px, self.rotation_deg
+
+    def __post_init__(self) -> None:
+        # Far beyond the canvas a float32 could not tell where a figure is.
+        if max(map(abs, self.box)) > _MOST_PX:
+            raise PatternError(f"figure has {max(self.box, key=abs):g}, expected at most {_MOST_PX:g} px or degrees")
+        if min(self.rgb) < 0 or max(self.rgb) > 1 or self.width_px <= 0 or self.length_px <= 0:
+            raise PatternError("figure needs rgb in [0, 1] and a width and length above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class _Figures:
+    """A pattern as its file has it."""
+
+    figures: tuple[_Figure, ...]
+    canvas_px: int = CANVAS_SIZE_PX
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.figures) <= MAX_FIGURES:
+            raise PatternError(f"it has {len(self.figures)} figures, expected at least one and {MAX_FIGURES} at most")
+
+
+_FILE = RecordFile(kind=_Figures, name="roadproof-pattern", error=PatternError, remedy="make it again")
+
+
 def save_pattern(pattern: Pattern, path: Path) -> None:
     """Write `path` (JSON: every figure by name and unit) and, beside it, its raster as PNG.
 
@@ -185,17 +220,13 @@ def save_pattern(pattern: Pattern, path: Path) -> None:
     """
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())
-    figures: list[dict[str, Any]] = [
-        {"shape": str(shape), **dict(zip(_BOX_NAMES, box, strict=True)), "rgb": rgb}
-        for shape, box, rgb in zip(pattern.shapes, boxes, colours, strict=True)
+    figures = [
+        _Figure(shape, x, y, width, length, rotation, (red, green, blue))
+        for shape, (x, y, width, length, rotation), (red, green, blue) in zip(
+            pattern.shapes, boxes, colours, strict=True
+        )
     ]
-    content: dict[str, Any] = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "canvas_px": CANVAS_SIZE_PX,
-        "figures": figures,
-    }
-    write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+    _FILE.write(path, _Figures(tuple(figures)))
     picture = Image.fromarray(raster(pattern))
     write_atomically(path.with_suffix(".png"), lambda part: picture.save(part, format="PNG"))
 
@@ -206,15 +237,9 @@ def load_pattern(path: Path) -> Pattern:
     Raises:
         PatternError: the file is missing, is not a pattern of this format, or a figure of it is not valid.
     """
-    content = read_json(path, FORMAT, FORMAT_VERSION, PatternError)
-    figures = content.get("figures")
-    if not isinstance(figures, list) or not figures:
-        raise PatternError(f"{path}: 'figures' is missing or empty, expected at least one figure")
-    if len(cast("list[Any]", figures)) > MAX_FIGURES:
-        raise PatternError(f"{path}: has {len(cast('list[Any]', figures))} figures, expected {MAX_FIGURES} at most")
-    parsed = [_parse_figure(path, k, figure) for k, figure in enumerate(cast("list[Any]", figures))]
-    shapes, boxes, colours = zip(*parsed, strict=True)
-    return Pattern(tuple(shapes), torch.tensor(boxes), torch.tensor(colours))
+    figures = _FILE.read(path).figures
+    boxes, colours = [figure.box for figure in figures], [figure.rgb for figure in figures]
+    return Pattern(tuple(figure.shape for figure in figures), torch.tensor(boxes), torch.tensor(colours))
 
 
 def read_paint(path: Path) -> UInt8[np.ndarray, "s s 4"]:
@@ -233,21 +258,3 @@ def read_paint(path: Path) -> UInt8[np.ndarray, "s s 4"]:
             f"{CANVAS_SIZE_PX}×{CANVAS_SIZE_PX}; resize it"
         )
     return paint
-
-
-def _parse_figure(path: Path, k: int, figure: Any) -> tuple[Shape, list[float], list[float]]:  # noqa: ANN401
-    try:
-        shape = Shape(figure["shape"])
-        box = [float(figure[name]) for name in _BOX_NAMES]
-        rgb = [float(value) for value in figure["rgb"]]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        expected = ", ".join(("shape", *_BOX_NAMES, "rgb"))
-        raise PatternError(f"{path}: figure {k} is not valid ({error!r}); expected {expected}") from None
-    if len(rgb) != 3 or not np.isfinite([*box, *rgb]).all():
-        raise PatternError(f"{path}: figure {k} has values that are not finite, or rgb is not three numbers")
-    # Far beyond the canvas a float32 could not tell where a figure is.
-    if max(map(abs, box)) > _MOST_PX:
-        raise PatternError(f"{path}: figure {k} has {max(box, key=abs):g}, expected at most {_MOST_PX:g} px or degrees")
-    if min(rgb) < 0 or max(rgb) > 1 or box[2] <= 0 or box[3] <= 0:
-        raise PatternError(f"{path}: figure {k} needs rgb in [0, 1] and a width and length above 0")
-    return shape, box, rgb

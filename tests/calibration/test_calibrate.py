@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import needs
-from roadproof.calibration import Method, calibrate, load_report, replays_needed
+from roadproof.calibration import CalibrationReport, Method, calibrate, replays_needed
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.drives import Swerve, Trajectories, Window, record
@@ -117,13 +117,13 @@ def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, d
 
 def test_the_set_and_its_report_survive_their_files(two_paint, tmp_path):
     two_paint.report.save(tmp_path / "report.json")
-    assert load_report(tmp_path / "report.json") == two_paint.report
+    assert CalibrationReport.load(tmp_path / "report.json") == two_paint.report
     save_recordings(two_paint.recordings, tmp_path / "recordings")
     loaded = load_recordings(tmp_path / "recordings")
     assert [drive.name for drive in loaded.recordings] == ["clean", "right", "left"]
     (tmp_path / "report.json").write_text("{")
     with pytest.raises(CalibrationError, match="not valid JSON"):
-        load_report(tmp_path / "report.json")
+        CalibrationReport.load(tmp_path / "report.json")
 
 
 def test_a_replay_that_goes_another_way_is_refused(town, drives):

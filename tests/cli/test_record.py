@@ -87,7 +87,7 @@ def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call
     before = {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")}
     assert call(*select) == said
     assert {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")} == before
-    assert "holds a choice for another attack" in call(*select[:-1], "1", code=2)
+    assert "holds a choice with candidates 2, now it is 1" in call(*select[:-1], "1", code=2)
 
 
 def test_a_second_call_goes_on_where_the_first_ended(run, call):
@@ -99,7 +99,7 @@ def test_a_second_call_goes_on_where_the_first_ended(run, call):
 
 def test_what_has_been_calibrated_is_not_mixed_with_another_method(run, call):
     said = call("calibrate", "runs", "--method", "published", code=2)
-    assert "was calibrated by pose; remove it to calibrate again by published" in said
+    assert "holds a calibration with method 'pose', now it is 'published'; choose another folder, or remove it" in said
 
 
 def test_a_scenario_that_is_a_link_out_of_the_folder_is_not_followed(call, workplace):

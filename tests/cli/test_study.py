@@ -7,7 +7,7 @@ import functools
 import pytest
 
 import needs
-from roadproof.study.rows import pandas, read_table
+from roadproof.study.folder import pandas, read_table
 from short_drive import write_plan
 
 PLAN = """

@@ -4,7 +4,8 @@ import subprocess
 import sys
 
 from made_up_study import METHODS, made_up_study, write_made_up_study
-from roadproof.study.rows import failed, write_result, write_table
+from roadproof.study.folder import write_result, write_table
+from roadproof.study.rows import failed
 
 
 def tables(*arguments):

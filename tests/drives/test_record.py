@@ -9,7 +9,7 @@ import needs
 from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
-from roadproof.drives.drives import write_settings
+from roadproof.drives.folder import write_settings
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
 from roadproof.recordings import Push
@@ -36,9 +36,9 @@ def drives(town, folder):
 def test_the_drives_go_as_far_astray_as_was_asked_and_to_their_side(drives):
     assert [drive.push for drive in drives.drives] == [Push.CLEAN, Push.RIGHT, Push.LEFT]
     clean, right, left = drives.drives
-    assert clean.deviation_m == 0.0
-    assert 1.0 < right.deviation_m < 1.3
-    assert -1.3 < left.deviation_m < -1.0
+    assert clean.offset_m == 0.0
+    assert 1.0 < right.offset_m < 1.3
+    assert -1.3 < left.offset_m < -1.0
     assert right.right_m.min() > -0.05
     assert left.right_m.max() < 0.05
     # Measured without the recorder's own path: least distance to the clean positions.
@@ -47,7 +47,7 @@ def test_the_drives_go_as_far_astray_as_was_asked_and_to_their_side(drives):
 
 
 def test_a_recording_of_a_driver_that_answered_otherwise_is_not_taken(drives, folder):
-    with pytest.raises(RecordingError, match="a recording of another driver, which answers otherwise"):
+    with pytest.raises(RecordingError, match="a recording of another controller, which answers otherwise"):
         write_settings(dataclasses.replace(drives.settings, answers="0123456789abcdef"), folder)
     write_settings(drives.settings, folder)
 
@@ -145,7 +145,7 @@ def test_a_drive_made_before_is_recorded_over_the_bare_road(drives, town, tmp_pa
     right = drives.drives[1]
     along = record_along(town, PaintShy(), drives, right.episode, name="round-1", folder=tmp_path)
     assert along.push is Push.RIGHT
-    assert along.deviation_m == pytest.approx(right.deviation_m, abs=0.02)
+    assert along.offset_m == pytest.approx(right.offset_m, abs=0.02)
     np.testing.assert_array_equal(along.frames, right.frames)
     np.testing.assert_array_equal(along.frame_number, right.frame_number)
     np.testing.assert_array_equal(along.episode.x_m[along.frame_number], right.episode.x_m[right.frame_number])

@@ -5,7 +5,7 @@ import json
 from roadproof.datatypes import Event, EventKind
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.infractions import first_event_s, infraction_points, leaderboard_factor
-from roadproof.study.job import measured
+from roadproof.study.rows import drive_columns
 from runs import write_evaluation
 
 # A rail touched twice, two lights within a second, the lawn after the sidewalk, the wrong lane twice and once more.
@@ -31,7 +31,10 @@ def test_evaluation_json_holds_all_that_its_points_are_made_of(tmp_path):
     trials = json.loads((tmp_path / "evaluation.json").read_text())["trials"]
     assert len(trials) == 6
     for trial in trials:
-        painted, clean = ([Event.of(stored) for stored in trial[name]] for name in ("events", "clean_events"))
+        painted, clean = (
+            [Event(EventKind(each["kind"]), each["time_s"], each["detail"]) for each in trial[name]]
+            for name in ("events", "clean_events")
+        )
         assert (len(painted), len(clean)) == (8, 2)
         assert trial["points"] == infraction_points(painted) == POINTS
         assert trial["clean_points"] == infraction_points(clean) == 6.0
@@ -44,7 +47,7 @@ def test_evaluation_json_holds_all_that_its_points_are_made_of(tmp_path):
 def test_a_row_of_a_study_holds_the_events_that_its_points_are_made_of(tmp_path):
     write_evaluation(tmp_path, events=EVENTS, clean_events=CLEAN)
     for trial in Evaluation.load(tmp_path).trials:
-        row = measured(trial)
+        row = drive_columns(trial)
         events = [Event(EventKind(kind), time_s, detail) for kind, time_s, detail in json.loads(row["events"])]
         assert tuple(events) == trial.events
         assert row["points"] == infraction_points(events) == POINTS

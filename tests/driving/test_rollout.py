@@ -193,14 +193,16 @@ def rewritten(path, change):
 
 
 DAMAGE = {
-    "is 'other' version 1, expected 'roadproof-episode' version 1": lambda header, _: header.update(format="other"),
-    "version 9, expected 'roadproof-episode' version 1": lambda header, _: header.update(version=9),
-    "'ending' is missing": lambda header, _: header.pop("ending"),
-    "'bored' is not a valid Ending": lambda header, _: header.update(ending="bored"),
-    "weather 'dry' is unknown": lambda header, _: header.update(weather="dry"),
+    "has format 'other', expected 'roadproof-episode'": lambda header, _: header.update(format="other"),
+    "has version 9, this roadproof reads up to 1; update it": lambda header, _: header.update(version=9),
+    "required field `ending`": lambda header, _: header.pop("ending"),
+    "ending: Invalid enum value 'bored'": lambda header, _: header.update(ending="bored"),
+    "weather: Invalid enum value 'dry'": lambda header, _: header.update(weather="dry"),
     "it has no brake": lambda _, content: content.pop("brake"),
     "x_m of the episode has NaN": lambda _, content: content.update(x_m=content["x_m"] * np.nan),
-    "expected \\(40,\\) for 41 observations": lambda _, content: content.update(steer=content["steer"][1:]),
+    "steer of the episode has shape \\(39,\\), expected \\(40,\\)": lambda _, content: content.update(
+        steer=content["steer"][1:]
+    ),
 }
 
 

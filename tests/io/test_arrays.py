@@ -161,9 +161,9 @@ def test_bad_archives_are_refused_in_one_line(tmp_path: Path, what: str) -> None
         ("words", "Expecting value"),
         ("[" * 100_000, "recursion"),
         ('{"version": ' + "9" * 5000 + "}", "integer"),
-        (json.dumps({"format": "other", "version": 1}), "expected 'f' version 1"),
-        (json.dumps({"format": "f", "version": True}), "expected 'f' version 1"),
-        (json.dumps({"format": "f", "version": 2}), "expected 'f' version 1"),
+        (json.dumps({"format": "other", "version": 1}), "has format 'other', expected 'f'"),
+        (json.dumps({"format": "f", "version": True}), "has version True, expected a whole number from 1"),
+        (json.dumps({"format": "f", "version": 2}), "has version 2, this roadproof reads up to 1; update it"),
     ],
 )
 def test_bad_headers_are_refused(tmp_path: Path, text: str, reason: str) -> None:

@@ -13,7 +13,7 @@ from roadproof.attacks.gradopt import Rung
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
-from roadproof.drives.drives import read_drive
+from roadproof.drives.folder import read_drive
 from roadproof.driving.drive_store import load_episodes
 from roadproof.errors import CalibrationError, RoadproofError
 from roadproof.pipeline.budget import Budget
@@ -70,9 +70,9 @@ def test_a_round_records_the_bare_road_where_the_attacked_car_went(done):
     steps = drive.frame_number
     np.testing.assert_allclose(drive.episode.x_m[steps], attacked.x_m[steps], atol=1e-6)
     assert not drive.episode.painted
-    assert drive.push is (Push.RIGHT if drive.deviation_m > 0 else Push.LEFT)
+    assert drive.push is (Push.RIGHT if drive.offset_m > 0 else Push.LEFT)
     # This driver swerves to the right, away from the paint, and sees none of it here.
-    assert drive.deviation_m > 0.1
+    assert drive.offset_m > 0.1
     assert (drive.steer == 0).all()
     assert attacked.steer.max() > 0.01
 

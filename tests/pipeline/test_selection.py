@@ -1,6 +1,8 @@
 """Choosing by driving: what is driven, what is kept, and what is not taken for something else."""
 
 import dataclasses
+import json
+import shutil
 
 import pytest
 import torch
@@ -80,20 +82,26 @@ def test_a_lost_choice_is_made_again_from_the_drives(done, town, street):
 
 
 OTHERS = {
-    "a controller that answers otherwise": {"controller": PaintShy(gain=5.0)},
-    "another scenario": {"scenario": {"time_limit_s": 2.0}},
-    "another weather": {"weather": Weather.RAINY_NOON},
-    "other paint": {"candidates": [candidate("left", 60.0, blue=0.9), *CANDIDATES[1:]]},
-    "fewer of them": {"best": 2},
+    "a choice of another controller, which answers otherwise": {"controller": PaintShy(gain=5.0)},
+    "a choice with scenario.time_limit_s 3.0, now it is 2.0": {"scenario": {"time_limit_s": 2.0}},
+    "a choice with weather 'clear-noon', now it is 'rainy-noon'": {"weather": Weather.RAINY_NOON},
+    "a choice with patterns": {"candidates": [candidate("left", 60.0, blue=0.9), *CANDIDATES[1:]]},
+    "a choice with candidates 3, now it is 2": {"best": 2},
 }
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_choice_of_other_inputs_is_refused(done, town, street, name):
-    given = {"controller": PaintShy(), "candidates": CANDIDATES, "best": 3} | OTHERS[name]
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("message", OTHERS)
+def test_a_choice_of_other_inputs_is_refused(done, town, street, tmp_path, message, older):
+    """Older ones say what they were made of by the names of their drives alone."""
+    folder = shutil.copytree(done[0], tmp_path / "selection")
+    given = {"controller": PaintShy(), "candidates": CANDIDATES, "best": 3} | OTHERS[message]
+    if older:
+        path, message = folder / "selection.json", "a choice with drives"
+        path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "made_of"}))
     given["scenario"] = dataclasses.replace(street, **given.get("scenario", {}))
-    with pytest.raises(RoadproofError, match="holds a choice for another attack"):
-        select_by_driving(town, folder=done[0], **given)
+    with pytest.raises(RoadproofError, match=f"holds {message}"):
+        select_by_driving(town, folder=folder, **given)
 
 
 def test_the_clean_drive_that_is_given_is_not_made(town, street, tmp_path):

@@ -1,21 +1,25 @@
 from __future__ import annotations
 
+import json
+import re
 import time
 
 import pytest
 
 from roadproof.errors import RoadproofError
+from roadproof.io.identity import ANSWERS
 from roadproof.pipeline.stage_costs import FILE, Ledger, StageCost, read_cost
 
 STAGES = ("record", "attack")
+ONE = {"seed": 1, "scenario": {"name": "left-03", "goal_m": (1.0, 2.0)}, ANSWERS: "0123"}
 
 
 def test_a_stage_that_is_gone_on_with_adds_to_what_it_took_before(tmp_path):
-    ledger = Ledger(tmp_path, "one", STAGES)
+    ledger = Ledger(tmp_path, ONE, STAGES)
     with pytest.raises(KeyboardInterrupt), ledger.stage("record"):
         time.sleep(0.02)
         raise KeyboardInterrupt
-    again = Ledger(tmp_path, "one", STAGES)
+    again = Ledger(tmp_path, ONE, STAGES)
     before = again.cost["record"].seconds
     assert before >= 0.02
     with again.stage("record"):
@@ -29,7 +33,7 @@ def test_a_stage_that_is_gone_on_with_adds_to_what_it_took_before(tmp_path):
 
 def test_time_is_noted_while_a_stage_lasts(tmp_path, monkeypatch):
     monkeypatch.setattr("roadproof.pipeline.stage_costs._EVERY_S", 0.01)
-    ledger = Ledger(tmp_path, "one", STAGES)
+    ledger = Ledger(tmp_path, ONE, STAGES)
     with ledger.stage("attack"):
         time.sleep(0.02)
         ledger.step()
@@ -41,11 +45,56 @@ def test_time_is_noted_while_a_stage_lasts(tmp_path, monkeypatch):
 
 
 def test_another_run_and_a_damaged_ledger_are_refused(tmp_path):
-    Ledger(tmp_path, "one", STAGES)
-    with pytest.raises(RoadproofError, match="other settings"):
-        Ledger(tmp_path, "two", STAGES)
+    Ledger(tmp_path, ONE, STAGES)
+    with pytest.raises(
+        RoadproofError, match="holds a run with seed 1, now it is 2; choose another folder, or remove it"
+    ):
+        Ledger(tmp_path, ONE | {"seed": 2}, STAGES)
+    with pytest.raises(RoadproofError, match=r"with scenario\.goal_m \[1\.0, 2\.0\], now it is \[1\.0, 3\.0\]"):
+        Ledger(tmp_path, ONE | {"scenario": {"name": "left-03", "goal_m": (1.0, 3.0)}}, STAGES)
+    with pytest.raises(RoadproofError, match="a run of another controller, which answers otherwise"):
+        Ledger(tmp_path, ONE | {ANSWERS: "4567"}, STAGES)
     path = tmp_path / FILE
     path.write_text(path.read_text().replace('"seconds": 0.0', '"seconds": "long"'))
     with pytest.raises(RoadproofError, match="damaged"):
         read_cost(tmp_path)
     assert read_cost(tmp_path / "elsewhere") == {}
+
+
+OLD = {
+    "format": "roadproof-run",
+    "version": 1,
+    "identity": json.dumps([{"name": "left-03"}, "Budget(select=1)", {"figures": 5}, 0, "pilotnet"]),
+    "cost": {"record": {"seconds": 2.5, "simulator_calls": 5}},
+    "paint": "rendered",
+    "controller": "0123",
+}
+NOW = {
+    "scenario": {"name": "left-03"},
+    "budget": "Budget(select=1)",
+    "space": {"figures": 5},
+    "seed": 0,
+    "controller": "pilotnet",
+    ANSWERS: "0123",
+    "paint": "rendered",
+}
+
+
+def test_a_run_of_an_earlier_version_goes_on_or_is_refused_in_one_line(tmp_path):
+    """Its identity was a text; at first it said neither paint nor answers."""
+    for left_out in ((), ("paint", "controller")):
+        (tmp_path / FILE).write_text(json.dumps({name: OLD[name] for name in OLD if name not in left_out}))
+        for part, other in (("seed", 1), ("budget", "Budget(select=2)"), ("paint", "composited")):
+            with pytest.raises(RoadproofError, match=f"holds a run with {part} .*, now it is {re.escape(repr(other))}"):
+                Ledger(tmp_path, NOW | {part: other}, STAGES)
+        ledger = Ledger(tmp_path, NOW, STAGES)
+        assert ledger.cost["record"] == StageCost(2.5, 5)
+        with ledger.stage("attack"):
+            pass
+        assert Ledger(tmp_path, NOW, STAGES).cost["record"] == StageCost(2.5, 5)
+        with pytest.raises(RoadproofError, match="with seed 0, now it is 1"):
+            Ledger(tmp_path, NOW | {"seed": 1}, STAGES)
+    for damaged in ("no JSON", "[1, 2]", "5"):
+        (tmp_path / FILE).write_text(json.dumps(OLD | {"identity": damaged}))
+        with pytest.raises(RoadproofError, match=r"run\.json is incomplete or damaged .*; remove it, the stages stay"):
+            Ledger(tmp_path, NOW, STAGES)

@@ -1,5 +1,6 @@
 import pytest
 
+from hand_made_study import hand_made_records
 from roadproof.datatypes import Weather
 from roadproof.scenarios import builtin_scenarios
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan
@@ -18,3 +19,8 @@ def small_study():
         ),
         weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON),
     )
+
+
+@pytest.fixture
+def records():
+    return hand_made_records()

@@ -23,10 +23,10 @@ from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.patterns import load_pattern
 from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING
-from roadproof.study.job import MEASURED, budget_of, run_job, space_of
-from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan
+from roadproof.study.job import run_job, space_of
+from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
 from roadproof.study.plan import Job, StartPlan, TrafficPlan
-from roadproof.study.rows import JOB_COLUMNS
+from roadproof.study.rows import CostColumns, DriveColumns, JobColumns
 from short_drive import SHORT
 
 COSTS = ("search_seconds", "seconds")
@@ -78,7 +78,9 @@ def test_gradopt_finds_and_is_judged_in_every_condition(tmp_path):
         ("clear-noon", True),
         ("rainy-noon", False),
     ]
-    assert all(tuple(row) == (*JOB_COLUMNS, *MEASURED) for row in result.rows)
+    drive, costs = DriveColumns.__annotations__, CostColumns.__annotations__
+    assert all(tuple(row) == (*JobColumns.__annotations__, "controller", *drive, *costs) for row in result.rows)
+    assert {row["job"] for row in result.rows} == {job.key}
     first = result.rows[0]
     # One drive recorded, two to calibrate, one over the only candidate; a pair for each row.
     assert (first["search_calls"], first["evaluation_calls"]) == (4, 6)

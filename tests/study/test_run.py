@@ -10,9 +10,9 @@ import pytest
 
 import needs
 from roadproof.errors import StudyError
+from roadproof.study.folder import read_table
 from roadproof.study.job import run_job
 from roadproof.study.plan import load_study
-from roadproof.study.rows import read_table
 from roadproof.study.run import run_study
 from short_drive import write_plan
 from study_work import counts, dies_for_two_figures, fails_for_bo, tells_threads

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
-from roadproof.study.summary import failures, matrix, summary
+from pandas import DataFrame
+
+from roadproof.study.summary import failures, summary, transfer_summary
 
 
 def row(method, deviation_m, *, weather="clear-noon", traffic=False, error=None, **more):
@@ -18,22 +20,22 @@ def test_methods_are_summed_up_as_they_were_searched():
         row("BO", 0.5),
         {**row("BO", None), "error": "no luck"},
     ]
-    ours, theirs = summary(rows)
+    ours, theirs = summary(DataFrame(rows))
     assert "GradOpt: 1.50 m deviation, alone in clear-noon; found with 15 simulator calls in 30 s" in ours
     assert "BO: 0.50 m" in theirs
-    assert failures(rows) == ("left-01, K = 1, BO, seed 0: no luck",)
+    assert failures(DataFrame(rows)) == ("left-01, K = 1, BO, seed 0: no luck",)
 
 
 def test_a_study_in_which_all_failed_has_failures_alone():
     rows = [row("BO", None, error="no luck")]
-    assert summary(rows) == ()
-    assert len(failures(rows)) == 1
+    assert summary(DataFrame(rows)) == ()
+    assert len(failures(DataFrame(rows))) == 1
 
 
 def test_a_transfer_is_a_mean_for_each_method_and_controller():
     found = {"found_on": "cil"}
     rows = [row("BO", 1.0, controller="cil", **found), row("BO", 2.0, controller="cil", **found)]
-    assert matrix([*rows, row("BO", 0.25, controller="own", **found)]) == (
+    assert transfer_summary(DataFrame([*rows, row("BO", 0.25, controller="own", **found)])) == (
         "BO, found against cil: 1.50 m deviation of cil",
         "BO, found against cil: 0.25 m deviation of own",
     )

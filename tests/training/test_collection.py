@@ -9,42 +9,44 @@ from roadproof.errors import TrainingError
 from roadproof.scenarios import builtin_scenarios
 from roadproof.training.collection import CollectionPlan, collect, record_drive
 from roadproof.training.shards import Shard
-from roadproof.training.workers import Seat
+from roadproof.training.workers import Worker
 
 needs.town()
 
 
 @pytest.fixture(scope="module")
-def seat():
-    seat = Seat(None, 0.1)
-    yield seat
-    seat.close()
+def worker():
+    worker = Worker(None, 0.1)
+    yield worker
+    worker.close()
 
 
-def test_a_quiet_drive_follows_the_route_and_a_knocked_one_leaves_it(seat):
-    quiet = record_drive(seat.town, CollectionPlan(drives=1, seed=3, knocked=0.0, traffic=0.0), 0, None)
-    knocked = record_drive(seat.town, CollectionPlan(drives=1, seed=3, knocked=1.0, traffic=0.0), 0, None)
+def test_a_quiet_drive_follows_the_route_and_a_disturbed_one_leaves_it(worker):
+    quiet = record_drive(worker.town, CollectionPlan(drives=1, seed=3, disturbed=0.0, traffic=0.0), 0, None)
+    disturbed = record_drive(worker.town, CollectionPlan(drives=1, seed=3, disturbed=1.0, traffic=0.0), 0, None)
     assert len(quiet) > 60
     assert np.abs(quiet.lateral_m).max() < 0.35
-    assert np.abs(knocked.lateral_m).max() > 0.5
+    assert np.abs(disturbed.lateral_m).max() > 0.5
     # The label is what brings the car back: right of the route it steers left of what the route asks, and the
     # other way round.
-    assert np.corrcoef(knocked.lateral_m, knocked.expert[:, 0])[0, 1] > 0.2
+    assert np.corrcoef(disturbed.lateral_m, disturbed.expert[:, 0])[0, 1] > 0.2
     assert quiet.frames.shape[1:] == (88, 200, 3)
-    assert quiet.about["weather"] == knocked.about["weather"]
-    assert (quiet.about["knocked"], knocked.about["knocked"]) == (False, True)
+    assert quiet.about["weather"] == disturbed.about["weather"]
+    assert (quiet.about["disturbed"], disturbed.about["disturbed"]) == (False, True)
 
 
-def test_drives_start_at_rest_and_the_expert_wants_to_go(seat):
-    quiet = record_drive(seat.town, CollectionPlan(drives=1, seed=3, knocked=0.0, traffic=0.0), 1, None)
+def test_drives_start_at_rest_and_the_expert_wants_to_go(worker):
+    quiet = record_drive(worker.town, CollectionPlan(drives=1, seed=3, disturbed=0.0, traffic=0.0), 1, None)
     assert quiet.speed_mps[0] < 0.1
     assert quiet.expert[0, 1] > 0.3
     assert quiet.speed_mps.max() > 4.0
 
 
-def test_paint_is_seen_only_where_it_was_asked_for(seat):
-    bare = record_drive(seat.town, CollectionPlan(drives=1, seed=5, knocked=0.0, traffic=0.0), 0, None)
-    painted = record_drive(seat.town, CollectionPlan(drives=1, seed=5, knocked=0.0, traffic=0.0, painted=1.0), 0, None)
+def test_paint_is_seen_only_where_it_was_asked_for(worker):
+    bare = record_drive(worker.town, CollectionPlan(drives=1, seed=5, disturbed=0.0, traffic=0.0), 0, None)
+    painted = record_drive(
+        worker.town, CollectionPlan(drives=1, seed=5, disturbed=0.0, traffic=0.0, painted=1.0), 0, None
+    )
     assert painted.about["painted"]
     assert not bare.about["painted"]
     assert len(bare) == len(painted)
@@ -54,20 +56,20 @@ def test_paint_is_seen_only_where_it_was_asked_for(seat):
     np.testing.assert_array_equal(bare.expert, painted.expert)
 
 
-def test_a_controller_drives_and_the_expert_answers(seat, tmp_path):
+def test_a_controller_drives_and_the_expert_answers(worker, tmp_path):
     save_controller(CIL(width=0.05, seed=1).eval(), tmp_path / "untrained.safetensors")
     plan = CollectionPlan(
-        drives=1, seed=3, controller=str(tmp_path / "untrained.safetensors"), knocked=0.0, traffic=0.0
+        drives=1, seed=3, controller=str(tmp_path / "untrained.safetensors"), disturbed=0.0, traffic=0.0
     )
     from roadproof.controllers import load_controller
 
-    shard = record_drive(seat.town, plan, 0, load_controller(plan.controller))
+    shard = record_drive(worker.town, plan, 0, load_controller(plan.controller))
     assert np.abs(shard.lateral_m).max() <= 2.6
     assert np.isfinite(shard.expert).all()
 
 
 def test_a_folder_is_filled_up_and_processes_agree(tmp_path):
-    plan = CollectionPlan(drives=2, seed=8, knocked=0.5, traffic=0.0)
+    plan = CollectionPlan(drives=2, seed=8, disturbed=0.5, traffic=0.0)
     told = []
     first = collect(plan, tmp_path / "a", processes=2, on_drive=told.append)
     assert sorted(told) == [1, 2]
@@ -84,7 +86,7 @@ def test_a_folder_is_filled_up_and_processes_agree(tmp_path):
 
 def test_scenarios_are_not_what_is_driven():
     from roadproof.roads.maps import load_map
-    from roadproof.training.ways import random_scenario
+    from roadproof.training.random_scenarios import random_scenario
 
     built_in = {(s.start.x_m, s.start.y_m, s.goal_m) for s in builtin_scenarios()}
     roads = load_map("town")
@@ -93,7 +95,7 @@ def test_scenarios_are_not_what_is_driven():
         assert (drawn.start.x_m, drawn.start.y_m, drawn.goal_m) not in built_in
 
 
-@pytest.mark.parametrize("changes", [{"drives": 0}, {"knocked": 1.2}, {"traffic": -0.1}, {"painted": 2.0}])
+@pytest.mark.parametrize("changes", [{"drives": 0}, {"disturbed": 1.2}, {"traffic": -0.1}, {"painted": 2.0}])
 def test_plans_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError, match=next(iter(changes))):
         CollectionPlan(**({"drives": 1, "seed": 0} | changes))

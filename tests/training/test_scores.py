@@ -8,7 +8,7 @@ import needs
 from roadproof.datatypes import Control, Weather
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.training.scores import Trial, score_drive, score_drives
-from roadproof.training.workers import Seat
+from roadproof.training.workers import Worker
 
 needs.town()
 
@@ -32,9 +32,9 @@ class Held:
 
 @pytest.fixture(scope="module")
 def town():
-    seat = Seat(None, 0.05)
-    yield seat.town
-    seat.close()
+    worker = Worker(None, 0.05)
+    yield worker.town
+    worker.close()
 
 
 def test_the_expert_drives_a_turn_clean(town):
@@ -70,6 +70,13 @@ def test_who_stands_does_not_arrive(town):
     assert not score.arrived
     assert score.events == ()
     assert score.failed_at_m == pytest.approx((short.start.x_m, short.start.y_m), abs=0.2)
+
+
+def test_who_stands_until_the_drive_is_given_up_does_not_arrive(town):
+    long = dataclasses.replace(find_scenario("straight-02", SCENARIOS), time_limit_s=60.0)
+    score = score_drive(town, Held(Control(0.0)), Trial(scenario=long))
+    assert (score.arrived, score.clean, score.events) == (False, False, ())
+    assert score.seconds == pytest.approx(30.0)
 
 
 def test_processes_and_one_process_agree():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,10 +18,13 @@ from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
-from roadproof.attacks.methods import GradOpt
+from roadproof.attacks.methods import GradOpt, stored
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
-from roadproof.attacks.result import AttackResult, Candidate, Cost
+from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.controllers import Controller
+from roadproof.errors import RoadproofError
+from roadproof.io.identity import require_same
+from roadproof.io.records import plain
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -99,20 +104,68 @@ def attack(
     )
 
 
-def kept_attack(folder: Path, search: Callable[[Path], AttackResult]) -> AttackResult:
+def kept_attack(
+    folder: Path,
+    recordings: RecordingSet,
+    controller: Controller,
+    space: SearchSpace,
+    *,
+    objective: Objective,
+    method: Method,
+    groups: Sequence[Group] | None = None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    starts: Sequence[Candidate] = (),
+    on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
+) -> AttackResult:
     """A search that is done once: what it found is read from its folder where it is there already.
 
     Args:
-        folder: of the result.
-        search: does it; gets the checkpoint to go on from.
+        folder: folder of the result; it keeps the running search too.
+        recordings: as in `attack`, like all that follow.
+        controller: on `device`.
+        space: the patterns allowed.
+        objective: what is made large.
+        method: how it is searched.
+        groups: drives attacked together.
+        seed: seed of everything random.
+        device: where to search.
+        starts: candidates to search on from.
+        on_step: called after every step.
 
     Raises:
-        RoadproofError: the result is damaged, or the search refuses.
+        RoadproofError: the result is damaged or of another search, or the search refuses.
         OutputError: the folder cannot be written.
     """
-    checkpoint = folder / "search.safetensors"
-    if not (folder / "result.json").exists():
-        search(checkpoint).save(folder)
+    frames = hashlib.sha256()
+    for drive in recordings.recordings:
+        for values in (drive.frames, drive.frame_number, drive.image_from_canvas):
+            frames.update(np.ascontiguousarray(values).tobytes())
+    made_of = {
+        "space": plain(space),
+        "objective": objective.name,
+        "method": stored(method),
+        "groups": groups and list(map(str, groups)),
+        "seed": seed,
+        "recordings": frames.hexdigest(),
+    }
+    checkpoint, path = folder / "search.safetensors", folder / "result.json"
+    if path.exists():
+        require_same(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
+    else:
+        attack(
+            recordings,
+            controller,
+            space,
+            objective=objective,
+            method=method,
+            groups=groups,
+            seed=seed,
+            device=device,
+            starts=starts,
+            checkpoint=checkpoint,
+            on_step=on_step,
+        ).save(folder, made_of)
     checkpoint.unlink(missing_ok=True)
     return AttackResult.load(folder)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from roadproof.io.files import write_tensors
+from roadproof.io.identity import digest
 
 
 def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None:
@@ -20,7 +20,7 @@ def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None
         OutputError: the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-    write_tensors(path, tensors, {"identity": _digest(identity)})
+    write_tensors(path, tensors, {"identity": digest(identity)})
 
 
 def load_checkpoint(path: Path, identity: str, device: torch.device) -> dict[str, Tensor] | None:
@@ -30,13 +30,9 @@ def load_checkpoint(path: Path, identity: str, device: torch.device) -> dict[str
     try:
         with cast("Any", safe_open)(path, framework="pt") as stored:
             metadata: dict[str, str] = stored.metadata() or {}
-            if metadata.get("identity") != _digest(identity):
+            if metadata.get("identity") != digest(identity):
                 return None
             names: list[str] = stored.keys()
             return {name: stored.get_tensor(name).to(device) for name in names}
     except (SafetensorError, OSError):
         return None
-
-
-def _digest(identity: str) -> str:
-    return hashlib.sha256(identity.encode()).hexdigest()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, astuple, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -14,13 +15,9 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
-from roadproof.io.files import read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
-
-FORMAT = "roadproof-attack"
-FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -99,8 +96,12 @@ class AttackResult:
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: Path, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
+
+        Args:
+            folder: folder of the result.
+            made_of: what tells the search from another (`kept_attack`).
 
         Raises:
             OutputError: the folder cannot be written.
@@ -108,18 +109,14 @@ class AttackResult:
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
-        told: dict[str, Any] = asdict(self)
-        del told["pattern"]
-        told |= {
-            "candidates": [
+        RESULT_FILE.write(
+            folder / "result.json",
+            self,
+            made_of=made_of or {},
+            candidates=[
                 [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
             ],
-            "history": np.round(self.history.astype(float), 6).tolist(),
-            "method": stored(self.method),
-        }
-        kind = "surrogate and predicted: composited frames, not driving"
-        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, **told}
-        write_atomically(folder / "result.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+        )
 
     @staticmethod
     def load(folder: Path) -> AttackResult:
@@ -128,66 +125,61 @@ class AttackResult:
         Raises:
             RoadproofError: a file is missing, damaged or of another format.
         """
-        path, remedy = folder / "result.json", "search again"
-        content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
-        told = record(content, _Stored, path, RoadproofError, remedy)
-        try:
-            history = np.array(told.history, dtype=np.float64)
-        except ValueError as error:
-            raise RoadproofError(f"{path} is incomplete or damaged ({error}); {remedy}") from None
-        candidates: list[Candidate] = []
-        for rank, each in enumerate(told.candidates, 1):
-            ranked = record(dict(zip(_Ranked.__slots__, each, strict=False)), _Ranked, path, RoadproofError, remedy)
-            candidates.append(Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), *astuple(ranked)))
-        return AttackResult(
-            pattern=load_pattern(folder / "pattern.json"),
-            candidates=tuple(candidates),
-            history=history,
-            method=_method(told, path, remedy),
-            **{name: getattr(told, name) for name in _Stored.__slots__ if name not in _MADE},
+        path = folder / "result.json"
+        content = RESULT_FILE.content(path)
+        if "method" not in content:
+            content["method"] = _of_first_format(content)
+        ranked = _ROWS_FILE.made(path, content).candidates
+        candidates = tuple(
+            Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), *msgspec.structs.astuple(each))
+            for rank, each in enumerate(ranked, 1)
         )
+        return RESULT_FILE.made(path, content, pattern=load_pattern(folder / "pattern.json"), candidates=candidates)
+
+
+class _Ranked(msgspec.Struct, array_like=True, frozen=True):
+    """A candidate but for its pattern, as a list; older results lack the last one or two."""
+
+    group: str
+    surrogate_shift: float
+    predicted_m: float | None = None
+    predicted_range_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class _Ranked:
-    """A candidate but for its pattern; older results lack the last one or two."""
+class _Rows:
+    """The candidates of result.json."""
 
-    group: str
-    surrogate_shift: float
-    predicted_m: float | None = None
-    predicted_range_m: tuple[float, float] | None = None
+    candidates: tuple[_Ranked, ...]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Stored:
-    """result.json; of version 1 with schedule and restarts instead of a method, and at first without an objective."""
-
-    group: str
-    surrogate_shift: float
-    by_group: dict[str, float]
-    seed: int
-    candidates: list[list[Any]]
-    history: list[list[list[float]]]
-    cost: Cost
-    checks: tuple[Check, ...]
-    space: SearchSpace
-    method: dict[str, Any] = field(default_factory=dict[str, Any])
-    schedule: dict[str, Any] = field(default_factory=dict[str, Any])
-    restarts: int = 0
-    objective: str = "steering shift"
-    predicted_m: float | None = None
-    predicted_range_m: tuple[float, float] | None = None
+def _rounded(history: Float[np.ndarray, "i g r"]) -> Float[np.ndarray, "i g r"]:
+    return np.round(history.astype(float), 6)
 
 
-_MADE = ("candidates", "history", "method", "schedule", "restarts")
+def _method(stated: dict[str, Any]) -> Method:
+    return method_of(str(stated.get("method", "")), **{name: stated[name] for name in stated if name != "method"})
 
 
-def _method(told: _Stored, path: Path, remedy: str) -> Method:
-    given = dict(told.method)
-    try:
-        if not given:
-            halving, iterations = bool(told.schedule.get("heats")), told.schedule.get("iterations")
-            return GradOpt(iterations=iterations, restarts=told.restarts, halving=halving)
-        return method_of(str(given.pop("method", "")), **given)
-    except RoadproofError as error:
-        raise RoadproofError(f"{path} is incomplete or damaged ({error}); {remedy}") from None
+def _of_first_format(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The method, which was a schedule and a number of restarts."""
+    schedule: dict[str, Any] = content["schedule"] if isinstance(content.get("schedule"), dict) else {}
+    halving = bool(schedule.get("heats"))
+    stated = {"iterations": schedule.get("iterations"), "restarts": content.get("restarts"), "halving": halving}
+    return {"method": GradOpt.word} | stated
+
+
+RESULT_FILE = RecordFile(
+    kind=AttackResult,
+    name="roadproof-attack",
+    version=2,
+    error=RoadproofError,
+    remedy="search again",
+    elsewhere=("pattern", "candidates"),
+    forms={
+        "method": Form(dict[str, Any], stored, _method),
+        "history": Form(Float[np.ndarray, "i g r"], _rounded, _rounded),
+    },
+    notes={"kind": "surrogate and predicted: composited frames, not driving"},
+)
+_ROWS_FILE = RecordFile(kind=_Rows, error=RoadproofError, remedy="search again")

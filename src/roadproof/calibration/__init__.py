@@ -7,4 +7,3 @@ from roadproof.calibration.calibrate import calibrate as calibrate
 from roadproof.calibration.calibrate import replays_needed as replays_needed
 from roadproof.calibration.report import CalibrationReport as CalibrationReport
 from roadproof.calibration.report import DriveReport as DriveReport
-from roadproof.calibration.report import load_report as load_report

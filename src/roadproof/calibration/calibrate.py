@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
-from roadproof.calibration.replays import Replays
-from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, load_report, stated_errors_px
+from roadproof.calibration.replays import Replays, drive_digest
+from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
 from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import Homography, homography_from_pose
+from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
 from roadproof.simulators.protocol import Simulator
@@ -52,6 +53,8 @@ class Calibrated:
 
     recordings: RecordingSet
     report: CalibrationReport
+    made_of: Mapping[str, object] = field(default_factory=dict[str, object])
+    """The method and a digest of every drive, which tell it from another calibration."""
 
     def save(self, run: Path) -> None:
         """Write both, the recordings last, since they say that it is finished.
@@ -59,19 +62,34 @@ class Calibrated:
         Raises:
             OutputError: they cannot be written.
         """
-        self.report.save(run / "calibration" / "report.json")
+        CalibrationReport.FILE.write(run / "calibration" / "report.json", self.report, made_of=self.made_of)
         save_recordings(self.recordings, run / "recordings")
 
     @staticmethod
-    def load(run: Path) -> Calibrated | None:
+    def kept(run: Path, drives: Drives, method: Method) -> Calibrated | None:
         """Read what `save` wrote; None where the run has not been calibrated.
 
+        Args:
+            run: folder of the run.
+            drives: the drives that it is to be a calibration of.
+            method: how they are to be calibrated.
+
         Raises:
-            CalibrationError, RecordingError: a file is missing or damaged.
+            CalibrationError, RecordingError: a file is missing or damaged, or it is a calibration of other drives, or
+                by another method.
         """
         if not (run / "recordings").exists():
             return None
-        return Calibrated(load_recordings(run / "recordings"), load_report(run / "calibration" / "report.json"))
+        path, now = run / "calibration" / "report.json", _parts(drives, method)
+        content = CalibrationReport.FILE.content(path)
+        report = CalibrationReport.FILE.made(path, content)
+        before = content.get("made_of") or {"method": report.method}
+        require_same(run / "recordings", "a calibration", before, now, CalibrationError)
+        return Calibrated(load_recordings(run / "recordings"), report, now)
+
+
+def _parts(drives: Drives, method: Method) -> dict[str, object]:
+    return {"method": str(method), "drives": {drive.name: drive_digest(drive) for drive in drives.drives}}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +166,7 @@ def calibrate(
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
         canvas=settings.scenario.canvas,
     )
-    return Calibrated(recordings, report)
+    return Calibrated(recordings, report, _parts(drives, method))
 
 
 def _from_points(replays: Replays, drive: Drive) -> _Geometry:

@@ -146,13 +146,19 @@ def _check_same_way(name: str, step: int, state: VehicleState, wanted: VehicleSt
         )
 
 
-def _digest(drives: Drives, drive: Drive, paint: PatternImage) -> str:
-    """Tells replays apart: the controls, the frames wanted, the paint, and where."""
-    digest = hashlib.sha256(repr((drives.settings, drive.name)).encode())
-    episode = drive.episode
-    for values in (episode.steer, episode.throttle, episode.brake, drive.frame_number, paint):
+def drive_digest(drive: Drive, before: bytes = b"", after: bytes = b"") -> str:
+    """Tells a drive from others by its controls and the steps of its kept frames; and what stands before and after."""
+    episode, digest = drive.episode, hashlib.sha256(before)
+    for values in (episode.steer, episode.throttle, episode.brake, drive.frame_number):
         digest.update(np.ascontiguousarray(values).tobytes())
+    digest.update(after)
     return digest.hexdigest()
+
+
+def _digest(drives: Drives, drive: Drive, paint: PatternImage) -> str:
+    """Tells replays apart: where, the controls, the frames wanted, and the paint."""
+    where = repr((drives.settings, drive.name)).encode()
+    return drive_digest(drive, where, np.ascontiguousarray(paint).tobytes())
 
 
 def _read(path: Path, digest: str) -> dict[str, Any] | None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
-from roadproof.io.files import read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.records import RecordFile, Saved
 
-FORMAT = "roadproof-calibration"
-FORMAT_VERSION = 1
 _GRID = 9
 
 
@@ -54,7 +49,7 @@ class DriveReport:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class CalibrationReport:
+class CalibrationReport(Saved):
     """How good a calibration is, and what it cost.
 
     Args:
@@ -72,24 +67,10 @@ class CalibrationReport:
     calls: int
     seconds: float
 
-    def save(self, path: Path) -> None:
-        """Write it as JSON.
 
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        content = {"format": FORMAT, "version": FORMAT_VERSION, **asdict(self)}
-        write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
-
-
-def load_report(path: Path) -> CalibrationReport:
-    """Read what `CalibrationReport.save` wrote.
-
-    Raises:
-        CalibrationError: the file is missing or damaged.
-    """
-    content = read_json(path, FORMAT, FORMAT_VERSION, CalibrationError)
-    return record(content, CalibrationReport, path, CalibrationError, "calibrate again")
+CalibrationReport.FILE = RecordFile(
+    kind=CalibrationReport, name="roadproof-calibration", error=CalibrationError, remedy="calibrate again"
+)
 
 
 def stated_errors_px(

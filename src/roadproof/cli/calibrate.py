@@ -34,7 +34,7 @@ def calibrate(
     from roadproof.calibration import calibrate as run
     from roadproof.cli.progress import progress
     from roadproof.drives import load_drives
-    from roadproof.errors import CalibrationError, RecordingError
+    from roadproof.errors import RecordingError
     from roadproof.io.locks import hold
     from roadproof.simulators.loading import open_simulator
 
@@ -46,13 +46,8 @@ def calibrate(
     hold(folder)
 
     for path, drives in recorded.items():
-        done = Calibrated.load(path)
+        done = Calibrated.kept(path, drives, how)
         if done is not None:
-            before = done.report.method
-            if before != how:
-                raise CalibrationError(
-                    f"{path / 'recordings'} was calibrated by {before}; remove it to calibrate again by {how}"
-                )
             _summarise(done.report, path)
             continue
         with (

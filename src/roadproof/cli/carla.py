@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from roadproof.cli.options import number, unset
-
-if TYPE_CHECKING:
-    from roadproof.simulators.checks import Check
 
 carla = typer.Typer(no_args_is_help=True, add_completion=False, help="CARLA: serve the town as one, examine a server.")
 
@@ -66,10 +63,7 @@ def doctor(host: Host = "127.0.0.1", port: Port = 2000) -> None:
 
     typer.echo(f"CARLA server at {host}:{port}")
 
-    def told(check: Check) -> None:
-        typer.echo(f"{'ok  ' if check.passed else 'BAD '} {check.name}: {check.detail}")
-
-    if not examine(CarlaSimulator(host, port), told).passed:
+    if not examine(CarlaSimulator(host, port), lambda check: typer.echo(str(check))).passed:
         raise typer.Exit(1)
 
 

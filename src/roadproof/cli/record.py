@@ -99,5 +99,5 @@ def _summarise(drives: Drives, run: Path) -> None:
     say(f"{drives.settings.scenario.name}, {drives.settings.weather}: {drives.calls} drives, kept in {run / 'record'}")
     for drive in drives.drives:
         steps = f"steps {drive.frame_number[0]} to {drive.frame_number[-1]}"
-        aside = f"up to {drive.deviation_m:+.2f} m to the right" if drive.deviation_m else "clean"
+        aside = f"up to {drive.offset_m:+.2f} m to the right" if drive.offset_m else "clean"
         say(f"  {drive.name:8} {len(drive.frames)} frames, {steps}, {aside}{drive.note and '; ' + drive.note}")

@@ -40,9 +40,9 @@ def run(
 
     from roadproof.cli.progress import HOURS_S, progress
     from roadproof.controllers import load_controller
+    from roadproof.study.folder import is_done
     from roadproof.study.job import run_job
     from roadproof.study.plan import load_study
-    from roadproof.study.rows import is_done, records
     from roadproof.study.run import run_study
     from roadproof.study.summary import failures, summary
 
@@ -59,7 +59,7 @@ def run(
             failed += any(row.get("error") for row in result.rows)
             show(done, failed)
 
-        rows = records(run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told))
+        rows = run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told)
     say = Console(soft_wrap=True, highlight=False, markup=False).print
     for line in summary(rows):
         say(line)
@@ -84,18 +84,15 @@ def transfer(
 
     from roadproof.cli.progress import stages
     from roadproof.study.plan import load_study
-    from roadproof.study.rows import records
-    from roadproof.study.summary import matrix
+    from roadproof.study.summary import transfer_summary
     from roadproof.study.transfer import transfer as run_transfer
 
     chosen = load_study(plan, trust=trust)
     specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
     with stages() as show:
-        rows = records(
-            run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
-        )
+        rows = run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
     say = Console(soft_wrap=True, highlight=False, markup=False).print
-    for line in matrix(rows):
+    for line in transfer_summary(rows):
         say(line)
     say(f"Rows in {out / 'transfer.parquet'}")
 
@@ -111,13 +108,11 @@ def tables(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from rich.console import Console
 
-    from roadproof.report.study.page import write_study
-    from roadproof.study.rows import read_table, records
+    from roadproof.study.folder import read_table
+    from roadproof.study.page import write_tables
 
-    rows, transfer = records(read_table(folder)), []
-    if (folder / "transfer.parquet").exists():
-        driven = read_table(folder, "transfer.parquet")
-        transfer = records(driven.rename(columns={"controller": "driven_by"}))
-    page = write_study(rows, folder, out or folder / "tables", transfer)
+    rows = read_table(folder)
+    driven = read_table(folder, "transfer.parquet") if (folder / "transfer.parquet").exists() else None
+    page = write_tables(rows, folder, out or folder / "tables", driven)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     console.print(f"The tables are {page}, as Markdown and LaTeX beside it; figures in {page.parent / 'figures'}")

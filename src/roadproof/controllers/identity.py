@@ -6,13 +6,11 @@ Drives, recordings and runs that were made with the one are not taken for those 
 
 from __future__ import annotations
 
-import hashlib
-import json
-
 import numpy as np
 
 from roadproof.controllers.asking import act_of, frame_size_of
 from roadproof.controllers.protocol import Controller
+from roadproof.io.identity import digest, stated
 
 Answers = list[tuple[float, ...]]
 
@@ -50,4 +48,4 @@ def identity_of(driver: object, size: tuple[int, int]) -> str:
     """
     if not isinstance(driver, Controller):
         return ""
-    return hashlib.sha256(json.dumps(answers_of(driver, size)).encode()).hexdigest()[:16]
+    return digest(stated(answers_of(driver, size)))[:16]

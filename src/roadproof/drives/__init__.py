@@ -1,8 +1,8 @@
 """Recording a driver: the clean drive, and drives pushed aside, past the canvas."""
 
-from roadproof.drives.drives import Drive as Drive
-from roadproof.drives.drives import Drives as Drives
-from roadproof.drives.drives import load_drives as load_drives
+from roadproof.drives.folder import Drive as Drive
+from roadproof.drives.folder import Drives as Drives
+from roadproof.drives.folder import load_drives as load_drives
 from roadproof.drives.record import record as record
 from roadproof.drives.record import record_along as record_along
 from roadproof.drives.trajectories import Scheme as Scheme

@@ -16,7 +16,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.asking import act_of
 from roadproof.controllers.identity import identity_of
 from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
-from roadproof.drives.drives import Drive, Drives, Settings, read_drive, write_drive, write_settings
+from roadproof.drives.folder import Drive, Drives, Settings, read_drive, write_drive, write_settings
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
 from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
 from roadproof.driving.episode import Episode
@@ -238,7 +238,7 @@ def _astray(
             noise = steering_noise(plan.push, how, clean.episode, int(clean.frame_number[-1]), rng)
             return noisy(policy, clean.episode, share * noise, answers.append)
         length_m = float(path.arclength_m[-1])
-        wanted = offsets(plan.push, share * plan.deviation_m, first, last, length_m, rng, weaves=plan.weaves)
+        wanted = offsets(plan.push, share * plan.offset_m, first, last, length_m, rng, weaves=plan.weaves)
         swerve = swerving(policy, path, wanted, answers.append)
 
         def act(seen: Observation) -> Control:

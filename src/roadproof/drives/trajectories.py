@@ -80,14 +80,14 @@ class Plan:
     Args:
         name: of its folder.
         push: to which side.
-        deviation_m: size of a swerve; 0 for a clean drive and for steering noise.
+        offset_m: largest offset of a swerve in metres; 0 for a clean drive and for steering noise.
         stream: numbers its random draws.
         weaves: whether it weaves from side to side.
     """
 
     name: str
     push: Push
-    deviation_m: float
+    offset_m: float
     stream: int
     weaves: bool = False
 

@@ -9,8 +9,7 @@ again, and one of other inputs is never mistaken for it.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -25,7 +24,9 @@ from roadproof.driving.rollout import Driver, rollout
 from roadproof.driving.starts import NOMINAL, StartOffset
 from roadproof.errors import EpisodeError
 from roadproof.io.files import inside
-from roadproof.scenarios import Scenario, identity
+from roadproof.io.identity import ANSWERS, digest, stated
+from roadproof.scenarios import Scenario
+from roadproof.scenarios import identity as identity_of_scenario
 from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
 
 CLEAN = "clean"
@@ -64,7 +65,7 @@ class Episodes:
         paints: what is painted, by name.
         digests: hash of each of them, and of none for the bare road.
         folder: they are in its folder "episodes".
-        common: all that every drive depends on, as text.
+        parts: all that every drive depends on.
     """
 
     driver: AnyDriver
@@ -72,7 +73,7 @@ class Episodes:
     paints: Mapping[str, PatternImage]
     digests: Mapping[str, str]
     folder: Path
-    common: str
+    parts: Mapping[str, object]
 
     @staticmethod
     def of(
@@ -90,17 +91,22 @@ class Episodes:
             paints=paints,
             digests={name: hashlib.sha256(content).hexdigest() for name, content in hashed.items()},
             folder=folder,
-            common=_identity(simulator, driver, scenario),
+            parts=_parts(simulator, driver, scenario),
         )
+
+    @property
+    def made_of(self) -> dict[str, object]:
+        """The parts, with the controller's answers apart from what it is called."""
+        driver, answers = cast("list[object]", self.parts["driver"])
+        return {**self.parts, "driver": driver, ANSWERS: digest(stated(answers))}
 
     def file(self, drive: Conditions) -> str:
         """What it is called."""
-        told = [self.common, self.digests[drive.paint]]
-        told += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
-        told += [] if drive.start == NOMINAL else [repr(drive.start)]
+        parts = [stated(self.parts), self.digests[drive.paint]]
+        parts += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
+        parts += [] if drive.start == NOMINAL else [repr(drive.start)]
         among = f"traffic-{drive.seed}" if drive.cars + drive.pedestrians else "alone"
-        ending = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:12]
-        return f"{drive.weather}-{among}-{drive.paint}-{ending}.npz"
+        return f"{drive.weather}-{among}-{drive.paint}-{digest(stated(parts))[:12]}.npz"
 
     def has(self, drive: Conditions) -> bool:
         """Whether it was made before."""
@@ -165,8 +171,8 @@ def driver_in_words(driver: AnyDriver) -> str:
     return type(driver).__name__ if isinstance(driver, Controller) else str(getattr(driver, "__qualname__", driver))
 
 
-def _identity(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> str:
-    """Everything that all drives depend on, as text. A controller is known by what it answers."""
+def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[str, object]:
+    """Everything that all drives depend on, by name. A controller is known by what it answers."""
     view = simulator.input
     answers = answers_of(driver, (view.height_px, view.width_px)) if isinstance(driver, Controller) else []
     parts: dict[str, object] = {
@@ -176,10 +182,10 @@ def _identity(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> st
         "input": asdict(view),
         "dt_s": simulator.dt_s,
         "driver": [driver_in_words(driver), answers],
-        "scenario": identity(scenario),
+        "scenario": identity_of_scenario(scenario),
     }
     if simulator.paint is not PaintKind.RENDERED:
         parts["paint"] = simulator.paint
     if isinstance(simulator, Identified):
         parts["world"] = simulator.identity
-    return json.dumps(parts, sort_keys=True, default=cast("Callable[[object], str]", str))
+    return parts

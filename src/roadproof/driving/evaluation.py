@@ -13,13 +13,11 @@ Nothing is pickled, and no path in a file leaves the folder.
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -32,14 +30,12 @@ from roadproof.driving.intervals import Mean, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import check_name, read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.files import check_name, write_atomically
+from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
 from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
 from roadproof.simulators.protocol import PaintKind, PatternImage
 
-FORMAT = "roadproof-evaluation"
-FORMAT_VERSION = 1
 ATTACK = "attack"
 _UNITS = {
     "deviation_m": "metres, the paper's equation, from the clean drive of the same weather, traffic and seed",
@@ -226,19 +222,11 @@ class Evaluation:
         _save_scenario(self.scenario, folder)
         picture = Image.fromarray(paint)
         write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
-        content: dict[str, Any] = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "kind": kind_of(self.paint),
-            "units": _UNITS,
-        }
-        content |= {"scenario": self.scenario.name}
-        content |= {name: getattr(self, name) for name in self.__slots__ if name not in ("scenario", "trials")}
-        content["start_range"] = asdict(self.start_range)
-        content |= {"trials": [asdict(trial) for trial in self.trials], "rows": [asdict(row) for row in self.rows()]}
-        write_atomically(
+        EVALUATION_FILE.write(
             folder / "evaluation.json",
-            lambda part: part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"),
+            self,
+            kind=kind_of(self.paint),
+            rows=self.rows(),
         )
 
     @staticmethod
@@ -249,12 +237,22 @@ class Evaluation:
             EpisodeError: a file is missing, damaged or of another format.
         """
         path = folder / "evaluation.json"
-        content = read_json(path, FORMAT, FORMAT_VERSION, EpisodeError)
+        content = EVALUATION_FILE.content(path)
         try:
             scenario = load_scenarios(folder / "scenario.toml")[0]
         except RoadproofError as error:
             raise EpisodeError(f"{path} is incomplete or damaged ({error}); evaluate again") from None
-        return record(content | {"scenario": asdict(scenario)}, Evaluation, path, EpisodeError, "evaluate again")
+        return EVALUATION_FILE.made(path, content, scenario=scenario)
+
+
+EVALUATION_FILE = RecordFile(
+    kind=Evaluation,
+    name="roadproof-evaluation",
+    error=EpisodeError,
+    remedy="evaluate again",
+    forms={"scenario": Form(str, lambda scenario: scenario.name, lambda name: name)},
+    notes={"units": _UNITS},
+)
 
 
 def kind_of(paint: PaintKind) -> str:

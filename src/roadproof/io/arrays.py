@@ -21,7 +21,7 @@ from typing import Any, cast
 import numpy as np
 
 from roadproof.errors import RoadproofError
-from roadproof.io.files import write_atomically
+from roadproof.io.files import check_format, one_line, parse_json, write_atomically
 
 MOST_BYTES = 4 * 2**30
 """An archive, or an array, that would take more memory is not read."""
@@ -68,10 +68,10 @@ def write_archive(
 
 def packed(arrays: Mapping[str, Any], header: Mapping[str, Any] | None = None, *, level: int = 6) -> bytes:
     """What `write_archive` writes; the same bytes for the same arrays, whenever."""
-    told = {} if header is None else {HEADER: np.array(json.dumps(header, ensure_ascii=False))}
+    stated = {} if header is None else {HEADER: np.array(json.dumps(header, ensure_ascii=False))}
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as archive:
-        for name, array in (told | dict(arrays)).items():
+        for name, array in (stated | dict(arrays)).items():
             member = io.BytesIO()
             np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getbuffer(), zipfile.ZIP_DEFLATED, level)
@@ -94,7 +94,7 @@ def read_archive(
         error: it is missing, lacks an array, is packed or filled in a way that roadproof never writes, or would unpack
             to more.
     """
-    return _read(path, tuple(names), None, error, remedy, most_bytes)[1]
+    return read_record(path, names, error, remedy, header=None, most_bytes=most_bytes)[1]
 
 
 def read_record(
@@ -103,8 +103,9 @@ def read_record(
     error: type[RoadproofError],
     remedy: str,
     *,
-    header: str = HEADER,
+    header: str | None = HEADER,
     format_version: tuple[str, int] | None = None,
+    most_bytes: int = MOST_BYTES,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of an archive.
 
@@ -113,20 +114,19 @@ def read_record(
         names: of the arrays wanted.
         error: what to raise.
         remedy: what the user can do where it is missing or damaged.
-        header: under which name the JSON object is.
-        format_version: what its "format" and "version" must be, where it has them.
+        header: under which name the JSON object is; None where there is none.
+        format_version: what its "format" must be and the newest "version" understood, where it has them.
+        most_bytes: that the whole archive may unpack to.
 
     Raises:
         error: as `read_archive`, or the header is no JSON object, or of another format or version.
     """
-    told, arrays = _read(path, tuple(names), header, error, remedy, MOST_BYTES)
-    found = (told.get("format"), told.get("version"))
-    if format_version is not None and (found != format_version or isinstance(found[1], bool)):
-        raise error(
-            f"{path} is {found[0]!r:.60} version {found[1]!r:.40}, expected {format_version[0]!r} version "
-            f"{format_version[1]}; {remedy}"
-        )
-    return told, arrays
+    with _opened(path, error, remedy, most_bytes) as archive:
+        stated = {} if header is None else parse_json(str(_member(archive, header, "U")))
+        arrays = {name: _member(archive, name, _KINDS) for name in names}
+    if format_version is not None:
+        check_format(stated, path, *format_version, error)
+    return stated, arrays
 
 
 def archive_names(path: Path, error: type[RoadproofError], remedy: str) -> frozenset[str]:
@@ -156,15 +156,7 @@ def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarr
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None
     except _DAMAGE as reason:
-        raise error(f"{path} is damaged ({_said(reason)}); {remedy}") from None
-
-
-def _read(
-    path: Path, names: tuple[str, ...], header: str | None, error: type[RoadproofError], remedy: str, most_bytes: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    with _opened(path, error, remedy, most_bytes) as archive:
-        told = {} if header is None else _header(_member(archive, header, "U"))
-        return told, {name: _member(archive, name, _KINDS) for name in names}
+        raise error(f"{path} is damaged ({one_line(reason)}); {remedy}") from None
 
 
 @contextmanager
@@ -179,12 +171,7 @@ def _opened(
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None
     except _DAMAGE as reason:
-        raise error(f"{path} is damaged ({_said(reason)}); {remedy}") from None
-
-
-def _said(reason: BaseException) -> str:
-    words = " ".join(str(reason).split()).strip("'\"")
-    return f"{words or type(reason).__name__:.200}"
+        raise error(f"{path} is damaged ({one_line(reason)}); {remedy}") from None
 
 
 def _check(archive: zipfile.ZipFile, most_bytes: int) -> None:
@@ -206,7 +193,7 @@ def _member(archive: zipfile.ZipFile, name: str, kinds: str) -> np.ndarray:
         with archive.open(entry) as file:
             return _array(cast("io.BufferedIOBase", file), entry.file_size, kinds)
     except _DAMAGE as reason:
-        raise ValueError(f"{name}: {_said(reason)}") from None
+        raise ValueError(f"{name}: {one_line(reason)}") from None
 
 
 def _array(file: io.BufferedIOBase, size: int, kinds: str) -> np.ndarray:
@@ -228,10 +215,3 @@ def _array(file: io.BufferedIOBase, size: int, kinds: str) -> np.ndarray:
     if len(values) != left or file.read(1):
         raise ValueError(f"it holds {len(values)} bytes of {left}")
     return np.frombuffer(bytearray(values), dtype).reshape(shape, order="F" if by_column else "C")
-
-
-def _header(stored: np.ndarray) -> dict[str, Any]:
-    told: object = json.loads(str(stored))
-    if not isinstance(told, dict):
-        raise TypeError("its header is no JSON object")
-    return cast("dict[str, Any]", told)

@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -150,9 +150,28 @@ def check_writable(folder: Path) -> None:
     probe.unlink(missing_ok=True)
 
 
+def one_line(reason: BaseException) -> str:
+    """What an error says, as a part of a line; its name where it says nothing."""
+    words = " ".join(str(reason).split())
+    return f"{words or type(reason).__name__:.400}"
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write a JSON object, whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+
+    def write(part: Path) -> None:
+        part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+    write_atomically(path, write)
+
+
 def _whole(text: str) -> int:
     if len(text) > _MOST_DIGITS:
-        raise ValueError(f"a number has {len(text)} digits")
+        raise ValueError(f"an integer has {len(text)} digits")
     return int(text)
 
 
@@ -161,6 +180,44 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text:.20} is no finite number")
     return value
+
+
+def parse_json(text: str) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        TypeError: it is something else.
+        ValueError, RecursionError: it is not JSON, is too deep, or has a number that is none (NaN, infinity, hundreds
+            of digits).
+    """
+    content: object = json.loads(text, parse_int=_whole, parse_float=_finite, parse_constant=_finite)
+    if not isinstance(content, dict):
+        raise TypeError("it holds no JSON object")
+    return cast("dict[str, Any]", content)
+
+
+def check_format(
+    fields: Mapping[str, object], path: Path, file_format: str, version: int, error: type[RoadproofError]
+) -> None:
+    """See that a file says the format that is expected, in a version that is understood.
+
+    Args:
+        fields: what it says, by name.
+        path: the file, for the message.
+        file_format: what its "format" must be.
+        version: the newest "version" understood.
+        error: what to raise.
+
+    Raises:
+        error: it is of another format, or of a newer version.
+    """
+    if fields.get("format") != file_format:
+        raise error(f"{path} has format {fields.get('format')!r:.60}, expected {file_format!r}")
+    known = fields.get("version")
+    if not isinstance(known, int) or isinstance(known, bool) or known < 1:
+        raise error(f"{path} has version {known!r:.40}, expected a whole number from 1")
+    if known > version:
+        raise error(f"{path} has version {known!r:.40}, this roadproof reads up to {version}; update it")
 
 
 def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:
@@ -173,25 +230,15 @@ def read_json(path: Path, file_format: str, version: int, error: type[RoadproofE
         error: what to raise.
 
     Raises:
-        error: the file is missing, is not JSON, has a number that is none (NaN, infinity, hundreds of digits), or is of
-            another format or a newer version.
+        error: the file is missing, is no JSON object (`parse_json`), or is of another format or a newer version.
     """
     try:
-        content: Any = json.loads(
-            path.read_text(encoding="utf-8"), parse_int=_whole, parse_float=_finite, parse_constant=_finite
-        )
+        content = parse_json(path.read_text(encoding="utf-8"))
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}") from None
     except (ValueError, RecursionError) as reason:
         raise error(f"{path} is not valid JSON ({reason})") from None
-    if not isinstance(content, dict):
-        raise error(f"{path} holds no JSON object, expected a {file_format} file")
-    fields = cast("dict[str, Any]", content)
-    if fields.get("format") != file_format:
-        raise error(f"{path} has format {fields.get('format')!r}, expected {file_format!r}")
-    known = fields.get("version")
-    if not isinstance(known, int) or isinstance(known, bool) or known < 1:
-        raise error(f"{path} has version {known!r:.40}, expected a whole number from 1")
-    if known > version:
-        raise error(f"{path} has version {known!r:.40}, this roadproof reads up to {version}; update it")
-    return fields
+    except TypeError:
+        raise error(f"{path} holds no JSON object, expected a {file_format} file") from None
+    check_format(content, path, file_format, version, error)
+    return content

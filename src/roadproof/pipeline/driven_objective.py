@@ -10,7 +10,6 @@ Both are taken of every drive; the one asked for is the value.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,14 +27,12 @@ from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator
 
-FORMAT = "roadproof-driven"
-FORMAT_VERSION = 1
 SHARE = 0.8
 """Of the clean drive's frames, over which the authors sum the steering."""
 
@@ -87,7 +84,7 @@ class DrivenObjective:
         keep: Path | None = None,
     ) -> None:
         self._space, self._measure, self._keep = space, measure, keep
-        self._known = _read(keep) if keep is not None and keep.exists() else {}
+        self._known = _FILE.read(keep).drives if keep is not None and keep.exists() else {}
         self._canvas = scenario.canvas
 
         def drive(pattern: PatternImage | None, until: Callable[[Observation], bool] | None) -> Episode:
@@ -108,7 +105,7 @@ class DrivenObjective:
         if key not in self._known:
             self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._canvas)
             if self._keep is not None:
-                _write(self._known, self._keep)
+                _FILE.write(self._keep, _Kept(self._known))
         return self._known[key]
 
     def _enough(self) -> Callable[[Observation], bool]:
@@ -135,15 +132,23 @@ def _counted_frames(clean: Episode) -> int:
     return int(SHARE * clean.steer.size)
 
 
-def _read(path: Path) -> dict[str, Effect]:
-    stored = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
-    try:
-        return {str(key): Effect(float(steering), float(deviation)) for key, steering, deviation in stored["drives"]}
-    except (KeyError, TypeError, ValueError) as error:
-        raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove it") from None
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """Effects by digest of the paint; a list of three values each in their file."""
+
+    drives: dict[str, Effect]
 
 
-def _write(known: dict[str, Effect], path: Path) -> None:
-    drives = [[key, each.steering, each.deviation] for key, each in known.items()]
-    content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop", "drives": drives}
-    write_atomically(path, lambda part: part.write_text(json.dumps(content) + "\n"))
+_ROWS = Form(
+    tuple[tuple[str, float, float], ...],
+    lambda known: [(key, each.steering, each.deviation) for key, each in known.items()],
+    lambda rows: {key: Effect(*numbers) for key, *numbers in rows},
+)
+_FILE = RecordFile(
+    kind=_Kept,
+    name="roadproof-driven",
+    error=RoadproofError,
+    remedy="remove it",
+    forms={"drives": _ROWS},
+    notes={"kind": "closed loop"},
+)

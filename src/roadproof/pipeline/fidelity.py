@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +18,12 @@ from roadproof.datatypes import Control, Observation, Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import EpisodeError, RecordingError
-from roadproof.io.arrays import read_record, write_archive
+from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Push, Recording, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
-
-FORMAT = "roadproof-fidelity"
-FORMAT_VERSION = 1
-_ARRAYS = ("frame_number", "clean", "composited", "rendered", "clean_steer", "composited_steer", "rendered_steer")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -52,7 +48,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Fidelity:
+class Fidelity(Saved):
     """One recorded drive three times: as it was, with a pattern composited in, and with the pattern really there.
 
     Args:
@@ -77,29 +73,8 @@ class Fidelity:
     rendered_steer: Float[np.ndarray, " f"]
     agreement: Agreement
 
-    def save(self, path: Path) -> None:
-        """Write one NumPy archive with a JSON header.
 
-        Raises:
-            OutputError: it cannot be written.
-        """
-        header = {"format": FORMAT, "version": FORMAT_VERSION, "drive": self.drive, "agreement": asdict(self.agreement)}
-        write_archive(path, {name: getattr(self, name) for name in _ARRAYS}, header)
-
-    @staticmethod
-    def load(path: Path) -> Fidelity:
-        """Read what `save` wrote.
-
-        Raises:
-            EpisodeError: the file is missing, damaged or of another format.
-        """
-        header, arrays = read_record(
-            path, _ARRAYS, EpisodeError, "evaluate again", format_version=(FORMAT, FORMAT_VERSION)
-        )
-        try:
-            return Fidelity(drive=str(header["drive"]), agreement=Agreement(**header["agreement"]), **arrays)
-        except (KeyError, TypeError, ValueError) as error:
-            raise EpisodeError(f"{path} is incomplete ({error!r}); evaluate again") from None
+Fidelity.FILE = RecordFile(kind=Fidelity, name="roadproof-fidelity", error=EpisodeError, remedy="evaluate again")
 
 
 def measure_fidelity(

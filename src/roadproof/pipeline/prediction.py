@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,18 +13,14 @@ from roadproof.driving.deviation import passage
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.errors import EpisodeError
-from roadproof.io.arrays import read_record, write_archive
+from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
 from roadproof.recorded.world import UNSURE, RecordedWorld
 from roadproof.recordings import RecordingSet
 
-FORMAT = "roadproof-prediction"
-FORMAT_VERSION = 2
-_PATHS = ("clean_xy", "predicted_xy", "driven_xy")
-
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Prediction:
+class Prediction(Saved):
     """One pattern, foretold and driven over.
 
     Args:
@@ -59,32 +53,14 @@ class Prediction:
         """Predicted minus driven deviation."""
         return self.predicted_m - self.driven_m
 
-    def save(self, path: Path) -> None:
-        """Write one NumPy archive with a JSON header.
 
-        Raises:
-            OutputError: it cannot be written.
-        """
-        header: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION}
-        header |= {name: getattr(self, name) for name in self.__slots__ if name not in _PATHS}
-        write_archive(path, {name: getattr(self, name) for name in _PATHS}, header)
-
-    @staticmethod
-    def load(path: Path) -> Prediction:
-        """Read what `save` wrote.
-
-        Raises:
-            EpisodeError: the file is missing, damaged or of another format.
-        """
-        header, paths = read_record(
-            path, _PATHS, EpisodeError, "remove it to predict again", format_version=(FORMAT, FORMAT_VERSION)
-        )
-        try:
-            told: dict[str, Any] = {name: float(header[name]) for name in Prediction.__slots__ if name not in _PATHS}
-            told |= {name: paths[name].astype(np.float64) for name in _PATHS}
-            return Prediction(**told)
-        except (KeyError, TypeError, ValueError) as error:
-            raise EpisodeError(f"{path} is incomplete ({error!r}); remove it to predict again") from None
+Prediction.FILE = RecordFile(
+    kind=Prediction,
+    name="roadproof-prediction",
+    version=2,
+    error=EpisodeError,
+    remedy="remove it to predict again",
+)
 
 
 def predict(

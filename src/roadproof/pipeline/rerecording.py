@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, attack, kept_attack
+from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, kept_attack
 from roadproof.attacks.groups import Direction, Group, parse_groups
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.calibration import Method as Calibration
@@ -132,8 +132,19 @@ def search_on(
         recordings = replace(recordings, recordings=(*recordings.recordings, added))
         if groups[0].direction is Direction.EITHER:
             groups = parse_groups("all", recordings)
-        starts = [candidate for _, candidate in known]
-        again = _searched(recordings, controller, groups, found, objective, starts, place / "attack", device, tell)
+        again = kept_attack(
+            place / "attack",
+            recordings,
+            controller,
+            found.space,
+            objective=objective,
+            method=_gone_on(found.method),
+            groups=groups,
+            seed=found.seed,
+            starts=[candidate for _, candidate in known],
+            device=device,
+            on_step=lambda step, best, tell=tell: tell(step, f"{best:.2f}"),
+        )
         chosen = select_by_driving(
             simulator,
             controller,
@@ -180,43 +191,13 @@ def _recorded(
     """The way that the last pattern took the car, without the paint and calibrated, and the drives that took."""
     drive = record_along(simulator, controller, clean, last.over_chosen(), name=place.name, folder=place)
     both = replace(clean, drives=(*clean.drives, drive))
-    calibrated = Calibrated.load(place)
+    calibrated = Calibrated.kept(place, both, method)
     if calibrated is None:
         # The clean drive's replays lie there already and are not driven again.
         calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration")
         calibrated.save(place)
     calls = drive.calls + replays_needed(both, method) - replays_needed(clean, method)
     return calibrated.recordings.recordings[1], calls
-
-
-def _searched(
-    recordings: RecordingSet,
-    controller: Controller,
-    groups: Sequence[Group],
-    found: AttackResult,
-    objective: Objective,
-    starts: Sequence[Candidate],
-    place: Path,
-    device: torch.device | str,
-    tell: Callable[[int, str], None],
-) -> AttackResult:
-    """The search before, from where it and the rounds came to."""
-    return kept_attack(
-        place,
-        lambda checkpoint: attack(
-            recordings,
-            controller,
-            found.space,
-            objective=objective,
-            groups=groups,
-            method=_gone_on(found.method),
-            seed=found.seed,
-            starts=starts,
-            device=device,
-            checkpoint=checkpoint,
-            on_step=lambda step, best: tell(step, f"{best:.2f}"),
-        ),
-    )
 
 
 def _gone_on(method: Method) -> Method:

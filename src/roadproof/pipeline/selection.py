@@ -7,10 +7,10 @@ SELECTION/episodes/*.npz      the drives: clean, and one for each candidate (`dr
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, cast
 
 from roadproof.attacks import Candidate
 from roadproof.controllers import Controller
@@ -19,14 +19,11 @@ from roadproof.driving.drive_store import CLEAN, Conditions, Episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Trial
 from roadproof.errors import RoadproofError
-from roadproof.io.files import read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.identity import require_same
+from roadproof.io.records import RecordFile, plain
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
-
-FORMAT = "roadproof-selection"
-FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,11 +46,15 @@ class Selection:
     """The candidate that deviated most when driven.
 
     Args:
-        pattern: it.
+        pattern: the pattern of that candidate.
         driven: every candidate driven, in the surrogate's order.
-        chosen: index of it among them.
+        chosen: index of that candidate among them.
         simulator_calls: drives, the clean one included where it was made for this; 0 where they are predicted.
-        predicted: nothing was driven for real.
+        predicted: whether the drives are predicted, and nothing was driven for real.
+        made_of: what tells it from a choice among others (`io.identity`); empty in files older than the word.
+
+    Raises:
+        RoadproofError: `chosen` is none of the candidates.
     """
 
     pattern: Pattern
@@ -61,10 +62,15 @@ class Selection:
     chosen: int
     simulator_calls: int
     predicted: bool = False
+    made_of: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.chosen < len(self.driven):
+            raise RoadproofError(f"it has chosen {self.chosen} of {len(self.driven)} candidates")
 
     @property
     def deviation_m(self) -> float:
-        """Of the drive over the chosen one."""
+        """The paper's deviation of the drive over the chosen pattern, in metres."""
         return self.driven[self.chosen].trial.deviation_m
 
     def save(self, folder: Path) -> None:
@@ -74,15 +80,7 @@ class Selection:
             OutputError: the folder cannot be written.
         """
         save_pattern(self.pattern, folder / "pattern.json")
-        content = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "kind": "predicted" if self.predicted else "closed loop",
-            "driven": [asdict(each) for each in self.driven],
-            "chosen": self.chosen,
-            "simulator_calls": self.simulator_calls,
-        }
-        write_atomically(folder / "selection.json", lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+        SELECTION_FILE.write(folder / "selection.json", self, kind="predicted" if self.predicted else "closed loop")
 
     @staticmethod
     def load(folder: Path) -> Selection:
@@ -92,27 +90,19 @@ class Selection:
             RoadproofError: a file is missing or damaged.
         """
         path = folder / "selection.json"
-        content = read_json(path, FORMAT, FORMAT_VERSION, RoadproofError)
-        told = record(content, _Stored, path, RoadproofError, f"remove {folder}")
-        if not 0 <= told.chosen < len(told.driven):
-            raise RoadproofError(f"{path} has chosen {told.chosen} of {len(told.driven)}; remove {folder}")
-        return Selection(
-            pattern=load_pattern(folder / "pattern.json"),
-            driven=told.driven,
-            chosen=told.chosen,
-            simulator_calls=told.simulator_calls,
-            predicted=told.kind == "predicted",
+        content = SELECTION_FILE.content(path)
+        return SELECTION_FILE.made(
+            path, content, pattern=load_pattern(folder / "pattern.json"), predicted=content.get("kind") == "predicted"
         )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Stored:
-    """selection.json."""
-
-    driven: tuple[Driven, ...]
-    chosen: int
-    simulator_calls: int
-    kind: str = "closed loop"
+SELECTION_FILE = RecordFile(
+    kind=Selection,
+    name="roadproof-selection",
+    error=RoadproofError,
+    remedy="remove its folder to choose again",
+    elsewhere=("pattern", "predicted"),
+)
 
 
 def select_by_driving(
@@ -154,13 +144,17 @@ def select_by_driving(
     episodes = Episodes.of(simulator, controller, scenario, paints, folder)
     bare = Conditions(paint=CLEAN, weather=weather)
     over = [replace(bare, paint=name) for name in paints]
+    made_of = {
+        **episodes.made_of,
+        "weather": weather,
+        "candidates": len(over),
+        "patterns": [episodes.digests[name] for name in paints],
+        "drives": [episodes.file(drive) for drive in over],
+    }
     if (folder / "selection.json").exists():
         kept = Selection.load(folder)
-        if [each.trial.painted for each in kept.driven] != [episodes.file(drive) for drive in over]:
-            raise RoadproofError(
-                f"{folder} holds a choice for another attack, controller or scenario, or among more or fewer "
-                "candidates; remove it to choose again"
-            )
+        drives = {"drives": [each.trial.painted for each in kept.driven]}
+        require_same(folder, "a choice", kept.made_of or drives, made_of, RoadproofError)
         return kept
     calls = int(clean is None)
     if clean is not None and not episodes.has(bare):
@@ -179,6 +173,7 @@ def select_by_driving(
         chosen=winner,
         simulator_calls=0 if simulator.paint.predicted else calls + len(driven),
         predicted=simulator.paint.predicted,
+        made_of=cast("dict[str, Any]", plain(made_of)),
     )
     selection.save(folder)
     return selection

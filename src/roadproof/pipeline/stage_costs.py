@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from roadproof.errors import RoadproofError
-from roadproof.io.files import read_json, write_atomically
+from roadproof.io.identity import ANSWERS, require_same
+from roadproof.io.records import RecordFile, plain
 
 FILE = "run.json"
-FORMAT = "roadproof-run"
-FORMAT_VERSION = 1
 _EVERY_S = 1.0
 
 
@@ -35,45 +34,54 @@ class StageCost:
     simulator_calls: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """run.json; at first with an identity as text, the controller's answers and the paint instead of parts."""
+
+    cost: dict[str, StageCost]
+    made_of: dict[str, Any] = field(default_factory=dict[str, Any])
+    identity: str = ""
+    controller: str | None = None
+    paint: str = "rendered"
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        if not self.identity:
+            return self.made_of
+        names = ("scenario", "budget", "space", "seed", "controller")
+        parts = dict(zip(names, json.loads(self.identity), strict=True)) | {"paint": self.paint}
+        return parts if self.controller is None else parts | {ANSWERS: self.controller}
+
+    def __post_init__(self) -> None:
+        _ = self.parts  # says whether they can be read
+
+
+_FILE = RecordFile(kind=_Run, name="roadproof-run", error=RoadproofError, remedy="remove it, the stages stay")
+
+
 class Ledger:
     """Writes down what stages take.
 
     Args:
-        folder: of the run.
-        identity: tells this run from another.
-        stages: there are.
-        paint: how the simulator puts paint on the road, see `simulators.protocol.PaintKind`.
-        controller: which one is tested (`controllers.identity`), whatever it is called.
+        folder: folder of the run.
+        made_of: what tells this run from another, by name (`io.identity`).
+        stages: names of all its stages, in order.
 
     Raises:
-        RoadproofError: the folder is another run's, or one painted in another way.
+        RoadproofError: the folder is another run's; the message names what differs.
         OutputError: it cannot be written.
     """
 
-    def __init__(
-        self, folder: Path, identity: str, stages: Sequence[str], *, paint: str = "rendered", controller: str = ""
-    ) -> None:
-        self._path, self._identity, self._paint = folder / FILE, identity, paint
-        self._controller = controller
+    def __init__(self, folder: Path, made_of: Mapping[str, object], stages: Sequence[str]) -> None:
+        self._path, self._made_of = folder / FILE, cast("dict[str, Any]", plain(made_of))
         self._current, self._since = "", 0.0
         self.cost = {stage: StageCost() for stage in stages}
         if not self._path.exists():
             self._write()
             return
-        stored = read_json(self._path, FORMAT, FORMAT_VERSION, RoadproofError)
-        if stored.get("identity") != self._identity:
-            raise RoadproofError(f"{folder} holds a run with other settings; choose another folder, or remove it")
-        if stored.get("controller", controller) != controller:
-            raise RoadproofError(
-                f"{folder} holds a run of another controller, which answers otherwise, as before a training; choose "
-                "another folder, or remove it"
-            )
-        before = stored.get("paint", "rendered")
-        if before != paint:
-            raise RoadproofError(
-                f"{folder} holds a run whose paint is {before}, here it is {paint}; choose another folder"
-            )
-        self.cost |= _costs(stored, self._path)
+        before = _FILE.read(self._path)
+        require_same(folder, "a run", before.parts, self._made_of, RoadproofError)
+        self.cost |= before.cost
 
     @contextmanager
     def stage(self, name: str) -> Generator[None]:
@@ -102,10 +110,7 @@ class Ledger:
         self._write()
 
     def _write(self) -> None:
-        cost = {stage: asdict(cost) for stage, cost in self.cost.items()}
-        content = {"format": FORMAT, "version": FORMAT_VERSION, "identity": self._identity, "cost": cost}
-        content |= {"paint": self._paint, "controller": self._controller}
-        write_atomically(self._path, lambda part: part.write_text(json.dumps(content, indent=1) + "\n"))
+        _FILE.write(self._path, _Run(self.cost, self._made_of))
 
 
 def read_cost(folder: Path) -> dict[str, StageCost]:
@@ -115,12 +120,4 @@ def read_cost(folder: Path) -> dict[str, StageCost]:
         RoadproofError: the ledger is damaged.
     """
     path = folder / FILE
-    return _costs(read_json(path, FORMAT, FORMAT_VERSION, RoadproofError), path) if path.exists() else {}
-
-
-def _costs(stored: dict[str, Any], path: Path) -> dict[str, StageCost]:
-    try:
-        cost: dict[str, dict[str, float]] = stored["cost"]
-        return {stage: StageCost(float(each["seconds"]), int(each["simulator_calls"])) for stage, each in cost.items()}
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise RoadproofError(f"{path} is incomplete or damaged ({error}); remove it, the stages stay") from None
+    return _FILE.read(path).cost if path.exists() else {}

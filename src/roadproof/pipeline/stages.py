@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from roadproof.attacks import AttackResult, attack, kept_attack, parse_groups
+from roadproof.attacks import AttackResult, kept_attack, parse_groups
 from roadproof.attacks.groups import Group
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
+from roadproof.controllers.identity import identity_of
 from roadproof.drives import Drives, record
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import Opening, evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError
+from roadproof.io.identity import ANSWERS
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
@@ -49,6 +51,20 @@ class Stages:
     processes: int
     on_progress: OnProgress
 
+    @property
+    def made_of(self) -> dict[str, object]:
+        """What tells this run from another."""
+        size = self.simulator.input.height_px, self.simulator.input.width_px
+        return {
+            "scenario": self.scenario,
+            "budget": repr(self.budget),
+            "space": self.space,
+            "seed": self.seed,
+            "controller": self.controller_name,
+            ANSWERS: identity_of(self.controller, size),
+            "paint": self.simulator.paint,
+        }
+
     def record(self, number: int) -> Drives:
         """The drives past the bare canvas in one of the weathers."""
         budget, wanted = self.budget, self.budget.trajectories
@@ -69,7 +85,7 @@ class Stages:
     def calibrate(self, number: int, drives: Drives) -> RecordingSet:
         """Those drives, calibrated."""
         place, each = self._folder_of(number), replays_needed(drives, self.budget.calibration)
-        done, total = Calibrated.load(place), each * len(self.budget.recorded_in)
+        done, total = Calibrated.kept(place, drives, self.budget.calibration), each * len(self.budget.recorded_in)
         if done is None:
             done = calibrate(
                 self.simulator,
@@ -93,18 +109,15 @@ class Stages:
         steps = budget.method.steps(budget.objective)
         return kept_attack(
             self.folder / "attack",
-            lambda checkpoint: attack(
-                recordings,
-                self.controller,
-                self.space,
-                objective=budget.objective,
-                method=budget.method,
-                groups=self.groups(recordings),
-                seed=self.seed,
-                device=self.device,
-                checkpoint=checkpoint,
-                on_step=lambda step, best: self.on_progress("Searching", step, steps, f"{best:.2f}"),
-            ),
+            recordings,
+            self.controller,
+            self.space,
+            objective=budget.objective,
+            method=budget.method,
+            groups=self.groups(recordings),
+            seed=self.seed,
+            device=self.device,
+            on_step=lambda step, best: self.on_progress("Searching", step, steps, f"{best:.2f}"),
         )
 
     def select(self, found: AttackResult, drives: Drives) -> Selection:

@@ -18,15 +18,13 @@ weather but the first in RUN/WEATHER/, as those of the first are in RUN.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from roadproof.attacks import AttackResult
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
-from roadproof.controllers.identity import identity_of
 from roadproof.driving.evaluate import Opening
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
@@ -59,8 +57,8 @@ class StressTest:
         prediction: where the recorded world says the chosen pattern takes the car, beside where it went; None where
             the search did not drive there, or nothing was driven to compare.
         evaluation: the drives over the chosen pattern, closed loop.
-        fidelity: composited frames of the clean drive beside rendered ones; None without `film`, or where no frame shows any
-            paint.
+        fidelity: composited frames of the clean drive beside rendered ones; None without `film`, or where no frame
+            shows any paint.
         cost: what each stage took since the run began.
     """
 
@@ -145,12 +143,8 @@ def stress_test(
 
 def _all_of(run: Stages, *, film: bool) -> StressTest:
     """All stages, one after another."""
-    budget, view = run.budget, run.simulator.input
-    # What tells this run from another.
-    told = (asdict(run.scenario), repr(budget), asdict(run.space), run.seed, run.controller_name)
-    who = identity_of(run.controller, (view.height_px, view.width_px))
-    ledger = Ledger(run.folder, json.dumps(told, default=str), STAGES, paint=run.simulator.paint, controller=who)
-    on_progress = run.on_progress
+    budget, on_progress = run.budget, run.on_progress
+    ledger = Ledger(run.folder, run.made_of, STAGES)
 
     def note_progress(stage: str, done: int, total: int, word: str) -> None:
         ledger.step()

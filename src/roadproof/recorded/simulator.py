@@ -12,7 +12,6 @@ import hashlib
 import math
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -24,15 +23,16 @@ from torch import Tensor
 from roadproof.compositing.raster import composite_raster
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, Homography, homography_from_pose
+from roadproof.geometry import CanvasPlacement, Homography, homography_from_pose
 from roadproof.io.files import is_plain_name
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recorded.world import RecordedWorld, Start
 from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Kind, Scenario
-from roadproof.simulators.arguments import check_pattern
-from roadproof.simulators.protocol import PaintKind, PatternImage, Pictures
+from roadproof.simulators.protocol import PaintKind, PatternImage
+from roadproof.simulators.tracker.drive import DriveTracker, Request
+from roadproof.simulators.tracker.simulator import TrackedSimulator
 
 FURTHEST_ASIDE_M = 3.0
 """A picture moved further to the side than this shows too much that was never recorded, so the drive ends."""
@@ -70,18 +70,12 @@ class RecordedGap:
         return abs(self.left_m) <= FURTHEST_ASIDE_M and abs(self.turned_rad) <= FURTHEST_TURNED_RAD
 
 
-@dataclass(kw_only=True, slots=True)
-class _Drive:
-    """A drive on its way."""
-
-    scenario: Scenario
-    pattern: PatternImage | None
-    full_pictures: Pictures
+class _Drive(DriveTracker):
     car: Motion
-    steps: int = 0
+    pattern: PatternImage | None
 
 
-class RecordedSimulator:
+class RecordedSimulator(TrackedSimulator[_Drive]):
     """Drives in calibrated recordings, as a `Simulator`.
 
     A drive begins where the recorded stretch of the clean drive begins, at its speed there; a scenario that starts near
@@ -90,6 +84,9 @@ class RecordedSimulator:
 
     There are no full pictures. Where they are asked for, the frame is enlarged to the place that it has in the camera
     picture; around it, where nothing was recorded, the picture is black.
+
+    A reset refuses other weathers than that of the recordings, others on the road, and a canvas elsewhere. The
+    scenario's time limit counts from the beginning of the stretch; its goal and its map, and the seed, do not count.
 
     Args:
         recordings: calibrated, with a canvas and the tracks of the drives; the clean drive among them.
@@ -116,24 +113,8 @@ class RecordedSimulator:
                 f"the vehicle has steps of {self._world.vehicle.dt_s} s, the recordings have {self._world.course.dt_s} "
                 "s; expected one and the same"
             )
+        super().__init__(recordings.camera, recordings.view, self._world.course.dt_s)
         self._weather = Weather(weather)
-        self._open = False
-        self._drive: _Drive | None = None
-
-    @property
-    def camera(self) -> CameraModel:
-        """The camera on the car."""
-        return self._world.recordings.camera
-
-    @property
-    def input(self) -> CropResize:
-        """How the controller's frame was cut from the camera picture."""
-        return self._world.recordings.view
-
-    @property
-    def dt_s(self) -> float:
-        """Seconds per step, those of the recorded tracks."""
-        return self._world.course.dt_s
 
     @property
     def paint(self) -> PaintKind:
@@ -182,87 +163,13 @@ class RecordedSimulator:
         return path.cpu().numpy()
 
     @property
-    def state(self) -> VehicleState:
-        """Where the car is now.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
-        return self._state(self._running().car)
-
-    @property
     def gap(self) -> RecordedGap:
         """How far the car is from the recorded pose that its picture is made from.
 
         Raises:
             SimulatorError: there was no reset.
         """
-        return _told(self._world.bank.nearest(_poses(self._running().car)))
-
-    def __enter__(self) -> RecordedSimulator:
-        self._open = True
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open, self._drive = False, None
-
-    def reset(
-        self,
-        scenario: Scenario,
-        *,
-        weather: Weather = Weather.CLEAR_NOON,
-        pattern: PatternImage | None = None,
-        cars: int = 0,
-        pedestrians: int = 0,
-        seed: int = 0,  # noqa: ARG002  # nothing here is drawn by chance
-        full_pictures: Pictures = False,
-    ) -> Observation:
-        """Begin a drive at the beginning of the recorded stretch.
-
-        Args:
-            scenario: its canvas must be the recordings'; its time limit counts from the beginning of the stretch. Its
-                start counts where it is near that beginning; goal and map are not looked at.
-            weather: that of the recordings.
-            pattern: painted on the canvas; None leaves the road bare.
-            cars: 0, since the recordings have none.
-            pedestrians: 0 as well.
-            seed: of nothing; drives are the same whatever it is.
-            full_pictures: which observations have an enlarged frame.
-
-        Raises:
-            SimulatorError: it is not open, or an argument does not fit.
-        """
-        if not self._open:
-            raise SimulatorError("the recorded world is closed; use it in a with-block")
-        if Weather(weather) is not self._weather:
-            raise SimulatorError(
-                f"the recordings have one light, called {self._weather}, so there is no drive at {weather}; record one"
-            )
-        if cars or pedestrians:
-            raise SimulatorError(
-                f"{cars} cars and {pedestrians} pedestrians are asked for, but recordings hold no others on the road; "
-                "expected 0 of both"
-            )
-        _check_canvas(scenario.canvas, self._world.bank.canvas)
-        check_pattern(pattern)
-        car = self._world.begin((self._start(scenario.start),))
-        self._drive = _Drive(scenario=scenario, pattern=pattern, full_pictures=full_pictures, car=car)
-        return self._observe(self._drive)
-
-    def step(self, control: Control) -> Observation:
-        """Drive on for `dt_s`; values of the control outside their range are clipped.
-
-        Raises:
-            SimulatorError: there was no reset.
-        """
-        drive = self._running()
-        given = control.clipped()
-        pedals = (self._one(value) for value in (given.steer, given.throttle, given.brake))
-        drive.car = self._world.vehicle.step(drive.car, *pedals)
-        drive.steps += 1
-        return self._observe(drive)
+        return _gap_of(self._world.bank.nearest(_poses(self._running().car)))
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px.
@@ -272,6 +179,31 @@ class RecordedSimulator:
         """
         return homography_from_pose(self.camera, self.state, self._world.bank.canvas)
 
+    def _begin(self, request: Request) -> _Drive:
+        scenario = request.scenario
+        if request.weather is not self._weather:
+            raise SimulatorError(
+                f"the recordings have one light, called {self._weather}, so there is no drive at {request.weather}; "
+                "record one"
+            )
+        if request.cars or request.pedestrians:
+            raise SimulatorError(
+                f"{request.cars} cars and {request.pedestrians} pedestrians are asked for, but recordings hold no "
+                "others on the road; expected 0 of both"
+            )
+        _check_canvas(scenario.canvas, self._world.bank.canvas)
+        drive = _Drive(request, self.dt_s)
+        drive.pattern = request.pattern
+        self._put(drive, self._world.begin((self._start(scenario.start),)))
+        return drive
+
+    def _advance(self, drive: _Drive, control: Control) -> None:
+        pedals = (self._one(value) for value in (control.steer, control.throttle, control.brake))
+        self._put(drive, self._world.vehicle.step(drive.car, *pedals))
+
+    def _put(self, drive: _Drive, car: Motion) -> None:
+        drive.car, drive.state = car, self._state(car)
+
     def _start(self, asked: VehicleState) -> Start:
         """How an asked start differs from the recorded one; not at all where it is another place."""
         here = self.scenario.start
@@ -279,14 +211,9 @@ class RecordedSimulator:
         c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
         turned = math.remainder(asked.yaw_rad - here.yaw_rad, 2 * math.pi)
         right_m = s * dx - c * dy
-        if abs(c * dx + s * dy) > SAME_PLACE_M or not _told_of(right_m, turned).inside:
+        if abs(c * dx + s * dy) > SAME_PLACE_M or not RecordedGap(0.0, -right_m, turned).inside:
             return Start()
         return Start(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
-
-    def _running(self) -> _Drive:
-        if self._drive is None:
-            raise SimulatorError("there is no drive; call reset first")
-        return self._drive
 
     def _one(self, value: float) -> Tensor:
         return torch.tensor([value], dtype=torch.float64, device=self._world.device)
@@ -297,22 +224,18 @@ class RecordedSimulator:
         return VehicleState(x + canvas.x_m, y + canvas.y_m, canvas.z_m, yaw, speed)
 
     def _observe(self, drive: _Drive) -> Observation:
-        course, poses, time_s = self._world.course, _poses(drive.car), drive.steps * self.dt_s
+        course, poses = self._world.course, _poses(drive.car)
         nearest = self._world.bank.nearest(poses)
-        inside = _told(nearest).inside
-        arrived = bool(course.locate(poses).s_m >= course.arclength_m[course.first + course.count - 1])
         frame = self._frame(poses, nearest, drive.pattern)
-        wanted = drive.full_pictures
-        shown = wanted if isinstance(wanted, bool) else drive.steps in wanted
-        return Observation(
-            frame=frame,
-            state=self._state(drive.car),
-            command=Command(int(self._world.bank.command[nearest.frame])),
-            time_s=time_s,
-            done=arrived or not inside or time_s >= drive.scenario.time_limit_s - 1e-9,
-            picture=self._enlarged(frame) if shown else None,
-            ending=None if inside else Ending.LEFT_RECORDED,
-        )
+        ending = None
+        if not _gap_of(nearest).inside:
+            ending = Ending.LEFT_RECORDED
+        elif course.locate(poses).s_m >= course.arclength_m[course.first + course.count - 1]:
+            ending = Ending.GOAL_REACHED
+        elif drive.time_is_up:
+            ending = Ending.TIME_LIMIT
+        command = Command(int(self._world.bank.command[nearest.frame]))
+        return drive.observation(frame, self._enlarged(frame) if drive.shows_picture else None, command, ending)
 
     def _frame(self, poses: Poses, nearest: Gap, pattern: PatternImage | None) -> UInt8[np.ndarray, "h w 3"]:
         with torch.no_grad():
@@ -335,12 +258,8 @@ def _poses(car: Motion) -> Poses:
     return Poses(car.x_m, car.y_m, car.yaw_rad)
 
 
-def _told(gap: Gap) -> RecordedGap:
+def _gap_of(gap: Gap) -> RecordedGap:
     return RecordedGap(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
-
-
-def _told_of(right_m: float, turned_rad: float) -> RecordedGap:
-    return RecordedGap(0.0, -right_m, turned_rad)
 
 
 def _check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:

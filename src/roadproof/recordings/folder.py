@@ -12,30 +12,24 @@ Nothing is pickled, and no path in a file leaves the folder.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from roadproof.errors import ColourError, GeometryError, OutputError, RecordingError
+from roadproof.errors import ColourError, OutputError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_archive, read_array, write_archive
-from roadproof.io.files import inside, read_json, write_folder_atomically
+from roadproof.io.files import inside, write_folder_atomically
 from roadproof.io.pictures import read_picture
+from roadproof.io.records import Form, RecordFile
 from roadproof.photometry import ColourTransform, PixelMaps, Response
-from roadproof.recordings.recording import PER_FRAME, Push, Recording, RecordingSet
+from roadproof.recordings.recording import Push, Recording, RecordingSet
 from roadproof.recordings.track import Track
-
-FORMAT = "roadproof-recordings"
-
-
-FORMAT_VERSION = 1
-
 
 _UNITS = {
     "frames": "RGB uint8, the controller's input, unpainted",
@@ -49,14 +43,65 @@ _UNITS = {
 }
 
 
-_TRACK = tuple(field.name for field in fields(Track))
-
-
 _AGAIN = "record or copy it again"
-
-
 _MOST_TRACK_BYTES = 2**26
 """A day at 10 steps a second: a track.npz that unpacks to more was not written by roadproof."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Drive:
+    """A drive as recordings.json lists it."""
+
+    name: str
+    push: Push
+    frames: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Manifest:
+    """recordings.json."""
+
+    origin: str = ""
+    canvas_px: int = CANVAS_SIZE_PX
+    camera: CameraModel
+    crop_resize: CropResize
+    colour: ColourTransform
+    canvas: CanvasPlacement | None = None
+    drives: tuple[_Drive, ...]
+
+    def __post_init__(self) -> None:
+        if self.canvas_px != CANVAS_SIZE_PX:
+            raise RecordingError(f"canvas_px is {self.canvas_px}, expected {CANVAS_SIZE_PX}; scale homographies")
+
+
+def _canvas(stated: dict[str, float] | None) -> CanvasPlacement | None:
+    names = [each.name for each in fields(CanvasPlacement)]
+    if stated is None:
+        return None
+    if set(stated) != set(names) or not all(abs(value) < 1e9 for value in stated.values()):
+        raise RecordingError(f"canvas is {stated!r:.200}, expected finite numbers for {', '.join(names)}")
+    return CanvasPlacement(**stated)
+
+
+_MANIFEST = RecordFile(
+    kind=_Manifest,
+    name="roadproof-recordings",
+    error=RecordingError,
+    remedy=_AGAIN,
+    forms={
+        "colour": Form(dict[str, Any], ColourTransform.to_dict, ColourTransform.from_dict),
+        "canvas": Form(dict[str, float] | None, lambda canvas: canvas, _canvas),
+    },
+    notes={"units": _UNITS},
+)
+_PER_FRAME = RecordFile(
+    kind=Recording,
+    error=RecordingError,
+    remedy=_AGAIN,
+    elsewhere=("name", "push", "frames", "maps", "track"),
+    header=None,
+)
+_TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
 
 
 def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = False) -> None:
@@ -76,35 +121,27 @@ def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = F
     def write(part: Path) -> None:
         for recording in recordings.recordings:
             _write_drive(recording, part / recording.name, compact=compact)
-        (part / "recordings.json").write_text(json.dumps(_manifest(recordings), indent=1, ensure_ascii=False) + "\n")
+        _MANIFEST.write(part / "recordings.json", _manifest(recordings))
 
     write_folder_atomically(folder, write)
 
 
-def _manifest(recordings: RecordingSet) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "origin": recordings.origin,
-        "units": _UNITS,
-        "canvas_px": CANVAS_SIZE_PX,
-        "camera": asdict(recordings.camera),
-        "crop_resize": asdict(recordings.view),
-        "colour": recordings.colour.to_dict(),
-        "canvas": recordings.canvas and asdict(recordings.canvas),
-        "drives": [
-            {"name": recording.name, "push": str(recording.push), "frames": len(recording.frames)}
-            for recording in recordings.recordings
-        ],
-    }
+def _manifest(recordings: RecordingSet) -> _Manifest:
+    return _Manifest(
+        origin=recordings.origin,
+        camera=recordings.camera,
+        crop_resize=recordings.view,
+        colour=recordings.colour,
+        canvas=recordings.canvas,
+        drives=tuple(_Drive(name=each.name, push=each.push, frames=len(each.frames)) for each in recordings.recordings),
+    )
 
 
 def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
     folder.mkdir()
-    per_frame: dict[str, Any] = {field: getattr(recording, field) for field in PER_FRAME}
-    write_archive(folder / "drive.npz", per_frame)
+    _PER_FRAME.write(folder / "drive.npz", recording)
     if recording.track is not None:
-        write_archive(folder / "track.npz", asdict(recording.track))
+        _TRACK.write(folder / "track.npz", recording.track)
     if recording.maps is not None:
         maps = recording.maps
         write_archive(
@@ -129,81 +166,38 @@ def load_recordings(folder: Path) -> RecordingSet:
         raise RecordingError(f"no folder {folder}; expected a set of recordings with a recordings.json")
     if not (folder / "recordings.json").is_file():
         raise RecordingError(f"{folder} has no recordings.json; expected a set of recordings made by roadproof")
-    manifest = read_json(folder / "recordings.json", FORMAT, FORMAT_VERSION, RecordingError)
-    size = manifest.get("canvas_px", CANVAS_SIZE_PX)
-    if size != CANVAS_SIZE_PX:
-        raise RecordingError(
-            f"{folder / 'recordings.json'}: canvas_px is {size!r:.60}, expected {CANVAS_SIZE_PX}; scale homographies"
-        )
-    try:
-        colour = ColourTransform.from_dict(manifest["colour"])
-        return RecordingSet(
-            camera=CameraModel(**manifest["camera"]),
-            view=CropResize(**manifest["crop_resize"]),
-            colour=colour,
-            recordings=tuple(_read_drive(folder, drive, colour.response) for drive in manifest["drives"]),
-            origin=str(manifest.get("origin", "")),
-            canvas=_read_canvas(folder / "recordings.json", manifest.get("canvas")),
-        )
-    except (KeyError, TypeError) as error:
-        raise RecordingError(f"{folder / 'recordings.json'} is incomplete or has an unknown field: {error}") from None
-    except (ColourError, GeometryError) as error:
-        raise RecordingError(f"{folder / 'recordings.json'}: {error}") from None
+    manifest = _MANIFEST.read(folder / "recordings.json")
+    return RecordingSet(
+        camera=manifest.camera,
+        view=manifest.crop_resize,
+        colour=manifest.colour,
+        recordings=tuple(_read_drive(folder, drive, manifest.colour.response) for drive in manifest.drives),
+        origin=manifest.origin,
+        canvas=manifest.canvas,
+    )
 
 
-def _read_canvas(path: Path, stored: object) -> CanvasPlacement | None:
-    if stored is None:
-        return None
-    names = [field.name for field in fields(CanvasPlacement)]
-    values = cast("dict[str, Any]", stored) if isinstance(stored, dict) else {}
-    # Python's JSON reads NaN, Infinity and integers that no float holds.
-    numbers = {
-        name: float(value) for name, value in values.items() if isinstance(value, int | float) and abs(value) < 1e9
-    }
-    if set(values) != set(names) or len(numbers) != len(names):
-        raise RecordingError(f"{path}: canvas is {stored!r:.200}, expected finite numbers for {', '.join(names)}")
-    return CanvasPlacement(**numbers)
-
-
-def _read_drive(root: Path, drive: dict[str, Any], response: Response) -> Recording:
-    name = drive["name"]
-    folder = inside(root, name, f"{root / 'recordings.json'}: drive", RecordingError)
+def _read_drive(root: Path, drive: _Drive, response: Response) -> Recording:
+    folder = inside(root, drive.name, f"{root / 'recordings.json'}: drive", RecordingError)
     if not folder.is_dir():
-        raise RecordingError(f"drive {name} is listed in recordings.json but {folder} is missing")
-    try:
-        push = Push(drive["push"])
-    except ValueError:
-        raise RecordingError(f"drive {name} has push {drive['push']!r}, expected one of {', '.join(Push)}") from None
-    stored = read_archive(folder / "drive.npz", PER_FRAME, RecordingError, _AGAIN)
-    for field in ("frame_number", "command"):
-        if stored[field].dtype.kind not in "iu":
-            raise RecordingError(f"drive {name}: {field} is of type {stored[field].dtype}, expected whole numbers")
-    return Recording(
-        name=name,
-        push=push,
-        frames=_read_frames(folder, stored["frame_number"]),
-        frame_number=stored["frame_number"],
-        image_from_canvas=stored["image_from_canvas"].astype(np.float64),
-        speed_mps=stored["speed_mps"].astype(np.float64),
-        command=stored["command"],
-        steer=stored["steer"].astype(np.float64),
+        raise RecordingError(f"drive {drive.name} is listed in recordings.json but {folder} is missing")
+    content = _PER_FRAME.content(folder / "drive.npz")
+    return _PER_FRAME.made(
+        folder / "drive.npz",
+        content,
+        name=drive.name,
+        push=drive.push,
+        frames=_read_frames(folder, content["frame_number"]),
         maps=_read_maps(folder / "shading.npz", response),
-        track=_read_track(folder / "track.npz", stored["frame_number"]),
+        track=_read_track(folder / "track.npz", content["frame_number"]),
     )
 
 
 def _read_track(path: Path, frame_number: np.ndarray) -> Track | None:
     if not path.exists():
         return None
-    stored = read_archive(path, _TRACK, RecordingError, _AGAIN, most_bytes=_MOST_TRACK_BYTES)
-    dt_s, step = stored.pop("dt_s"), stored.pop("step")
-    if dt_s.shape != () or step.dtype.kind not in "iu":
-        raise RecordingError(
-            f"{path} has dt_s of shape {dt_s.shape} and steps of type {step.dtype}, expected one number and integers"
-        )
+    track = _TRACK.read(path)
     try:
-        values = {name: array.astype(np.float64) for name, array in stored.items()}
-        track = Track(dt_s=float(dt_s), step=step.astype(np.int64), **values)
         track.rows(frame_number)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
@@ -231,6 +225,6 @@ def _read_frames(folder: Path, numbers: np.ndarray) -> UInt8[np.ndarray, "f h w 
     pictures = (folder / "frames" / f"{number}.png" for number in numbers)
     frames = [read_picture(path, RecordingError, _AGAIN) for path in pictures]
     sizes = {frame.shape[1::-1] for frame in frames}
-    if len(sizes) > 1:
-        raise RecordingError(f"{folder / 'frames'} has pictures of different sizes: {sorted(sizes)}")
+    if len(sizes) != 1:
+        raise RecordingError(f"{folder / 'frames'} has pictures of sizes {sorted(sizes)}, expected one; {_AGAIN}")
     return np.stack(frames)

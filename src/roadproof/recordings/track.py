@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import RecordingError
+from roadproof.io.records import check_arrays
 
 FASTEST_MPS = 70.0
 """No car of a recording moves faster between two steps: a pose that jumps further is wrong."""
@@ -51,14 +52,9 @@ class Track:
         count = self.step.size
         if count == 0:
             raise RecordingError("the track has no step, expected at least one")
-        for field in fields(self)[1:]:
-            values: np.ndarray = getattr(self, field.name)
-            if values.shape != (count,):
-                raise RecordingError(f"{field.name} of the track has shape {values.shape}, expected ({count},)")
-            if not np.isfinite(values).all():
-                raise RecordingError(f"{field.name} of the track has NaN or infinite values")
+        check_arrays(self, [field.name for field in fields(self)[1:]], (count,), "of the track", RecordingError)
         for name, low, high in (("steer", -1, 1), ("throttle", 0, 1), ("brake", 0, 1), ("speed_mps", -1, FASTEST_MPS)):
-            values = getattr(self, name)
+            values: np.ndarray = getattr(self, name)
             if values.min() < low or values.max() > high:
                 raise RecordingError(
                     f"{name} of the track goes from {values.min():g} to {values.max():g}, expected [{low}, {high}]"

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from roadproof.attacks import AttackResult
-from roadproof.calibration.report import CalibrationReport, load_report
+from roadproof.calibration.report import CalibrationReport
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.driving.drive_store import load_episodes
@@ -143,11 +143,12 @@ def read_run(folder: Path) -> Run:
         raise RoadproofError(f"no folder {folder}; expected a run with record, recordings, attack or evaluation in it")
     attack = AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None
     chosen = load_pattern(path) if (path := folder / "pattern.json").exists() else attack and attack.pattern
+    report = folder / "calibration" / "report.json"
     run = Run(
         folder=folder,
         drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
-        calibration=load_report(report) if (report := folder / "calibration" / "report.json").exists() else None,
+        calibration=CalibrationReport.load(report) if report.exists() else None,
         attack=attack,
         selections=_selections(folder),
         judged=_judged(folder / "evaluation") if (folder / "evaluation" / "evaluation.json").exists() else None,

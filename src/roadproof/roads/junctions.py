@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.roads.lanes import Lane, Line, lane_from_borders
+from roadproof.roads.polylines import polyline_stations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +115,7 @@ def _corners(way: list[Lane], lanes: list[Lane], before: dict[int, Lane]) -> lis
     border = _joined([lane.right for lane in way])
     across = border - _joined([lane.left for lane in way])
     outward = across / np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
-    stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(border, axis=0), axis=1))])
+    stations = polyline_stations(border)
     share = (stations / max(float(stations[-1]), 1e-9))[:, None]
     corners: list[Corner] = []
     for place, (first, last) in enumerate(strips):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from roadproof.errors import ScenarioError
 from roadproof.roads.opendrive import MAX_WIDTH_M
+from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.records import LaneRecord, OpenDrive, Road, Section
 
 Line = Float[np.ndarray, "n 3"]
@@ -87,6 +88,11 @@ class Lane:
         """Its largest width."""
         return float(np.linalg.norm(self.left - self.right, axis=1).max())
 
+    def at(self, station_m: float) -> tuple[float, float, float, float]:
+        """(x, y, z, heading) of its centre at an arc length, held at both ends."""
+        x, y, z = interpolated(station_m, self.stations_m, self.centre).tolist()
+        return x, y, z, float(np.interp(station_m, self.stations_m, self.headings_rad))
+
 
 def lane_from_borders(
     left: Line, right: Line, *, road: str, section: int, number: int, kind: str, junction: str | None
@@ -115,12 +121,6 @@ def lane_from_borders(
         successors=(),
         junction=junction,
     )
-
-
-def polyline_stations(points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Arc length up to each point."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def build_lanes(drive: OpenDrive) -> tuple[list[Lane], list[MarkLine]]:
@@ -235,8 +235,7 @@ def _mark_lines(road: Road, section: Section, record: LaneRecord, borders: _Bord
         if mark.kind in UNPAINTED:
             continue
         s = np.concatenate([[start], borders.s_m[(borders.s_m > start + 1e-6) & (borders.s_m < end - 1e-6)], [end]])
-        points = np.column_stack([np.interp(s, borders.s_m, line[:, axis]) for axis in range(3)])
-        yield MarkLine(mark, points, start, road.junction)
+        yield MarkLine(mark, interpolated(s, borders.s_m, line), start, road.junction)
 
 
 def _linked(drive: OpenDrive, lanes: list[Lane]) -> list[Lane]:

@@ -20,10 +20,9 @@ from roadproof.errors import ScenarioError
 from roadproof.roads.junctions import Corner, JunctionArea, junction_areas, triangulated
 from roadproof.roads.lanes import Lane, MarkLine, build_lanes
 from roadproof.roads.opendrive import read_opendrive
-from roadproof.roads.routes import Route, route_along, shortest_way
+from roadproof.roads.routes import Route, route_along, shortest_path
 from roadproof.roads.spatial import SegmentIndex, TriangleIndex
 
-REACH_M = 6.0
 MAX_EXTENT_M = 5000.0
 HEADING_WEIGHT_M = 2.0
 ON_ROUTE_M = 5.0
@@ -95,7 +94,7 @@ class RoadMap:
             float(high[0]),
             float(high[1]),
         )
-        self._segments = SegmentIndex.of([lane.centre for lane in lanes if lane.kind == "driving"], reach_m=REACH_M)
+        self._segments = SegmentIndex([lane.centre for lane in lanes if lane.kind == "driving"])
         self._heading = np.arctan2(self._segments.along[:, 1], self._segments.along[:, 0])
         self._surface = _surface_index(lanes, junctions)
 
@@ -121,7 +120,8 @@ class RoadMap:
         to be far left of its own lane, and in a junction the lane of its direction is found.
         """
         segments = self._segments
-        near = segments.candidates(x_m, y_m)
+        # An error of π makes up for no more distance than this.
+        near = segments.within(x_m, y_m, math.pi * HEADING_WEIGHT_M)
         start, along = segments.start[near], segments.along[near]
         dx, dy = x_m - start[:, 0], y_m - start[:, 1]
         ahead = dx * along[:, 0] + dy * along[:, 1]
@@ -159,7 +159,7 @@ class RoadMap:
         problem: ScenarioError | None = None
         for index, to_m in ends:
             try:
-                way = shortest_way(self.lanes, (begin.lane, begin.arclength_m), (index, to_m))
+                way = shortest_path(self.lanes, (begin.lane, begin.arclength_m), (index, to_m))
             except ScenarioError as error:
                 problem = error
                 continue
@@ -174,7 +174,7 @@ class RoadMap:
     def _goal_places(self, goal_m: tuple[float, float]) -> list[tuple[int, float]]:
         """Lanes (index, arc length) whose centre passes the goal as near as the nearest one, within 0.5 m."""
         segments = self._segments
-        near = segments.candidates(*goal_m)
+        near = segments.within(*goal_m, ON_ROUTE_M)
         reach = np.array(goal_m) - segments.start[near]
         ahead = np.clip((reach * segments.along[near]).sum(axis=1), 0.0, segments.length_m[near])
         distance = np.linalg.norm(reach - segments.along[near] * ahead[:, None], axis=1)
@@ -212,4 +212,4 @@ def _surface_index(lanes: tuple[Lane, ...], junctions: tuple[JunctionArea, ...])
     paved += [(triangulated(area.outline), Surface.DRIVING) for area in junctions]
     corners = np.concatenate([triangles[:, :, :2] for triangles, _ in paved])
     codes = np.concatenate([np.full(len(triangles), int(code)) for triangles, code in paved])
-    return TriangleIndex.of(corners, codes)
+    return TriangleIndex(corners, codes)

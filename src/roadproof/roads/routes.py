@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 
 from roadproof.datatypes import Command
 from roadproof.errors import ScenarioError
-from roadproof.roads.lanes import Lane, Line, polyline_stations
+from roadproof.roads.lanes import Lane, Line
+from roadproof.roads.polylines import interpolated, polyline_stations
 
 SPACING_M = 0.5
 COMMAND_LEAD_M = 20.0
@@ -99,11 +100,11 @@ class Route:
 
     def at(self, arclength_m: float) -> tuple[float, float, float, float]:
         """(x, y, z, heading) at a distance from the start, held at both ends."""
-        x, y, z = (float(np.interp(arclength_m, self.arclengths_m, self.points[:, axis])) for axis in range(3))
+        x, y, z = interpolated(arclength_m, self.arclengths_m, self.points).tolist()
         return x, y, z, float(np.interp(arclength_m, self.arclengths_m, self.headings_rad))
 
 
-def shortest_way(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[int, float]) -> tuple[int, ...]:
+def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[int, float]) -> tuple[int, ...]:
     """Lanes from a place (lane, arc length) to another, by A* over lane lengths with the straight line as its bound.
 
     Raises:
@@ -149,7 +150,7 @@ def route_along(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, to_m
     end_m = max(total - lanes[way[-1]].length_m + to_m, from_m + SPACING_M)
     count = max(1, math.ceil((end_m - from_m) / SPACING_M)) + 1
     at = np.linspace(from_m, end_m, count)
-    points = np.column_stack([np.interp(at, stations, centre[:, axis]) for axis in range(3)])
+    points = interpolated(at, stations, centre)
     along = np.gradient(points[:, :2], axis=0)
     crossings = _crossings(lanes, way, from_m, end_m)
     return Route(

@@ -1,92 +1,47 @@
-"""Finds what lies at or near a point, through a grid of cells: exact answers from few candidates.
-
-Each cell lists the shapes whose box, grown by a margin, touches it; a query looks at the list of its own cell only.
-"""
+"""Finds what lies at or near a point: k-d trees name the few shapes that can, and exact tests decide among them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 Points = Float[np.ndarray, "n 2"]
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Grid:
-    """Lists of shapes by cell: the shapes of cell k are `members[offsets[k]:offsets[k + 1]]`, in rising order."""
-
-    origin_m: Float[np.ndarray, " 2"]
-    cell_m: float
-    columns: int
-    rows: int
-    offsets: Int[np.ndarray, " c"]
-    members: Int[np.ndarray, " m"]
-
-    @classmethod
-    def over(cls, low_m: Points, high_m: Points, *, cell_m: float, margin_m: float) -> Grid:
-        """A grid over boxes given by their corners, each grown by a margin."""
-        origin = low_m.min(axis=0) - margin_m
-        first = np.floor((low_m - margin_m - origin) / cell_m).astype(np.intp)
-        last = np.floor((high_m + margin_m - origin) / cell_m).astype(np.intp)
-        columns, rows = (int(n) + 1 for n in last.max(axis=0))
-        spans = last - first + 1
-        counts = spans.prod(axis=1)
-        shape = np.repeat(np.arange(len(low_m)), counts)
-        rank = np.arange(len(shape)) - np.repeat(np.cumsum(counts) - counts, counts)
-        column = first[shape, 0] + rank % spans[shape, 0]
-        row = first[shape, 1] + rank // spans[shape, 0]
-        cell = row * columns + column
-        order = np.argsort(cell, kind="stable")
-        offsets = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=columns * rows))])
-        return cls(origin, cell_m, columns, rows, offsets, shape[order])
-
-    def near(self, x_m: float, y_m: float) -> Int[np.ndarray, " k"]:
-        """The shapes listed for the cell of one point; none outside the grid."""
-        column, row = int((x_m - self.origin_m[0]) // self.cell_m), int((y_m - self.origin_m[1]) // self.cell_m)
-        if not (0 <= column < self.columns and 0 <= row < self.rows):
-            return self.members[:0]
-        cell = row * self.columns + column
-        return self.members[self.offsets[cell] : self.offsets[cell + 1]]
-
-    def pairs(self, points_m: Points) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-        """All (point, shape) to be looked at for many points."""
-        at = np.floor((points_m - self.origin_m) / self.cell_m)
-        size = np.array([self.columns, self.rows])
-        inside: Bool[np.ndarray, " n"] = np.all((at >= 0) & (at < size), axis=1)
-        column, row = np.where(inside, at.T, 0.0).astype(np.intp)
-        cell = row * self.columns + column
-        counts = np.where(inside, self.offsets[cell + 1] - self.offsets[cell], 0)
-        point = np.repeat(np.arange(len(points_m)), counts)
-        rank = np.arange(len(point)) - np.repeat(np.cumsum(counts) - counts, counts)
-        return point, self.members[self.offsets[cell[point]] + rank]
+SMALL_M = 4.0
+"""Pieces of lanes are smaller and many, those of junctions larger and few: each have a tree of their own."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class TriangleIndex:
-    """Which triangles hold a point; each triangle has a code, and the largest code wins."""
+    """Which triangles hold a point; each triangle has a code, and the largest code wins.
 
-    corners: Float[np.ndarray, "t 3 2"]
-    edges: Float[np.ndarray, "t 3 2"]
-    codes: Int[np.ndarray, " t"]
-    grid: Grid
+    Args:
+        corners: of triangles of either winding.
+        codes: of the triangles, above 0.
+    """
 
-    @classmethod
-    def of(
-        cls, corners: Float[np.ndarray, "t 3 2"], codes: Int[np.ndarray, " t"], *, cell_m: float = 2.0
-    ) -> TriangleIndex:
-        """An index over triangles of either winding."""
-        edges = np.roll(corners, -1, axis=1) - corners
-        grid = Grid.over(corners.min(axis=1), corners.max(axis=1), cell_m=cell_m, margin_m=1e-6)
-        return cls(corners, edges, codes, grid)
+    def __init__(self, corners: Float[np.ndarray, "t 3 2"], codes: Int[np.ndarray, " t"]) -> None:
+        self._corners, self._codes = corners, codes
+        self._edges = np.roll(corners, -1, axis=1) - corners
+        middles = corners.mean(axis=1)
+        reach_m = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1) + 1e-6
+        sizes = (np.flatnonzero(reach_m <= SMALL_M), np.flatnonzero(reach_m > SMALL_M))
+        self._trees: list[tuple[Int[np.ndarray, " k"], Any, float]]
+        self._trees = [(mine, KDTree(middles[mine]), float(reach_m[mine].max())) for mine in sizes if len(mine)]
 
     def __call__(self, points_m: Points) -> Int[np.ndarray, " n"]:
         """The largest code among the triangles that hold each point; 0 where there is none."""
-        codes = np.zeros(len(points_m), dtype=self.codes.dtype)
-        point, triangle = self.grid.pairs(points_m)
-        held = _holds(self.corners[triangle], self.edges[triangle], points_m[point])
-        np.maximum.at(codes, point[held], self.codes[triangle[held]])
+        codes = np.zeros(len(points_m), dtype=self._codes.dtype)
+        for mine, tree, reach_m in self._trees:
+            near: list[list[int]] = list(tree.query_ball_point(points_m, reach_m))
+            point = np.repeat(np.arange(len(points_m)), [len(found) for found in near])
+            triangle = mine[np.fromiter(chain.from_iterable(near), np.intp, len(point))]
+            held = _holds(self._corners[triangle], self._edges[triangle], points_m[point])
+            np.maximum.at(codes, point[held], self._codes[triangle[held]])
         return codes
 
 
@@ -98,41 +53,44 @@ def _holds(
     return np.logical_or((side >= -1e-9).all(axis=1), (side <= 1e-9).all(axis=1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class SegmentIndex:
-    """Line segments with an owner each, to be found by points within a reach of them."""
+    """The segments of polylines, those without length left out.
 
-    start: Float[np.ndarray, "s 2"]
-    along: Float[np.ndarray, "s 2"]
-    length_m: Float[np.ndarray, " s"]
-    owner: Int[np.ndarray, " s"]
-    station_m: Float[np.ndarray, " s"]
-    grid: Grid
+    Args:
+        lines: polylines; their place in the list is the owner of their segments.
 
-    @classmethod
-    def of(cls, lines: list[Float[np.ndarray, "_ 3"]], *, reach_m: float, cell_m: float = 4.0) -> SegmentIndex:
-        """An index over the segments of polylines; segments without length are left out.
+    Attributes:
+        start: x and y of each segment's first point.
+        along: its direction, of length 1.
+        length_m: its length.
+        owner: the line it belongs to.
+        station_m: arc length of its line up to it.
+    """
 
-        Args:
-            lines: polylines; their place in the list is the owner of their segments.
-            reach_m: points nearer than this to a segment are sure to find it.
-            cell_m: side of a cell.
-        """
+    def __init__(self, lines: list[Float[np.ndarray, "_ 3"]]) -> None:
         start = np.concatenate([line[:-1, :2] for line in lines])
         step = np.concatenate([np.diff(line[:, :2], axis=0) for line in lines])
         length = np.linalg.norm(step, axis=1)
         owner = np.repeat(np.arange(len(lines)), [len(line) - 1 for line in lines])
         total = np.cumsum(length) - length
-        first = np.searchsorted(owner, np.arange(len(lines)))
-        station = total - total[first][owner]
+        station = total - total[np.searchsorted(owner, np.arange(len(lines)))][owner]
         keep = length > 1e-6
-        start, step, length, owner, station = (a[keep] for a in (start, step, length, owner, station))
-        grid = Grid.over(
-            np.minimum(start, start + step), np.maximum(start, start + step), cell_m=cell_m, margin_m=reach_m
-        )
-        return cls(start, step / length[:, None], length, owner, station, grid)
+        self.start: Float[np.ndarray, "s 2"] = start[keep]
+        self.along: Float[np.ndarray, "s 2"] = step[keep] / length[keep, None]
+        self.length_m: Float[np.ndarray, " s"] = length[keep]
+        self.owner: Int[np.ndarray, " s"] = owner[keep]
+        self.station_m: Float[np.ndarray, " s"] = station[keep]
+        self._tree: Any = KDTree(self.start + 0.5 * step[keep])
+        self._half_m = 0.5 * float(self.length_m.max())
 
-    def candidates(self, x_m: float, y_m: float) -> Int[np.ndarray, " k"]:
-        """Segments worth looking at for a point: those near it, or all where none is."""
-        near = self.grid.near(x_m, y_m)
-        return near if len(near) else np.arange(len(self.owner))
+    def within(self, x_m: float, y_m: float, beyond_m: float) -> Int[np.ndarray, " k"]:
+        """Segments near a point, in rising order: all whose distance exceeds the nearest one's by no more than this.
+
+        Args:
+            x_m: world x.
+            y_m: world y.
+            beyond_m: the nearest one's distance d and the others' D fulfil D² ≤ d² + this².
+        """
+        nearest_m: float = self._tree.query((x_m, y_m))[0]
+        reach_m = math.hypot(nearest_m, beyond_m) + self._half_m
+        return np.array(self._tree.query_ball_point((x_m, y_m), reach_m, return_sorted=True), np.intp)

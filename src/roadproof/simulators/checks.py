@@ -7,12 +7,13 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from roadproof.datatypes import Command, Control, Observation, VehicleState, Weather
-from roadproof.errors import SimulatorError
+from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import (
     CANVAS_SIZE_PX,
     Homography,
@@ -41,6 +42,9 @@ class Check:
     passed: bool
     detail: str
 
+    def __str__(self) -> str:
+        return f"{'ok    ' if self.passed else 'FAILED'} {self.name}: {self.detail}"
+
 
 @dataclass(frozen=True, slots=True)
 class SimulatorReport:
@@ -54,12 +58,22 @@ class SimulatorReport:
         return all(check.passed for check in self.checks)
 
     def __str__(self) -> str:
-        lines = [f"{'ok    ' if check.passed else 'FAILED'} {check.name}: {check.detail}" for check in self.checks]
         failed = sum(not check.passed for check in self.checks)
-        return "\n".join([*lines, "all checks passed" if not failed else f"{failed} of {len(lines)} checks failed"])
+        verdict = "all checks passed" if not failed else f"{failed} of {len(self.checks)} checks failed"
+        return "\n".join([*map(str, self.checks), verdict])
+
+    def require(self) -> None:
+        """Raise what the first failed check saw.
+
+        Raises:
+            BrokenPromiseError: a promise is not kept.
+        """
+        for check in self.checks:
+            if not check.passed:
+                raise BrokenPromiseError(f"{check.name}: {check.detail}")
 
 
-class _BrokenPromiseError(Exception):
+class BrokenPromiseError(Exception):
     """A promise is not kept; the message says what was seen."""
 
 
@@ -93,13 +107,14 @@ def check_simulator(
         ("transparency", kit.transparency),
         ("colours", kit.colours),
     )
-    return SimulatorReport(tuple(_checked(name, promise) for name, promise in promises if not only or name in only))
+    return SimulatorReport(tuple(checked(name, promise) for name, promise in promises if not only or name in only))
 
 
-def _checked(name: str, promise: Callable[[], str]) -> Check:
+def checked(name: str, promise: Callable[[], str]) -> Check:
+    """Check one promise: it returns what it saw, or raises."""
     try:
         return Check(name, True, promise())
-    except _BrokenPromiseError as broken:
+    except (BrokenPromiseError, RoadproofError) as broken:
         return Check(name, False, str(broken))
     except Exception as error:
         return Check(name, False, f"raised {type(error).__name__}: {error}")
@@ -107,11 +122,11 @@ def _checked(name: str, promise: Callable[[], str]) -> Check:
 
 def _expect(kept: bool, seen: str) -> None:
     if not kept:
-        raise _BrokenPromiseError(seen)
+        raise BrokenPromiseError(seen)
 
 
 class _Kit:
-    """The promises, each a method that returns what it saw or raises `_BrokenPromiseError`."""
+    """The promises, each a method that returns what it saw or raises `BrokenPromiseError`."""
 
     def __init__(self, simulator: Simulator, scenario: Scenario, steps: int) -> None:
         self._simulator, self._scenario, self._steps = simulator, scenario, steps
@@ -134,7 +149,7 @@ class _Kit:
         seen, camera = self._simulator.reset(self._scenario, full_pictures=True), self._simulator.camera
         picture = seen.picture
         if picture is None:
-            raise _BrokenPromiseError("no full picture, though it was asked for")
+            raise BrokenPromiseError("no full picture, though it was asked for")
         shape = (camera.height_px, camera.width_px, 3)
         _expect(picture.shape == shape, f"the picture is {picture.shape}, expected {shape}")
         off = float(np.abs(self._simulator.input(picture).astype(float) - seen.frame).mean())
@@ -181,7 +196,7 @@ class _Kit:
         except SimulatorError as error:
             _expect("\n" not in str(error), "the refusal of −1 cars has more than one line")
             return "−1 cars are refused"
-        raise _BrokenPromiseError("−1 cars were accepted")
+        raise BrokenPromiseError("−1 cars were accepted")
 
     def determinism(self) -> str:
         first, second = (self._drive(AHEAD, cars=3, pedestrians=3, seed=5) for _ in range(2))
@@ -242,26 +257,9 @@ class _Kit:
         _expect(float(off.mean()) < COLOUR_TOLERANCE, f"grey paint is {off.mean():.1f} levels off linear on average")
         return f"grey paint is within {off.mean():.2f} levels of linear on average"
 
-    def _drive(
-        self,
-        control: Control,
-        *,
-        pattern: PatternImage | None = None,
-        weather: Weather = Weather.CLEAR_NOON,
-        cars: int = 0,
-        pedestrians: int = 0,
-        seed: int = 0,
-        full_pictures: bool = False,
-    ) -> list[Observation]:
-        first = self._simulator.reset(
-            self._scenario,
-            pattern=pattern,
-            weather=weather,
-            cars=cars,
-            pedestrians=pedestrians,
-            seed=seed,
-            full_pictures=full_pictures,
-        )
+    def _drive(self, control: Control, **asked: Any) -> list[Observation]:  # noqa: ANN401
+        """A short drive with one control; `asked` goes to its reset."""
+        first = self._simulator.reset(self._scenario, **asked)
         return [first, *(self._simulator.step(control) for _ in range(self._steps))]
 
     def _at_canvas(self, pattern: PatternImage | None) -> Observation:
@@ -279,7 +277,7 @@ class _Kit:
             if dx * math.cos(state.yaw_rad) + dy * math.sin(state.yaw_rad) < VIEW_M:
                 return dataclasses.replace(state, speed_mps=0.0)
             state = self._simulator.step(AHEAD).state
-        raise _BrokenPromiseError(
+        raise BrokenPromiseError(
             f"the canvas is not within {VIEW_M:.0f} m after {APPROACH_STEPS} steps of throttle straight on"
         )
 
@@ -292,7 +290,7 @@ def _opaque(red: int, green: int, blue: int) -> UInt8[np.ndarray, "400 400 4"]:
 
 def _picture(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
     if seen.picture is None:
-        raise _BrokenPromiseError("no full picture, though it was asked for")
+        raise BrokenPromiseError("no full picture, though it was asked for")
     return seen.picture
 
 

@@ -12,16 +12,14 @@ from urllib.parse import urlsplit
 
 from roadproof.errors import SimulatorError
 from roadproof.roads.roadmap import RoadMap
-from roadproof.roads.routes import Route
-from roadproof.simulators.protocol import PaintChoice, Simulator
-from roadproof.traffic.agents import Agents
+from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
 SPECS = "town or carla://HOST:PORT"
 CARLA_PORT = 2000
 
 
-class MappedSimulator(Simulator, Protocol):
-    """A simulator that also shows the map, the way to the goal, the other cars and the people."""
+class MappedSimulator(Simulator, OpenWorld, Protocol):
+    """A simulator that hides nothing of its drives, and also shows the map."""
 
     def road_map(self, name: str) -> RoadMap:
         """The map a scenario names.
@@ -30,21 +28,6 @@ class MappedSimulator(Simulator, Protocol):
             SimulatorError: the simulator does not answer.
             ScenarioError: it has no such map.
         """
-        ...
-
-    @property
-    def route(self) -> Route:
-        """The way of the current drive."""
-        ...
-
-    @property
-    def cars(self) -> Agents:
-        """The other cars as they are now."""
-        ...
-
-    @property
-    def pedestrians(self) -> Agents:
-        """The people as they are now."""
         ...
 
 

@@ -11,7 +11,9 @@ from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, Weather
 from roadproof.geometry import CameraModel, CropResize, Homography
+from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
+from roadproof.traffic.agents import Agents
 
 PatternImage = UInt8[np.ndarray, "400 400 4"]
 """What is painted on the canvas: RGBA with straight (not premultiplied) alpha; y = 0 is the far edge."""
@@ -117,6 +119,26 @@ class Simulator(Protocol):
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px."""
+        ...
+
+
+@runtime_checkable
+class OpenWorld(Protocol):
+    """A simulator that hides nothing of the drive under way; the town is one."""
+
+    @property
+    def route(self) -> Route:
+        """The way to the goal."""
+        ...
+
+    @property
+    def cars(self) -> Agents:
+        """The others now."""
+        ...
+
+    @property
+    def pedestrians(self) -> Agents:
+        """The people now."""
         ...
 
 

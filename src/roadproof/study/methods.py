@@ -1,135 +1,104 @@
 """The methods that a study's plan can name, each with its own settings and no others.
 
-[[method]]
-name = "GradOpt"                          # stands in the tables
-search = "gradopt"
-objective = "deviation"                   # the path in the recorded world; or "steering", the shift on frames
-trajectories = 5                          # T, recorded drives; scheme: group, group-all or random
-swerves_m = [1.5]                         # how far pairs of them are pushed aside, in turn; then those that weave
-weaves_m = [0.5]
-noise_deg = [4, 20]                       # pushed by steering noise instead, as published
-frames = 40                               # kept of every recorded drive
-calibration = "two-paint"                 # or published, or pose
-restarts = 3
-iterations = 32                           # left out, what suits the objective
-halving = true                            # whether many starts compete first
-select = 1                                # candidates driven, of which the strongest is kept; 0 believes the first
-rounds = 0
-
-[[method]]
-name = "GradOpt as published"
-search = "published"                      # the paper's choices; see docs/published-and-improved.md
-masks = "binary"                          # of its code; or "antialiased", of its text
-trajectories = 3
-noise_deg = [4, 20]
-restarts = 4
-
-[[method]]
-name = "BO"
-search = "published-bo"                   # or random, tpe, gp, cma-es: patterns chosen by their values alone
-calls = 1000                              # patterns tried, each in a whole drive
-random_calls = 400                        # published-bo: before the model guides
-objective = "steering"                    # as published; or "deviation", what is reported
-where = "simulator"                       # or "recorded", where drives cost no simulator
-start = 4                                 # tries first as many patterns that GradOpt found, by the steering shift
+Every class is a `[[method]]` of the plan; docs/studies.md shows one of each. A job is known by a hash of these fields
+and their values: rename one, and finished jobs are unknown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, TypeAlias, cast
 
+import msgspec
+
+from roadproof.attacks import METHODS, OBJECTIVES, BayesianOptimisation, BlackBox, GradOpt, Published, method_of
+from roadproof.calibration import Method as Calibration
+from roadproof.datatypes import Weather
+from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.errors import StudyError
 from roadproof.limits import MANY
-from roadproof.study.reading import build, one_of, within
+from roadproof.pipeline.budget import PUBLISHED, QUICK, Budget
+from roadproof.study.reading import build
 
-GRADOPT, PUBLISHED = "gradopt", "published"
-SCHEMES = ("group", "group-all", "random")
+# What begins a number is checked by the object that it goes into; a plan may come from anyone, so it also has an end.
+Hundred: TypeAlias = Annotated[int, msgspec.Meta(le=100)]
+Thousand: TypeAlias = Annotated[int, msgspec.Meta(le=1000)]
+Many: TypeAlias = Annotated[int, msgspec.Meta(le=MANY)]
+Groups: TypeAlias = Literal["group", "group-all", "random"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GradOptPlan:
-    """GradOpt with exact gradients; see the head of this module."""
+    """GradOpt with exact gradients.
 
-    name: str
-    search: str = GRADOPT
-    objective: str = "deviation"
-    trajectories: int = 5
-    scheme: str = "group"
-    swerves_m: tuple[float, ...] = (1.5,)
+    Raises:
+        RoadproofError: a value is out of its range, or does not go with another.
+    """
+
+    name: str  # stands in the tables
+    search: str = GradOpt.word
+    objective: Literal["deviation", "steering"] = "deviation"  # the path in the recorded world, or the shift on frames
+    trajectories: int = 5  # T, recorded drives
+    scheme: Groups = "group"  # group-all: one pool; random: each drive perturbed to both sides
+    swerves_m: tuple[float, ...] = (1.5,)  # offsets of pairs of drives, in turn; then those of pairs that weave
     weaves_m: tuple[float, ...] = (0.5,)
-    noise_deg: tuple[int, int] | None = None
-    frames: int = 40
-    calibration: str = "two-paint"
-    restarts: int = 3
-    iterations: int | None = None
-    halving: bool = True
-    select: int = 1
-    rounds: int = 0
+    noise_deg: tuple[int, int] | None = None  # perturbed by steering noise instead, as published
+    frames: Many = 40  # kept of every recorded drive
+    calibration: Calibration = Calibration.TWO_PAINT
+    restarts: Thousand = 3
+    iterations: Many | None = None  # None: what suits the objective
+    halving: bool = True  # whether many starts compete first
+    select: Thousand = 1  # candidates driven, of which the strongest is kept; 0 believes the first
+    rounds: Hundred = 0  # of searching on along the way that the attacked car took
 
     def __post_init__(self) -> None:
-        # Late, since torch comes with it; a process that only passes plans on is spared.
-        from roadproof.attacks import OBJECTIVES
-        from roadproof.calibration import METHODS as CALIBRATIONS
-
-        one_of(self.objective, "objective", tuple(OBJECTIVES))
-        one_of(self.scheme, "scheme", SCHEMES)
-        one_of(self.calibration, "calibration", CALIBRATIONS)
-        within(self.restarts, "restarts", 1, 1000)
-        within(self.frames, "frames", 1, MANY)
-        within(self.iterations or 1, "iterations", 1, MANY)
-        within(self.select, "select", 0, 1000)
-        within(self.rounds, "rounds", 0, 100)
-        _check_count(self.trajectories)
         if self.objective == "deviation" and (self.scheme != "group" or self.trajectories == 1):
             raise StudyError(
                 "objective deviation is searched for each side apart; expected scheme group and trajectories 3 or more"
             )
+        budget_of(self, Weather.CLEAR_NOON)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PublishedPlan:
-    """GradOpt as published; see the head of this module."""
+    """GradOpt as published (docs/published-and-improved.md).
+
+    Raises:
+        RoadproofError: a value is out of its range.
+    """
 
     name: str
-    search: str = PUBLISHED
-    masks: str = "binary"
+    search: str = Published.word
+    masks: str = "binary"  # of the authors' code; or antialiased, of the paper's text
     trajectories: int = 3
-    scheme: str = "group"
+    scheme: Groups = "group"
     noise_deg: tuple[int, int] = (4, 20)
-    restarts: int = 4
+    restarts: Thousand = 4
 
     def __post_init__(self) -> None:
-        from roadproof.attacks.published import MASKS
-
-        one_of(self.masks, "masks", MASKS)
-        one_of(self.scheme, "scheme", SCHEMES)
-        within(self.restarts, "restarts", 1, 1000)
-        _check_count(self.trajectories)
+        budget_of(self, Weather.CLEAR_NOON)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BlackBoxPlan:
-    """A search without gradients; see the head of this module."""
+    """A search without gradients: it knows patterns by their values alone.
+
+    Raises:
+        RoadproofError: a value is out of its range, or does not go with another.
+    """
 
     name: str
-    search: str
-    calls: int = 1000
-    random_calls: int = 400
-    objective: str = "deviation"
-    where: str = "simulator"
-    start: int = 0
+    search: str  # published-bo, random, tpe, gp or cma-es
+    calls: Many = 1000  # patterns tried, each in a whole drive
+    random_calls: int = 400  # published-bo: before the model guides
+    objective: Literal["steering", "deviation"] = "deviation"  # as published, or what is reported
+    where: Literal["simulator", "recorded"] = "simulator"  # recorded: drives cost no simulator
+    start: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 0  # of GradOpt's patterns, by steering, are tried first
 
     def __post_init__(self) -> None:
-        from roadproof.pipeline.driven_objective import MEASURES
-
-        one_of(self.objective, "objective", MEASURES)
-        one_of(self.where, "where", ("simulator", "recorded"))
-        within(self.calls, "calls", 1, MANY)
-        within(self.random_calls, "random_calls", 1, MANY)
-        within(self.start, "start", 0, 1000)
-        if self.search == "published-bo" and self.random_calls >= self.calls:
+        budget_of(self, Weather.CLEAR_NOON)
+        if self.search == BayesianOptimisation.word and self.random_calls >= self.calls:
             raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         if self.start and self.where == "recorded":
             raise StudyError(f"start is {self.start} with where recorded; expected 0, or where simulator")
@@ -145,19 +114,63 @@ def method_plan(values: Mapping[str, Any]) -> MethodPlan:
         StudyError: it lacks a name or a known search, has a key that its search does not know, or a value makes no
             sense.
     """
-    from roadproof.attacks import METHODS
-
     for name in ("name", "search"):
         if name not in values:
             raise StudyError(f"method lacks {name}")
-    one_of(str(values["search"]), "search", tuple(METHODS))
-    kinds = {GRADOPT: GradOptPlan, PUBLISHED: PublishedPlan}
-    kind = kinds.get(str(values["search"]), BlackBoxPlan)
-    return build(kind, values, f"method {values['name']}")
+    word = str(values["search"])
+    if word not in METHODS:
+        raise StudyError(f"search is {word!r:.60}, expected one of {', '.join(METHODS)}")
+    kinds = {GradOpt.word: GradOptPlan, Published.word: PublishedPlan}
+    return build(kinds.get(word, BlackBoxPlan), values, f"method {values['name']}")
 
 
-def _check_count(trajectories: int) -> None:
-    from roadproof.drives.trajectories import COUNTS
+def budget_of(method: MethodPlan, weather: Weather) -> Budget:
+    """What a method spends on finding a pattern in recordings, in one weather.
 
-    if trajectories not in COUNTS:
-        raise StudyError(f"trajectories is {trajectories}, expected {', '.join(map(str, COUNTS))}")
+    Raises:
+        RoadproofError: a value of the method is out of its range.
+    """
+    match method:
+        case GradOptPlan():
+            swerve = Swerve(method.swerves_m, method.weaves_m)
+            least_px = (QUICK.window if method.objective == "deviation" else Window()).least_px
+            return replace(
+                QUICK,
+                weathers=(weather,),
+                method=GradOpt(iterations=method.iterations, restarts=method.restarts, halving=method.halving),
+                objective=OBJECTIVES[method.objective],
+                trajectories=_trajectories(
+                    method, swerve if method.noise_deg is None else SteeringNoise(*method.noise_deg)
+                ),
+                window=Window(frames=method.frames, least_px=least_px),
+                pooled=method.scheme != "group",
+                calibration=Calibration(method.calibration),
+                select=method.select,
+                rounds=method.rounds,
+            )
+        case PublishedPlan():
+            return replace(
+                PUBLISHED,
+                weathers=(weather,),
+                runs=0,
+                method=Published(masks=method.masks, restarts=method.restarts),
+                trajectories=_trajectories(method, SteeringNoise(*method.noise_deg)),
+                pooled=method.scheme != "group",
+            )
+        case BlackBoxPlan():
+            return replace(QUICK, weathers=(weather,), method=black_box(method), objective=OBJECTIVES[method.objective])
+
+
+def black_box(method: BlackBoxPlan) -> BlackBox:
+    """The search itself.
+
+    Raises:
+        RoadproofError: a value of the method is out of its range.
+    """
+    more = {"random_calls": method.random_calls} if method.search == BayesianOptimisation.word else {}
+    return cast("BlackBox", method_of(method.search, calls=method.calls, **more))
+
+
+def _trajectories(method: GradOptPlan | PublishedPlan, how: Swerve | SteeringNoise) -> Trajectories:
+    scheme = Scheme.RANDOM if method.scheme == "random" else Scheme.GROUP
+    return Trajectories(count=method.trajectories, scheme=scheme, perturbation=how)

@@ -1,37 +1,4 @@
-"""What a study compares, as a TOML file says it, and the independent jobs that come of it.
-
-format = "roadproof-study"
-version = 2
-controller = "cil"
-simulator = "town"                        # or carla://HOST:PORT, for one worker
-scenario_file = "own.toml"                # beside the study; left out, the built-in scenarios
-scenarios = ["straight-01", "left-*"]     # names or patterns of names
-figures = ["1-b", 1, 3, 5]                # K; 1-b is one black figure
-seeds = [0]
-reference = "GradOpt"                     # the method that tables compare with others; the first, left out
-weathers = ["clear-noon", "rainy-noon"]   # of the evaluation; attacks are found in the first
-
-[starts]                                  # of the drives that judge a pattern, in each weather; these are the defaults
-count = 5
-right_m = 0.3                             # to either side; drawn uniformly, as the others
-turned_rad = 0.05
-faster_mps = 2.0
-
-[traffic]                                 # leave it out for static objects only
-cars = 20
-pedestrians = 20
-runs = 10
-weathers = "all"                          # or "first": the others are driven alone
-
-[[method]]                                # see study.methods
-name = "GradOpt"
-search = "gradopt"
-
-[[method]]
-name = "BO"
-search = "published-bo"
-objective = "steering"
-"""
+"""What a study compares, as a TOML file says it (see docs/studies.md), and the independent jobs that come of it."""
 
 from __future__ import annotations
 
@@ -42,19 +9,20 @@ import json
 import sys
 import tomllib
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, fields
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from roadproof.controllers.loading import runs_code
 from roadproof.datatypes import Weather
+from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
 from roadproof.study.methods import MethodPlan, method_plan
-from roadproof.study.reading import build, one_of, within
+from roadproof.study.reading import build
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -64,80 +32,103 @@ JOB_VERSION = 3
 BLACK = "1-b"
 
 
+def _check_range(name: str, value: int, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise StudyError(f"{name} is {value}, expected {least} to {most}")
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrafficPlan:
     """Evaluation among others: seeded runs whose mean counts.
 
     Args:
-        cars: on the road.
-        pedestrians: about.
-        runs: in each weather.
+        cars: on the road, 0 to 500.
+        pedestrians: about, 0 to 500.
+        runs: in each weather, 1 to 10,000.
         weathers: "all", or "first": the study's other weathers are driven alone.
+
+    Raises:
+        StudyError: a number is out of its range, or nobody is on the road.
     """
 
     cars: int = 20
     pedestrians: int = 20
     runs: int = 10
-    weathers: str = "all"
+    weathers: Literal["all", "first"] = "all"
 
     def __post_init__(self) -> None:
-        for name in ("cars", "pedestrians"):
-            within(getattr(self, name), name, 0, MAX_CROWD)
+        _check_range("cars", self.cars, 0, MAX_CROWD)
+        _check_range("pedestrians", self.pedestrians, 0, MAX_CROWD)
+        _check_range("runs", self.runs, 1, 10_000)
         if not self.cars + self.pedestrians:
             raise StudyError("cars and pedestrians are 0; leave [traffic] out to drive alone")
-        within(self.runs, "runs", 1, 10_000)
-        one_of(self.weathers, "weathers", ("all", "first"))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class StartPlan:
+class StartPlan(StartRange):
     """Where the drives begin that judge a pattern: not where it was chosen.
 
     Args:
-        count: drives alone in each weather.
-        right_m: see `driving.starts.StartRange`, as turned_rad and faster_mps.
+        count: drives alone in each weather, 1 to 1000.
+
+    Raises:
+        EpisodeError: a start is too far from the scenario's.
+        StudyError: there is no drive, or there are too many.
     """
 
     count: int = 5
-    right_m: float = 0.3
-    turned_rad: float = 0.05
-    faster_mps: float = 2.0
 
     def __post_init__(self) -> None:
-        from roadproof.driving.starts import MOST
+        StartRange.__post_init__(self)
+        _check_range("count", self.count, 1, 1000)
 
-        within(self.count, "count", 1, 1000)
-        for name, most in MOST.items():
-            within(getattr(self, name), name, 0.0, most)
+    @property
+    def range(self) -> StartRange:
+        """What the starts are drawn from, without how many there are."""
+        return StartRange(right_m=self.right_m, turned_rad=self.turned_rad, faster_mps=self.faster_mps)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Job:
+class Conditions:
+    """Whom patterns are found against, and how they are judged.
+
+    Args:
+        controller: spec of the controller (`controllers.loading`).
+        weathers: of the drives that judge; patterns are found in the first.
+        traffic: cars and people beside those drives; None for drives alone.
+        starts: where those drives begin.
+        simulator: spec of the simulator (`simulators.loading`).
+    """
+
+    controller: str
+    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
+    traffic: TrafficPlan | None = None
+    starts: StartPlan = StartPlan()
+    simulator: str = "town"
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The conditions alone, by name."""
+        return {each.name: getattr(self, each.name) for each in fields(Conditions)}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Job(Conditions):
     """One pattern to be found and evaluated; independent of every other.
 
     Args:
-        controller: its spec.
-        scenario: where.
-        figures: K, or "1-b".
-        method: how.
+        scenario: where it is painted.
+        figures: K, or "1-b" for one black figure.
+        method: how it is found.
         seed: of the recording and the search.
-        weathers: of the evaluation; found in the first.
-        traffic: of the evaluation, or None.
-        starts: of the evaluation.
-        simulator: its spec, see `simulators.loading`.
         weights: digest of the file that the controller's spec names, or of the source of a function of yours; empty
             for one that comes with the package.
     """
 
-    controller: str
     scenario: Scenario
     figures: int | str
     method: MethodPlan
     seed: int
-    weathers: tuple[Weather, ...]
-    traffic: TrafficPlan | None
-    starts: StartPlan = StartPlan()
-    simulator: str = "town"
     weights: str = ""
 
     @property
@@ -151,34 +142,24 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Study:
+class Study(Conditions):
     """Scenarios × K × methods × seeds, evaluated in some weathers, with and without traffic.
 
     Args:
-        controller: its spec.
         scenarios: the stretches of road on which every method finds its patterns.
         figures: K, or "1-b" for one black figure.
         methods: how patterns are found.
         seeds: of recording and search.
-        weathers: of the evaluation; patterns are found in the first.
-        traffic: of the evaluation, or None.
-        starts: of the evaluation.
-        simulator: its spec.
         reference: name of the method that tables compare with the others; None for the first.
 
     Raises:
         StudyError: a list is empty, something stands in it twice, or a value makes no sense.
     """
 
-    controller: str
     scenarios: tuple[Scenario, ...]
     figures: tuple[int | str, ...]
     methods: tuple[MethodPlan, ...]
     seeds: tuple[int, ...] = (0,)
-    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
-    traffic: TrafficPlan | None = None
-    starts: StartPlan = StartPlan()
-    simulator: str = "town"
     reference: str | None = None
 
     def __post_init__(self) -> None:
@@ -194,7 +175,7 @@ class Study:
         if self.simulator != "town" and not is_server(self.simulator):
             raise StudyError(f"simulator is {self.simulator!r}, expected {SPECS}")
         for seed in self.seeds:
-            within(seed, "seeds", 0, MAX_SEED)
+            _check_range("seeds", seed, 0, MAX_SEED)
         # What is asked for twice would be two jobs that write the same folder.
         named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": [m.name for m in self.methods]}
         for what in ("figures", "seeds", "weathers"):
@@ -203,32 +184,22 @@ class Study:
             twice = [name for name in names if names.count(name) > 1]
             if twice:
                 raise StudyError(f"{what} has {twice[0]} twice, expected each once")
-        if self.reference is not None:
-            one_of(self.reference, "reference", named["method"])
+        if self.reference is not None and self.reference not in named["method"]:
+            raise StudyError(f"reference is {self.reference!r}, expected one of {', '.join(named['method'])}")
 
     @property
     def jobs(self) -> tuple[Job, ...]:
         """Every combination, scenario by scenario."""
-        weights = _digest(self.controller)
+        more: dict[str, Any] = {"weights": _digest(self.controller), **self.shared}
+        combinations = product(self.scenarios, self.figures, self.methods, self.seeds)
         return tuple(
-            Job(
-                controller=self.controller,
-                scenario=scenario,
-                figures=figures,
-                method=method,
-                seed=seed,
-                weathers=self.weathers,
-                traffic=self.traffic,
-                starts=self.starts,
-                simulator=self.simulator,
-                weights=weights,
-            )
-            for scenario, figures, method, seed in product(self.scenarios, self.figures, self.methods, self.seeds)
+            Job(scenario=scenario, figures=figures, method=method, seed=seed, **more)
+            for scenario, figures, method, seed in combinations
         )
 
 
 def load_study(path: Path, *, trust: bool = False) -> Study:
-    """Read a study; see the head of this module.
+    """Read a study.
 
     Args:
         path: of the TOML file.
@@ -263,19 +234,14 @@ def _check_harmless(study: Study) -> None:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Stated:
+class _Stated(Conditions):
     """A plan as its file says it."""
 
-    controller: str
     scenarios: tuple[str, ...]
     figures: tuple[int | str, ...]
     method: tuple[dict[str, Any], ...]
     scenario_file: str | None = None
     seeds: tuple[int, ...] = (0,)
-    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
-    traffic: dict[str, Any] | None = None
-    starts: dict[str, Any] = field(default_factory=dict[str, Any])
-    simulator: str = "town"
     reference: str | None = None
 
 
@@ -286,23 +252,20 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
         raise StudyError(
             f"version is {version!r}, expected {FORMAT_VERSION}; version 1 had other keys, see docs/studies.md"
         )
-    stated = build(_Stated, content, "the study")
+    tables = {"traffic": TrafficPlan, "starts": StartPlan}
+    built = {name: build(tables[name], content[name], name) for name in tables if isinstance(content.get(name), dict)}
+    stated = build(_Stated, content | built, "the study")
     listed = stated.scenario_file
     own = BUILTIN_FILE if listed is None else folder / listed
     if listed is not None and not own.resolve().is_relative_to(folder.resolve()):
         raise StudyError(f"scenario_file {listed!r} leaves the study's folder; put it beside the study")
-    methods = tuple(map(method_plan, stated.method))
     return Study(
-        controller=stated.controller,
         scenarios=_chosen(stated.scenarios, load_scenarios(own)),
         figures=stated.figures,
-        methods=methods,
+        methods=tuple(map(method_plan, stated.method)),
         seeds=stated.seeds,
-        weathers=stated.weathers,
-        traffic=None if stated.traffic is None else build(TrafficPlan, stated.traffic, "traffic"),
-        starts=build(StartPlan, stated.starts, "starts"),
-        simulator=stated.simulator,
         reference=stated.reference,
+        **stated.shared,
     )
 
 

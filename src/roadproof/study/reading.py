@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from roadproof.errors import StudyError
+from roadproof.errors import RoadproofError, StudyError
 
 T = TypeVar("T")
 
@@ -28,34 +28,22 @@ def build(kind: type[T], values: Mapping[str, Any], what: str) -> T:
             raise StudyError(f"{what} has an unknown key {key!r}; did you mean {nearest[0]!r}?")
     try:
         return msgspec.convert(values, kind)
+    except RoadproofError as error:
+        raise StudyError(f"{what}: {error}") from None
     except msgspec.ValidationError as error:
+        if isinstance(error.__cause__, RoadproofError):  # one that is a ValueError too
+            raise StudyError(f"{what}: {error.__cause__}") from None
         told = str(error).replace("`", "")
         if missing := re.fullmatch(r"Object missing required field (\w+)", told):
             raise StudyError(f"{what} lacks {missing[1]}") from None
         reason, _, where = told.partition(" - at $.")
-        at = where or "it"
-        raise StudyError(f"{what}: {at} is {_value(values, where)!r:.60}, {reason[0].lower()}{reason[1:]}") from None
+        name = re.split(r"[.\[]", where)[0]
+        if reason.startswith("Invalid enum value"):
+            reason = f"expected one of {', '.join(_choices(get_type_hints(kind)[name]))}"
+        raise StudyError(f"{what}: {where} is {values[name]!r:.60}, {reason[0].lower()}{reason[1:]}") from None
 
 
-def one_of(value: str, name: str, choices: Iterable[str]) -> None:
-    """See that a word is known.
-
-    Raises:
-        StudyError: it is not.
-    """
-    if value not in choices:
-        raise StudyError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
-
-
-def within(value: int | float, name: str, least: int | float, most: int | float) -> None:
-    """See that a number is in its range.
-
-    Raises:
-        StudyError: it is not.
-    """
-    if not least <= value <= most:
-        raise StudyError(f"{name} is {value}, expected {least} to {most}")
-
-
-def _value(values: Mapping[str, Any], where: str) -> object:
-    return values.get(where.partition("[")[0].partition(".")[0])
+def _choices(hint: Any) -> tuple[str, ...]:  # noqa: ANN401  # whatever annotates a field
+    """The words of a Literal or an enumeration, or of a tuple of them."""
+    one = get_args(hint)[0] if get_origin(hint) is tuple else hint
+    return get_args(one) or tuple(one)

@@ -1,36 +1,90 @@
-"""What a job gives back, where it is kept in the folder of its study, and all of it as one table.
+"""The columns of a study's rows, for those who write them and for those who read them.
 
-study.json            which method tables compare with the others
-jobs/KEY/job.json     what was done, in words; for people
-jobs/KEY/rows.json    its rows; there when the job is finished, or has failed
-jobs/KEY/…            the job's files: pattern.json, paths.npz
-work/KEY/             what a job keeps while it runs, to go on from
-rows.parquet          every row of every job
+A row is one drive over a pattern against the same drive without it; all its numbers but the costs are of driving. A job
+that failed has one row, with its own columns and `error` alone.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
-from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias, TypedDict
 
-from roadproof.errors import StudyError
-from roadproof.io.files import read_json, write_atomically
-from roadproof.study.plan import Job, Study
+from roadproof.datatypes import Event
+from roadproof.driving.evaluation import Trial
+from roadproof.study.plan import Job
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
+Frame: TypeAlias = Any
+"""A pandas DataFrame of rows: pandas, an extra, does not type its own."""
 
-FORMAT = "roadproof-study-rows"
-FORMAT_VERSION = 1
-STUDY_FORMAT = "roadproof-study-run"
-Row: TypeAlias = Mapping[str, str | int | float | bool | None]
 
-JOB_COLUMNS = ("scenario", "kind", "figures", "method", "seed")
-"""Which job a row belongs to; what follows it is `study.job.MEASURED`, and error, empty where all went well."""
+class JobColumns(TypedDict, total=False):
+    """Which job a row belongs to."""
+
+    job: str  # its key: the name of its folder in jobs/
+    scenario: str
+    kind: str  # of the scenario: straight, left or right
+    figures: str  # K, or 1-b for one black figure
+    method: str
+    seed: int
+
+
+class DriveColumns(TypedDict, total=False):
+    """What one drive over a pattern did."""
+
+    weather: str  # of both drives, as "clear-noon"
+    traffic: bool  # whether there were cars and people
+    traffic_seed: int  # of cars and people
+    start_right_m: float  # metres: how far to the right of the scenario's start both drives begin,
+    start_turned_rad: float  # radians: how far turned, left positive,
+    start_faster_mps: float  # metres a second: and how much faster
+    deviation_m: float  # metres: the paper's deviation between the two drives
+    lateral_m: float  # metres: largest offset from the clean path, left positive
+    points: float | None  # the CARLA challenge's infraction points with paint
+    clean_points: float | None  # the same without
+    leaderboard: float | None  # the CARLA Leaderboard's factor with paint, 1 where nothing happened
+    clean_leaderboard: float | None  # the same without
+    first_event_s: float | None  # seconds: when something first went wrong with paint; None where nothing did
+    left_lane: bool  # whether the car left its lane (`driving.evaluation.Trial`)
+    ending: str  # why the painted drive ended
+    events: str  # of the painted drive, those that count, as JSON: kind, seconds, with what or where
+    clean_events: str  # of the clean drive
+
+
+class CostColumns(TypedDict, total=False):
+    """What a job took; the same in all its rows."""
+
+    search_calls: int  # drives before the evaluation: recording, calibration, selection, or one a pattern tried
+    search_seconds: float  # seconds that finding the pattern took
+    evaluation_calls: int  # drives of the evaluation, clean ones included
+    seconds: float  # seconds of the whole job; of an evaluation that was interrupted, only of what was left
+
+
+class Row(JobColumns, DriveColumns, CostColumns, total=False):
+    """A row of rows.parquet."""
+
+    controller: str  # spec of who drove
+    error: str | None  # why the job failed; None where all went well
+
+
+class TransferRow(JobColumns, DriveColumns, total=False):
+    """A row of transfer.parquet: a pattern that was found against one controller, driven by another."""
+
+    found_on: str  # spec of the controller it was found against
+    controller: str  # spec of who drove
+
+
+class JobId(NamedTuple):
+    """A job as people name it."""
+
+    scenario: str
+    figures: str
+    method: str
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.scenario}, K = {self.figures}, {self.method}, seed {self.seed}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +105,10 @@ def failed(job: Job, reason: str) -> JobResult:
     return JobResult(({**job_columns(job), "error": reason},))
 
 
-def job_columns(job: Job) -> dict[str, str | int]:
+def job_columns(job: Job) -> JobColumns:
     """The columns that say which job a row belongs to."""
     return {
+        "job": job.key,
         "scenario": job.scenario.name,
         "kind": str(job.scenario.kind),
         "figures": str(job.figures),
@@ -62,101 +117,28 @@ def job_columns(job: Job) -> dict[str, str | int]:
     }
 
 
-def write_result(job: Job, result: JobResult, folder: Path) -> None:
-    """Keep what came of a job; its rows last, since they say that it is finished.
-
-    Raises:
-        OutputError: it cannot be written.
-        StudyError: a file would leave the job's folder.
-    """
-    place = folder / "jobs" / job.key
-    for name, content in result.files.items():
-        if Path(name).name != name or name in ("rows.json", "job.json"):
-            raise StudyError(f"a job gave a file {name!r}, expected a plain name of its own")
-        write_atomically(place / name, lambda part, content=content: part.write_bytes(content))
-    _write_json(place / "job.json", asdict(job))
-    _write_json(place / "rows.json", {"format": FORMAT, "version": FORMAT_VERSION, "rows": list(result.rows)})
-
-
-def write_study(study: Study, folder: Path) -> None:
-    """Keep what a report cannot know from the jobs.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    _write_json(folder / "study.json", {"format": STUDY_FORMAT, "version": 1, "reference": study.reference})
+def drive_columns(trial: Trial) -> DriveColumns:
+    """The columns of one drive over a pattern."""
+    return {
+        "weather": str(trial.weather),
+        "traffic": trial.traffic,
+        "traffic_seed": trial.seed,
+        "start_right_m": trial.start.right_m,
+        "start_turned_rad": trial.start.turned_rad,
+        "start_faster_mps": trial.start.faster_mps,
+        "deviation_m": trial.deviation_m,
+        "lateral_m": trial.lateral_m,
+        "points": trial.points,
+        "clean_points": trial.clean_points,
+        "leaderboard": trial.leaderboard,
+        "clean_leaderboard": trial.clean_leaderboard,
+        "first_event_s": trial.first_event_s,
+        "left_lane": trial.leaves_lane,
+        "ending": trial.ending,
+        "events": _as_json(trial.events),
+        "clean_events": _as_json(trial.clean_events),
+    }
 
 
-def read_rows(job: Job, folder: Path) -> tuple[Row, ...] | None:
-    """The rows of a job, or None where it has none yet.
-
-    Raises:
-        StudyError: the file is damaged.
-    """
-    path = folder / "jobs" / job.key / "rows.json"
-    if not path.exists():
-        return None
-    rows: list[dict[str, Any]] = read_json(path, FORMAT, FORMAT_VERSION, StudyError)["rows"]
-    return tuple(rows)
-
-
-def is_done(job: Job, folder: Path) -> bool:
-    """Whether a job came to its end; one that failed is not done and is tried again."""
-    rows = read_rows(job, folder)
-    return rows is not None and not any(row.get("error") for row in rows)
-
-
-def write_table(jobs: Iterable[Job], folder: Path) -> DataFrame:
-    """Gather the rows of all jobs that have some, in the jobs' order, and write them as Parquet.
-
-    Raises:
-        StudyError: there is none, or pandas and pyarrow are not installed.
-        OutputError: it cannot be written.
-    """
-    rows = [row for job in jobs for row in read_rows(job, folder) or ()]
-    if not rows:
-        raise StudyError(f"{folder} has no results yet; run the study first")
-    frame = pandas().DataFrame(rows)
-    if "error" not in frame:
-        frame["error"] = None
-    frame["error"] = frame["error"].astype("string")
-    write_atomically(folder / "rows.parquet", lambda part: frame.to_parquet(part, index=False))
-    return frame
-
-
-def read_table(folder: Path, name: str = "rows.parquet") -> DataFrame:
-    """Every row of a study.
-
-    Args:
-        folder: of the study.
-        name: of the table in it; `study transfer` writes transfer.parquet.
-
-    Raises:
-        StudyError: there is none, it is damaged, or pandas and pyarrow are not installed.
-    """
-    path = folder / name
-    if not path.is_file():
-        raise StudyError(f"{folder} has no {name}; run the study first")
-    try:
-        return pandas().read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise StudyError(f"{path} is damaged ({error}); run the study again, finished jobs are kept") from None
-
-
-def records(frame: DataFrame) -> list[dict[str, Any]]:
-    """The rows of a table, each by its columns' names."""
-    return cast("list[dict[str, Any]]", frame.to_dict("records"))
-
-
-def pandas() -> Any:  # noqa: ANN401  # the module
-    """The library for tables, an extra."""
-    try:
-        import_module("pyarrow")  # pandas reads and writes Parquet by it
-        return import_module("pandas")
-    except ImportError as error:
-        raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
-
-
-def _write_json(path: Path, content: object) -> None:
-    text = json.dumps(content, indent=1, default=str, allow_nan=False) + "\n"
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+def _as_json(events: Sequence[Event]) -> str:
+    return json.dumps([(each.kind, each.time_s, each.detail) for each in events])

@@ -9,18 +9,16 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.io.locks import working_in
 from roadproof.memory import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
+from roadproof.study.folder import is_done, write_result, write_study, write_table
 from roadproof.study.plan import Job, Study
-from roadproof.study.rows import JobResult, failed, is_done, write_result, write_study, write_table
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from roadproof.study.rows import Frame, JobResult, failed
 
 Work: TypeAlias = Callable[[Job, Path], JobResult]
 """Does a job; the folder is its own, and holds what a run before this one left there."""
@@ -37,7 +35,7 @@ def run_study(
     workers: int = 1,
     cluster: str | None = None,
     on_job: OnJob = lambda _done, _job, _result: None,
-) -> DataFrame:
+) -> Frame:
     """Do every job that is not done yet, and gather the rows.
 
     A job that fails becomes a row that says why, and the others go on. Killed in the middle, the same call does what

@@ -1,56 +1,40 @@
-"""What came of a study, in a few lines."""
+"""What came of a study, in a few lines for the screen."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from statistics import fmean
-from typing import Any, TypeAlias
-
-Record: TypeAlias = Mapping[str, Any]
+from roadproof.study.rows import Frame, JobId
 
 
-def summary(rows: Iterable[Record]) -> tuple[str, ...]:
+def summary(rows: Frame) -> tuple[str, ...]:
     """A line for each method: means over its jobs, driven alone in the weather the patterns were found in.
 
     Args:
-        rows: of a study, see `study.job`.
+        rows: of the study (`study.rows`).
     """
-    good = [row for row in rows if not _failed(row)]
-    alone = [row for row in good if not row["traffic"] and row["weather"] == good[0]["weather"]]
-    lines: list[str] = []
-    for method in dict.fromkeys(str(row["method"]) for row in alone):
-        own = [row for row in alone if row["method"] == method]
-        deviation_m, calls, seconds = (
-            fmean(float(row[name]) for row in own) for name in ("deviation_m", "search_calls", "search_seconds")
-        )
-        lines.append(
-            f"{method}: {deviation_m:.2f} m deviation, alone in {own[0]['weather']}; found with {calls:.0f} simulator "
-            f"calls in {seconds:.0f} s"
-        )
-    return tuple(lines)
+    good = rows[rows["error"].isna()]
+    if good.empty:
+        return ()
+    home = good["weather"].iloc[0]
+    alone = good[~good["traffic"].astype(bool) & (good["weather"] == home)]
+    numbers = ["deviation_m", "search_calls", "search_seconds"]
+    means = alone.astype(dict.fromkeys(numbers, float)).groupby("method", sort=False)[numbers].mean()
+    return tuple(
+        f"{method}: {deviation_m:.2f} m deviation, alone in {home}; found with {calls:.0f} simulator calls in "
+        f"{seconds:.0f} s"
+        for method, deviation_m, calls, seconds in means.itertuples()
+    )
 
 
-def failures(rows: Iterable[Record]) -> tuple[str, ...]:
+def failures(rows: Frame) -> tuple[str, ...]:
     """A line for each job that failed."""
-    return tuple(
-        f"{row['scenario']}, K = {row['figures']}, {row['method']}, seed {row['seed']}: {row['error']}"
-        for row in rows
-        if _failed(row)
-    )
+    bad = rows[rows["error"].notna()]
+    return tuple(f"{JobId(*job)}: {why}" for *job, why in bad[[*JobId._fields, "error"]].itertuples(index=False))
 
 
-def matrix(rows: Iterable[Record]) -> tuple[str, ...]:
+def transfer_summary(rows: Frame) -> tuple[str, ...]:
     """A line for each method and controller of a transfer: the mean deviation."""
-    found: dict[tuple[str, str, str], list[float]] = {}
-    for row in rows:
-        who = (str(row["method"]), str(row["found_on"]), str(row["controller"]))
-        found.setdefault(who, []).append(float(row["deviation_m"]))
+    means = rows.groupby(["method", "found_on", "controller"], sort=False)["deviation_m"].mean()
     return tuple(
-        f"{method}, found against {found_on}: {fmean(deviations):.2f} m deviation of {controller}"
-        for (method, found_on, controller), deviations in found.items()
+        f"{method}, found against {found_on}: {deviation_m:.2f} m deviation of {controller}"
+        for (method, found_on, controller), deviation_m in means.items()
     )
-
-
-def _failed(row: Record) -> bool:
-    # A table has no text there, or what stands for none.
-    return isinstance(row["error"], str) and bool(row["error"])

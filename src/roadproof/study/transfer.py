@@ -1,11 +1,9 @@
 """Patterns found against one controller, tried on others: does a weakness belong to one network or to many?
 
 FOLDER/transfer/CONTROLLER/SCENARIO/   the drives of every controller, kept, so that the same call goes on
-FOLDER/transfer.parquet                a row for each pattern and controller
+FOLDER/transfer.parquet                a row for each pattern and drive of a controller (`rows.TransferRow`)
 
-Every pattern is driven over alone, in the weather it was found in. Columns: those that tell a job
-(`rows.JOB_COLUMNS`), `found_on`, the controller it was found against, and the ones of driving of `job.MEASURED`, from
-controller to ending.
+Every pattern is driven over alone, in the weather it was found in.
 """
 
 from __future__ import annotations
@@ -13,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from roadproof.controllers import Controller, load_controller
 from roadproof.driving.evaluate import evaluate
@@ -22,12 +19,9 @@ from roadproof.io.files import inside, write_atomically
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.job import measured, start_range
+from roadproof.study.folder import is_done, pandas
 from roadproof.study.plan import Job, Study
-from roadproof.study.rows import Row, is_done, job_columns, pandas
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from roadproof.study.rows import Frame, TransferRow, drive_columns, job_columns
 
 
 def transfer(
@@ -36,7 +30,7 @@ def transfer(
     controllers: Sequence[str],
     *,
     on_pattern: Callable[[int, int], object] = lambda _done, _total: None,
-) -> DataFrame:
+) -> Frame:
     """Drive every controller over the patterns of a study.
 
     Args:
@@ -56,7 +50,7 @@ def transfer(
     if not found:
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
-    rows: list[Row] = []
+    rows: list[TransferRow] = []
     done = 0
     with open_simulator(study.simulator) as world:
         for spec, driver in drivers.items():
@@ -69,7 +63,7 @@ def transfer(
     return frame
 
 
-def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> list[Row]:
+def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> list[TransferRow]:
     place = inside(folder / "transfer" / re.sub(r"[^\w.-]", "_", spec), job.scenario.name, "scenario", ScenarioError)
     evaluation = evaluate(
         world,
@@ -80,9 +74,11 @@ def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controlle
         driver_name=spec,
         weathers=job.weathers[:1],
         starts=job.starts.count,
-        start_range=start_range(job),
+        start_range=job.starts.range,
         runs=0,
         seed=job.seed,
     )
-    told = {**job_columns(job), "found_on": job.controller, "controller": spec}
-    return [{**told, **measured(trial)} for trial in evaluation.trials]
+    return [
+        TransferRow(**job_columns(job), found_on=job.controller, controller=spec, **drive_columns(trial))
+        for trial in evaluation.trials
+    ]

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
+from roadproof.roads.polylines import interpolated
 from roadproof.roads.roadmap import RoadMap
 from roadproof.traffic.agents import NOBODY, Agents
 from roadproof.traffic.tracks import Tracks
@@ -124,7 +125,7 @@ class Pedestrians:
         across = self._map.lanes[other]
         arrives_m = across.length_m * (1.0 - at_m / lane.length_m)
         track, start_m = self._tracks.place[other]
-        there = np.array([np.interp(arrives_m, across.stations_m, across.centre[:, axis]) for axis in range(2)])
+        there = interpolated(arrives_m, across.stations_m, across.centre[:, :2])
         here = np.array([now.x_m[who], now.y_m[who]])
         middle = 0.5 * (here + there)
         apart = np.hypot(car_x - middle[0], car_y - middle[1])

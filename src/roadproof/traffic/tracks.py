@@ -7,6 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from roadproof.roads.polylines import interpolated
 from roadproof.roads.roadmap import RoadMap
 
 SPACING_M = 0.5
@@ -82,12 +83,8 @@ class Tracks:
         stations: list[Float[np.ndarray, " _"]] = [
             np.linspace(0.0, float(line[-1, 0]), n) for line, n in zip(lines, counts, strict=True)
         ]
-        self._x: Float[np.ndarray, " p"] = np.concatenate(
-            [np.interp(s, line[:, 0], line[:, 1]) for s, line in zip(stations, lines, strict=True)]
-        )
-        self._y: Float[np.ndarray, " p"] = np.concatenate(
-            [np.interp(s, line[:, 0], line[:, 2]) for s, line in zip(stations, lines, strict=True)]
-        )
+        points = [interpolated(s, line[:, 0], line[:, 1:]) for s, line in zip(stations, lines, strict=True)]
+        self._x, self._y = np.concatenate(points).T.copy()
         yaws: list[Float[np.ndarray, " _"]] = []
         limits: list[Float[np.ndarray, " _"]] = []
         for first, n, s in zip(self._first.tolist(), counts, stations, strict=True):

@@ -6,6 +6,7 @@ the drives can be filled up later.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,9 +15,8 @@ import numpy as np
 import torch
 
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import act_of
-from roadproof.datatypes import Command, Control, Event, Observation, Weather
-from roadproof.driving.rollout import Policy
+from roadproof.datatypes import Command, Control, Observation, Weather
+from roadproof.driving.rollout import Policy, policy_of, rollout
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
 from roadproof.roads.maps import load_map
@@ -24,10 +24,10 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage
 from roadproof.simulators.town.simulator import TownSimulator
-from roadproof.training.expert import Expert
+from roadproof.training.expert import expert
+from roadproof.training.random_scenarios import Displacement, Disturbance, random_scenario
 from roadproof.training.shards import Shard
-from roadproof.training.ways import Displacement, Knocks, random_scenario
-from roadproof.training.workers import Seat, spread
+from roadproof.training.workers import Worker, spread
 
 STEP_S = 0.1
 FURTHEST_M = 2.6
@@ -45,10 +45,10 @@ class CollectionPlan:
 
     Args:
         drives: how many.
-        seed: of everything: ways, weathers, traffic, knocks, paint.
+        seed: of everything: scenarios, weathers, traffic, disturbances, paint.
         map_name: the map driven on.
         controller: spec of who drives; None is the expert.
-        knocked: share of the drives that are disturbed.
+        disturbed: share of the drives that start beside the lane's middle and are disturbed.
         traffic: share of the drives with others on the road.
         painted: share of the drives with a random pattern on the canvas.
 
@@ -60,14 +60,14 @@ class CollectionPlan:
     seed: int
     map_name: str = "town"
     controller: str | None = None
-    knocked: float = 0.7
+    disturbed: float = 0.7
     traffic: float = 0.4
     painted: float = 0.0
 
     def __post_init__(self) -> None:
         if self.drives < 1:
             raise TrainingError(f"drives is {self.drives}, expected at least 1")
-        for name in ("knocked", "traffic", "painted"):
+        for name in ("disturbed", "traffic", "painted"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
 
@@ -81,7 +81,7 @@ class _Conditions:
     cars: int
     pedestrians: int
     pattern: PatternImage | None
-    knocks: Knocks | None
+    disturbance: Disturbance | None
 
 
 def collect(
@@ -106,7 +106,7 @@ def collect(
     paths = tuple(folder / f"drive-{number:05d}.npz" for number in range(plan.drives))
     missing = [(plan, number, path) for number, path in enumerate(paths) if not path.exists()]
     done = plan.drives - len(missing)
-    for _ in spread(_record, missing, Seat(plan.controller, STEP_S), processes=processes):
+    for _ in spread(_record, missing, Worker(plan.controller, STEP_S), processes=processes):
         done += 1
         if on_drive is not None:
             on_drive(done)
@@ -114,47 +114,62 @@ def collect(
 
 
 def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, controller: Controller | None) -> Shard:
-    """Drive number so-and-so of a plan.
+    """One drive of a plan.
 
     It ends at the goal, after its time, when something is hit, or when the car is too far off for the expert's answer
     to mean anything.
+
+    Args:
+        town: an open simulator.
+        plan: which drives.
+        number: of the drive in the plan.
+        controller: who drives; None is the expert.
     """
     given = _conditions(plan, number)
-    seen = town.reset(
+    rows: list[tuple[Observation, Control, float]] = []
+
+    def driver(town: TownSimulator) -> Policy:
+        expert_of, policy = expert(town), None if controller is None else policy_of(controller, town)
+        still_s, steps = 0.0, itertools.count()
+
+        def drive(seen: Observation) -> Control:
+            nonlocal still_s
+            answer = expert_of(seen)
+            still_s = still_s + town.dt_s if seen.state.speed_mps < 0.1 and answer.throttle == 0.0 else 0.0
+            if still_s <= STILL_S:
+                rows.append((seen, answer, town.place.lateral_m))
+            control = answer if policy is None else policy(seen)
+            return control if given.disturbance is None else given.disturbance.on(control, next(steps))
+
+        return drive
+
+    def is_over(seen: Observation) -> bool:
+        collided = any(event.kind.startswith("collision") for event in seen.events)
+        return collided or abs(town.place.lateral_m) > FURTHEST_M
+
+    rollout(
+        town,
+        driver,
         given.scenario,
         weather=given.weather,
         pattern=given.pattern,
         cars=given.cars,
         pedestrians=given.pedestrians,
         seed=number,
+        until=is_over,
     )
-    expert, policy = Expert(town.route), None if controller is None else _acting(controller)
-    rows: list[tuple[Observation, Control, float]] = []
-    at_m, still_s, step = 0.0, 0.0, 0
-    while not seen.done:
-        place = town.route.locate(seen.state.x_m, seen.state.y_m, at_m if step else None)
-        at_m = place.arclength_m
-        if abs(place.lateral_m) > FURTHEST_M or any(_collided(event) for event in seen.events):
-            break
-        answer = expert.drive(seen.state, town.cars, town.pedestrians)
-        still_s = still_s + town.dt_s if seen.state.speed_mps < 0.1 and answer.throttle == 0.0 else 0.0
-        if still_s <= STILL_S:
-            rows.append((seen, answer, place.lateral_m))
-        control = answer if policy is None else policy(seen)
-        seen = town.step(control if given.knocks is None else given.knocks.on(control, step))
-        step += 1
     return _shard(rows, plan, number, given)
 
 
-def _record(seat: Seat, work: tuple[CollectionPlan, int, Path]) -> None:
+def _record(worker: Worker, work: tuple[CollectionPlan, int, Path]) -> None:
     plan, number, path = work
-    record_drive(seat.town, plan, number, seat.controller).save(path)
+    record_drive(worker.town, plan, number, worker.controller).save(path)
 
 
 def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
     generator = np.random.default_rng([plan.seed, number])
     # First what does not depend on the shares, so that plans that differ in them alone share weathers and numbers.
-    knocked, busy, painted = generator.uniform(size=3) < (plan.knocked, plan.traffic, plan.painted)
+    disturbed, busy, painted = generator.uniform(size=3) < (plan.disturbed, plan.traffic, plan.painted)
     weather = WEATHERS[int(generator.integers(len(WEATHERS)))]
     cars, pedestrians = (int(generator.integers(10, 41)) for _ in range(2))
     scenario = random_scenario(
@@ -163,7 +178,7 @@ def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
         generator,
         name=f"drive-{number:05d}",
         command=COMMANDS[number % len(COMMANDS)],
-        displacement=Displacement() if knocked else None,
+        displacement=Displacement() if disturbed else None,
     )
     steps = int(scenario.time_limit_s / STEP_S) + 2
     return _Conditions(
@@ -172,7 +187,7 @@ def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
         cars=cars if busy else 0,
         pedestrians=pedestrians if busy else 0,
         pattern=_random_paint(generator) if painted else None,
-        knocks=Knocks(steps, STEP_S, generator) if knocked else None,
+        disturbance=Disturbance(steps, STEP_S, generator) if disturbed else None,
     )
 
 
@@ -180,14 +195,6 @@ def _random_paint(generator: np.random.Generator) -> PatternImage:
     space = SearchSpace(figures=int(generator.integers(1, MOST_FIGURES + 1)), family="free")
     draw = torch.Generator().manual_seed(int(generator.integers(2**31)))
     return raster(space.pattern(space.random((), draw)))
-
-
-def _acting(controller: Controller) -> Policy:
-    return lambda seen: act_of(controller, seen.frame, seen.state.speed_mps, int(seen.command))
-
-
-def _collided(event: Event) -> bool:
-    return event.kind.startswith("collision")
 
 
 def _shard(
@@ -206,7 +213,7 @@ def _shard(
             "weather": given.weather,
             "cars": given.cars,
             "pedestrians": given.pedestrians,
-            "knocked": given.knocks is not None,
+            "disturbed": given.disturbance is not None,
             "painted": given.pattern is not None,
         },
     )

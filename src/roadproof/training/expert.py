@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Control, Observation, VehicleState
+from roadproof.roads.polylines import interpolated
 from roadproof.roads.routes import Route
+from roadproof.simulators.protocol import OpenWorld
 from roadproof.traffic.agents import (
     CAR_LENGTH_M,
     CAR_WIDTH_M,
@@ -58,28 +59,8 @@ class Manner:
     sight_m: float = 4.5
 
 
-@runtime_checkable
-class OpenWorld(Protocol):
-    """A simulator that hides nothing of the drive under way; the town is one."""
-
-    @property
-    def route(self) -> Route:
-        """The way to the goal."""
-        ...
-
-    @property
-    def cars(self) -> Agents:
-        """The others now."""
-        ...
-
-    @property
-    def pedestrians(self) -> Agents:
-        """The people now."""
-        ...
-
-
 def expert(world: OpenWorld) -> Callable[[Observation], Control]:
-    """The expert as the driver of a `rollout`: gets in after the reset and drives what is under way."""
+    """The expert as the driver of a `rollout`: made after the reset, it drives what is under way."""
     driver = Expert(world.route)
     return lambda seen: driver.drive(seen.state, world.cars, world.pedestrians)
 
@@ -133,8 +114,8 @@ class Expert:
         route = self._route
         beyond = np.maximum(at - route.length_m, 0.0)
         end = float(route.headings_rad[-1])
-        x = np.interp(at, route.arclengths_m, route.points[:, 0]) + beyond * math.cos(end)
-        y = np.interp(at, route.arclengths_m, route.points[:, 1]) + beyond * math.sin(end)
+        x, y = interpolated(at, route.arclengths_m, route.points[:, :2]).T
+        x, y = x + beyond * math.cos(end), y + beyond * math.sin(end)
         free_m, leader = first_in_way(
             x[None],
             y[None],

@@ -152,16 +152,9 @@ def imitate(
         draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
         batch = data.batch(torch.multinomial(weights, plan.batch, replacement=True, generator=draw), place)
         batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw))
-        mixed = torch.autocast(place.type, torch.bfloat16, enabled=multiplies_bfloat16(place))
-        with seeded(plan.seed * 1_000_003 + step), mixed:
-            answer: ConditionalOutput = network(batch.frames, batch.speed_mps, batch.command)
-        loss = imitation_loss(answer, batch, plan.loss)
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-        optimiser.step()
+        found = _step(network, batch, plan, optimiser, step)
         _average(average, network, min(plan.averaging, (1 + step) / (10 + step)))
-        sums += torch.stack([loss.detach(), (answer.controls[:, 0] - batch.expert[:, 0]).detach().abs().mean()]).cpu()
+        sums += found
         counted += 1
         if (step + 1) % every == 0 or step + 1 == plan.steps:
             if not sums.isfinite().all():
@@ -173,6 +166,22 @@ def imitate(
         if checkpoint is not None and ((step + 1) % every == 0 or step + 1 == plan.steps):
             _keep(checkpoint, plan, step + 1, network, average, optimiser)
     return average
+
+
+def _step(
+    network: Learner, batch: Batch, plan: TrainingPlan, optimiser: torch.optim.Optimizer, step: int
+) -> Float[Tensor, "2"]:
+    """Learn from one batch; its loss and its error of steering."""
+    device = batch.frames.device
+    mixed = torch.autocast(device.type, torch.bfloat16, enabled=multiplies_bfloat16(device))
+    with seeded(plan.seed * 1_000_003 + step), mixed:
+        answer: ConditionalOutput = network(batch.frames, batch.speed_mps, batch.command)
+    loss = imitation_loss(answer, batch, plan.loss)
+    optimiser.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+    optimiser.step()
+    return torch.stack([loss.detach(), (answer.controls[:, 0] - batch.expert[:, 0]).detach().abs().mean()]).cpu()
 
 
 def imitation_loss(answer: ConditionalOutput, batch: Batch, weights: LossWeights) -> Float[Tensor, ""]:

@@ -38,7 +38,11 @@ FORMAT_VERSION = 1
 NETWORKS = ("cil", "pilotnet")
 
 OnStage = Callable[[str, int, int, str], object]
-"""Told of a stage's name, how much of it is done, of how much, and a word about it."""
+"""Called with a stage's name, how much of it is done, of how much, and a word about it."""
+
+
+def _unwatched(stage: str, done: int, total: int, word: str) -> None:
+    del stage, done, total, word
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,7 +52,7 @@ class Recipe:
     Args:
         network: "cil" or "pilotnet" (the conditional one).
         width: CIL's factor on channels and units.
-        seed: of ways, traffic, knocks, weights, batches.
+        seed: of scenarios, traffic, disturbances, weights, batches.
         start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
         drives: of the expert.
         painted_drives: of the expert over random paint, besides.
@@ -110,7 +114,7 @@ class Recipe:
             drives=self.round_drives,
             seed=self.seed + 1000 * number,
             controller=str(controller),
-            knocked=0.5,
+            disturbed=0.5,
             painted=0.5 if self.painted_drives else 0.0,
         )
 
@@ -125,7 +129,7 @@ class Recipe:
         )
 
 
-def gather(recipe: Recipe, folder: Path, *, processes: int = 1, on_stage: OnStage | None = None) -> list[Path]:
+def gather(recipe: Recipe, folder: Path, *, processes: int = 1, on_stage: OnStage = _unwatched) -> list[Path]:
     """Record the expert's drives of a recipe; what can be done on another machine than the training.
 
     Returns:
@@ -144,7 +148,7 @@ def gather(recipe: Recipe, folder: Path, *, processes: int = 1, on_stage: OnStag
 
 
 def follow(
-    recipe: Recipe, folder: Path, *, processes: int = 1, device: str = "cpu", on_stage: OnStage | None = None
+    recipe: Recipe, folder: Path, *, processes: int = 1, device: str = "cpu", on_stage: OnStage = _unwatched
 ) -> Path:
     """Carry a recipe out, as far as the folder does not hold it yet.
 
@@ -153,7 +157,7 @@ def follow(
         folder: where everything is kept.
         processes: how many simulators drive at once.
         device: what the network learns on.
-        on_stage: told how far it is.
+        on_stage: called with how far it is.
 
     Returns:
         The controller's weights file.
@@ -176,14 +180,10 @@ def follow(
     return weights
 
 
-def _collected(
-    plan: CollectionPlan, folder: Path, title: str, processes: int, on_stage: OnStage | None
-) -> tuple[Path, ...]:
-    def told(done: int) -> None:
-        if on_stage is not None:
-            on_stage(title, done, plan.drives, "drives")
-
-    return collect(plan, folder, processes=processes, on_drive=told)
+def _collected(plan: CollectionPlan, folder: Path, title: str, processes: int, on_stage: OnStage) -> tuple[Path, ...]:
+    return collect(
+        plan, folder, processes=processes, on_drive=lambda done: on_stage(title, done, plan.drives, "drives")
+    )
 
 
 def _trained(
@@ -193,17 +193,12 @@ def _trained(
     shards: list[Path],
     path: Path,
     device: str,
-    on_stage: OnStage | None,
+    on_stage: OnStage,
 ) -> None:
     if path.exists():
         return
     plan = recipe.training_plan(number)
     title = "Learning from the expert" if number == 0 else f"Round {number}, learning"
-
-    def told(step: int, steps: int, loss: float) -> None:
-        if on_stage is not None:
-            on_stage(title, step, steps, f"loss {loss:.4f}")
-
     checkpoint = path.with_suffix(".ckpt")
     learnt = imitate(
         start(),
@@ -211,7 +206,7 @@ def _trained(
         plan,
         checkpoint=checkpoint,
         device=device,
-        on_progress=lambda at: told(at.step, at.steps, at.loss),
+        on_progress=lambda at: on_stage(title, at.step, at.steps, f"loss {at.loss:.4f}"),
     )
     save_controller(learnt, path)
     checkpoint.unlink(missing_ok=True)

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import act_of
-from roadproof.datatypes import Event, Observation, Weather
-from roadproof.driving.rollout import Policy
+from roadproof.datatypes import Ending, Event, Observation, Weather
+from roadproof.driving.rollout import rollout
 from roadproof.roads.routes import Crossing
 from roadproof.scenarios import Scenario
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
-from roadproof.training.workers import Seat, spread
+from roadproof.training.workers import Worker, spread
 
 STEP_S = 0.05
 ASTRAY_M = 6.0
@@ -91,7 +90,7 @@ def score_drives(
     Raises:
         ControllerError: the controller cannot be loaded, or does not fit the simulator.
     """
-    return spread(_score, trials, Seat(spec, STEP_S), processes=processes)
+    return spread(_score, trials, Worker(spec, STEP_S), processes=processes)
 
 
 def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial) -> DrivingScore:
@@ -102,54 +101,49 @@ def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial
         controller: who drives; None is the expert.
         trial: what to drive.
     """
-    seen = town.reset(
-        trial.scenario, weather=trial.weather, cars=trial.cars, pedestrians=trial.pedestrians, seed=trial.seed
-    )
-    policy = expert(town) if controller is None else _acting(controller)
     alone = trial.cars + trial.pedestrians == 0
-    events, steers = list(seen.events), list[float]()
-    at, aside = np.zeros(0), np.zeros(0)
-    failed_at: tuple[float, float] | None = None
-    place = town.route.locate(seen.state.x_m, seen.state.y_m)
-    track = [(place.arclength_m, abs(place.lateral_m))]
-    while not (seen.done or track[-1][1] > ASTRAY_M or (alone and events)):
-        control = policy(seen).clipped()
-        steers.append(control.steer)
-        seen = town.step(control)
-        events += seen.events
-        place = town.route.locate(seen.state.x_m, seen.state.y_m, track[-1][0])
-        track.append((place.arclength_m, abs(place.lateral_m)))
-        if events and failed_at is None:
-            failed_at = _where(seen)
+    track: list[tuple[float, float]] = []
+    events: list[Event] = []
+
+    def is_over(seen: Observation) -> bool:
+        track.append((town.place.arclength_m, abs(town.place.lateral_m)))
+        events.extend(seen.events)
+        return not seen.done and (track[-1][1] > ASTRAY_M or (alone and bool(events)))
+
+    drive = rollout(
+        town,
+        expert if controller is None else controller,
+        trial.scenario,
+        weather=trial.weather,
+        cars=trial.cars,
+        pedestrians=trial.pedestrians,
+        seed=trial.seed,
+        until=is_over,
+    )
     at, aside = np.array(track).T
-    arrived = seen.done and seen.time_s < trial.scenario.time_limit_s - 0.5 * town.dt_s
+    arrived = drive.ending is Ending.GOAL_REACHED
     reached = [crossing for crossing in town.route.crossings if at.max() > crossing.enters_m]
+    failed = int(np.searchsorted(drive.time_s, events[0].time_s)) if events else -1
     return DrivingScore(
         arrived=arrived,
-        events=tuple(events),
-        seconds=seen.time_s,
+        events=drive.events,
+        seconds=float(drive.time_s[-1]),
         lateral_m=float(aside.max()),
         mean_lateral_m=float(aside.mean()),
-        steer_change=float(np.abs(np.diff(steers)).mean()) if len(steers) > 1 else 0.0,
+        steer_change=float(np.abs(np.diff(drive.steer)).mean()) if len(drive.steer) > 1 else 0.0,
         turns=len(reached),
         turns_taken=sum(_taken(crossing, at, aside, arrived) for crossing in reached),
-        failed_at_m=failed_at if events or arrived else _where(seen),
+        failed_at_m=(round(float(drive.x_m[failed]), 1), round(float(drive.y_m[failed]), 1))
+        if events or not arrived
+        else None,
     )
 
 
-def _score(seat: Seat, trial: Trial) -> DrivingScore:
-    return score_drive(seat.town, seat.controller, trial)
-
-
-def _acting(controller: Controller) -> Policy:
-    return lambda seen: act_of(controller, seen.frame, seen.state.speed_mps, int(seen.command))
+def _score(worker: Worker, trial: Trial) -> DrivingScore:
+    return score_drive(worker.town, worker.controller, trial)
 
 
 def _taken(crossing: Crossing, at: np.ndarray, aside: np.ndarray, arrived: bool) -> bool:
     """Whether the car came out of a junction on its route; one in which the route ends counts when it arrived."""
     beyond = at >= crossing.leaves_m - 1.0
     return bool((aside[beyond] < TAKEN_M).any()) if beyond.any() else arrived
-
-
-def _where(seen: Observation) -> tuple[float, float]:
-    return round(seen.state.x_m, 1), round(seen.state.y_m, 1)

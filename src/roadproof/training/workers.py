@@ -19,11 +19,11 @@ Work = TypeVar("Work")
 Result = TypeVar("Result")
 
 
-class Seat:
+class Worker:
     """What a process drives with: a simulator and a controller, each made when first wanted and then kept.
 
     Args:
-        controller_spec: of the controller; None leaves the seat without one.
+        controller_spec: of the controller, or None for none.
         dt_s: seconds per step of the simulator.
     """
 
@@ -49,14 +49,14 @@ class Seat:
 
 
 def spread(
-    function: Callable[[Seat, Work], Result], works: Sequence[Work], seat: Seat, *, processes: int
+    function: Callable[[Worker, Work], Result], works: Sequence[Work], worker: Worker, *, processes: int
 ) -> Iterator[tuple[Work, Result]]:
     """Call a function for every piece of work, in as many processes as asked for; one means this one.
 
     Args:
-        function: a module's own function; it gets the seat of its process and a piece of work.
+        function: a module's own function; it gets the worker of its process and a piece of work.
         works: the pieces; they travel between processes.
-        seat: the pattern of every process' seat; must be unused so far.
+        worker: what every process gets a copy of; must be unused so far.
         processes: how many at once.
 
     Yields:
@@ -68,11 +68,11 @@ def spread(
     if processes <= 1 or len(works) <= 1:
         try:
             for work in works:
-                yield work, function(seat, work)
+                yield work, function(worker, work)
         finally:
-            seat.close()
+            worker.close()
         return
-    with processes_beside(min(processes, len(works)), _sit_down, seat) as pool:
+    with processes_beside(min(processes, len(works)), _begin, worker) as pool:
         waiting = {pool.submit(_call, function, work): work for work in works}
         try:
             for future in as_completed(waiting):
@@ -83,15 +83,15 @@ def spread(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-_seat: Seat | None = None
+_worker: Worker | None = None
 
 
-def _sit_down(seat: Seat) -> None:
-    global _seat  # one seat a process, made by its initialiser
-    _seat = seat
+def _begin(worker: Worker) -> None:
+    global _worker  # one a process, made by its initialiser
+    _worker = worker
     torch.set_num_threads(1)
 
 
-def _call(function: Callable[[Seat, Work], Result], work: Work) -> Result:
-    assert _seat is not None
-    return function(_seat, work)
+def _call(function: Callable[[Worker, Work], Result], work: Work) -> Result:
+    assert _worker is not None
+    return function(_worker, work)

@@ -8,22 +8,19 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import free_port, serving
+from carla_serving import CAMERA, INPUT, free_port, serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
-from roadproof.geometry import CameraModel, CropResize
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import load_scenarios
 from roadproof.simulators.carla.doctor import examine
 from roadproof.simulators.carla.places import scenario_between, straight_stretch
 from roadproof.simulators.carla.simulator import CarlaSimulator
 
-CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)
 ALL = [
     "connection",
     "map",
@@ -56,7 +53,7 @@ def test_a_sound_server_is_found_sound(port):
     assert tuple(told) == findings.checks
     assert "native: squares are seen within" in str(findings)
     assert "differ by up to 0.000 m and 0.00 levels" in str(findings)
-    assert str(findings).endswith("everything works")
+    assert str(findings).endswith("all checks passed")
 
 
 @pytest.mark.slow

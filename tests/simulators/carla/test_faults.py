@@ -1,6 +1,7 @@
 """What becomes of a drive, its recordings and the server when one of the two ends dies or hangs."""
 
 import contextlib
+import dataclasses
 import os
 import signal
 import subprocess
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import serving
+from carla_serving import SMALL, SMALL_INPUT, serving
+from carla_serving import STREET as WHOLE_STREET
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
@@ -23,18 +25,13 @@ import carla
 from roadproof.datatypes import Control, VehicleState
 from roadproof.drives import Swerve, Trajectories, Window, load_drives, record
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
-from roadproof.scenarios import Scenario, save_scenarios
+from roadproof.geometry import CanvasPlacement
+from roadproof.scenarios import save_scenarios
 from roadproof.simulators.carla.simulator import CarlaSimulator
 
-SMALL = CameraModel(width_px=80, height_px=60, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-SMALL_INPUT = CropResize(left_px=0, top_px=12, right_px=80, bottom_px=51, width_px=80, height_px=39)
-STREET = Scenario(
-    name="street",
-    kind="straight",
-    map_name="street",
+STREET = dataclasses.replace(
+    WHOLE_STREET,
     start=VehicleState(25.0, -1.75, 0.0, 0.0, 6.0),
-    goal_m=(140.0, -1.75),
     canvas=CanvasPlacement(x_m=45.0, y_m=0.0, width_m=6.0),
     time_limit_s=3.0,
 )

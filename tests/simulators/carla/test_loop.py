@@ -22,7 +22,7 @@ pytest.importorskip("carla", reason="CARLA's client is not installed: pip instal
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 from roadproof.attacks import GradOpt, SteeringShift
-from roadproof.calibration import load_report
+from roadproof.calibration import CalibrationReport
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
@@ -121,7 +121,7 @@ def figures(direct, served):
         "painted_apart_m": apart_m(direct.painted, served.painted),
     }
     for name, side in (("direct", direct), ("served", served)):
-        report = load_report(side.folder / "calibration" / "report.json")
+        report = CalibrationReport.load(side.folder / "calibration" / "report.json")
         found |= {f"{name}_{key}": value for key, value in dataclasses.asdict(side.fidelity.agreement).items()}
         found |= {
             f"{name}_residual_px": max(drive.residual_px.mean for drive in report.drives),
@@ -149,7 +149,7 @@ def test_a_controller_drives_the_bare_road_as_it_does_in_the_town(sides):
 def test_recordings_are_calibrated_as_well_as_in_the_town(sides):
     # 0.29 px in the town and 0.15 px here from what was seen, 0.30 and 0.03 from what the simulators state.
     for side, residual_px, stated_px in zip(sides, (0.6, 0.3), (0.6, 0.1), strict=True):
-        for drive in load_report(side.folder / "calibration" / "report.json").drives:
+        for drive in CalibrationReport.load(side.folder / "calibration" / "report.json").drives:
             assert drive.frames == BUDGET.window.frames
             assert drive.residual_px.mean < residual_px
             assert drive.stated_px.mean < stated_px

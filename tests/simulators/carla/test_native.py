@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import serving
+from carla_serving import CAMERA, INPUT, serving
+from carla_serving import STREET as WHOLE_STREET
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
@@ -15,9 +16,8 @@ from roadproof.datatypes import Control, VehicleState
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import rollout
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
+from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.roads.maps import load_map
-from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL
 from roadproof.simulators.carla.native import Ground, find_ground, texture_of
 from roadproof.simulators.carla.session import Session
@@ -27,17 +27,7 @@ from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import PaintKind
 
-CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)
-STREET = Scenario(
-    name="street",
-    kind="straight",
-    map_name="street",
-    start=VehicleState(25.0, -1.75, 0.0, 0.0, 0.0),
-    goal_m=(140.0, -1.75),
-    canvas=CanvasPlacement(x_m=50.0, y_m=0.0, width_m=6.0),
-    time_limit_s=30.0,
-)
+STREET = dataclasses.replace(WHOLE_STREET, start=VehicleState(25.0, -1.75, 0.0, 0.0, 0.0))
 # A server on which no texture ever changes, as where a road's material has no parameter of the right name.
 DEAF = """
 from roadproof.simulators.carla_server import world

@@ -6,33 +6,19 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import serving
+from carla_serving import SMALL, SMALL_INPUT, STREET, serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 import carla
 
-from roadproof.datatypes import Control, EventKind, VehicleState
+from roadproof.datatypes import Control, EventKind
 from roadproof.driving.infractions import infraction_points
 from roadproof.driving.rollout import rollout
-from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
-from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.session import Session
 from roadproof.simulators.carla.signals import trigger_volume
 from roadproof.simulators.carla.simulator import CarlaSimulator
-
-SMALL = CameraModel(width_px=80, height_px=60, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-SMALL_INPUT = CropResize(left_px=0, top_px=12, right_px=80, bottom_px=51, width_px=80, height_px=39)
-STREET = Scenario(
-    name="street",
-    kind="straight",
-    map_name="street",
-    start=VehicleState(20.0, -1.75, 0.0, 0.0, 0.0),
-    goal_m=(140.0, -1.75),
-    canvas=CanvasPlacement(x_m=50.0, y_m=0.0, width_m=6.0),
-    time_limit_s=30.0,
-)
 
 # Along the street's right lane, whose middle is y = 1.75 in CARLA's world, stand a light at 45 m that is red, one at
 # 60 m that is green, one at 75 m that turns red 7.5 s after the lights were set back, and a stop sign at 90 m. A red

@@ -13,36 +13,21 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import free_port, serving
+from carla_serving import CAMERA, INPUT, SMALL, SMALL_INPUT, STREET, free_port, serving
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 import carla
 
-from roadproof.datatypes import Control, EventKind, VehicleState, Weather
+from roadproof.datatypes import Control, EventKind, Weather
 from roadproof.errors import ScenarioError, SimulatorError
-from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
-from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
 
-CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)
-SMALL = CameraModel(width_px=80, height_px=60, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-SMALL_INPUT = CropResize(left_px=0, top_px=12, right_px=80, bottom_px=51, width_px=80, height_px=39)
-STREET = Scenario(
-    name="street",
-    kind="straight",
-    map_name="street",
-    start=VehicleState(20.0, -1.75, 0.0, 0.0, 0.0),
-    goal_m=(140.0, -1.75),
-    canvas=CanvasPlacement(x_m=50.0, y_m=0.0, width_m=6.0),
-    time_limit_s=30.0,
-)
 AHEAD = Control(0.0, throttle=0.6)
 
 

@@ -10,7 +10,7 @@ from roadproof.driving.infractions import counted, infraction_points
 from roadproof.driving.rollout import rollout
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import builtin_scenarios, find_scenario
-from roadproof.simulators.tracker.endings import BLOCKED_S, STANDS_S, Endings
+from roadproof.simulators.tracker.judge import BLOCKED_S, STANDS_S, Endings
 
 SCENARIO = find_scenario("left-03", builtin_scenarios())
 ROUTE = scenario_route(SCENARIO, load_map(SCENARIO.map_name))

@@ -1,4 +1,4 @@
-"""The car, the other cars and the people, between the town's world and CARLA's.
+"""The car, what it hits, the other cars and the people, between the town's world and CARLA's.
 
 Convention:
     CARLA's world is left-handed: y and yaw change their sign. A walker's place is its middle, a car's the ground.
@@ -7,10 +7,12 @@ Convention:
 from __future__ import annotations
 
 import math
+import queue
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.tracker.judge import Contact
 from roadproof.traffic.agents import Agents
 from roadproof.traffic.traffic import Traffic
 
@@ -128,6 +130,38 @@ class Crowd:
         for actor in self._session.ask(what, lambda: self._session.world.get_actors(ids)) if ids else ():
             self._session.keep(actor)
         return ids
+
+
+class Collisions:
+    """The collision sensor on the car; the session keeps it until the end of the drive."""
+
+    def __init__(self, session: Session, ego: carla.Actor) -> None:
+        self._session = session
+        self._hits: queue.SimpleQueue[carla.CollisionEvent] = queue.SimpleQueue()
+        blueprint = session.library().find("sensor.other.collision")
+        sensor = session.ask(
+            "a collision sensor", lambda: session.world.spawn_actor(blueprint, carla.Transform(), attach_to=ego)
+        )
+        assert isinstance(sensor, carla.Sensor)
+        session.keep(sensor)
+        sensor.listen(self._hits.put)
+
+    def contacts(self, crowd: Crowd | None) -> list[Contact]:
+        """What was hit since the last call, people aside: where they are is known, and the judge looks there."""
+        found: dict[str, Contact] = {}
+        while not self._hits.empty():
+            hit = self._hits.get_nowait()
+            # The server is asked who that is.
+            other = self._session.ask("what was hit", lambda hit=hit: hit.other_actor)
+            if other.type_id.startswith("walker."):
+                continue
+            index = None if crowd is None else crowd.car_index(other.id)
+            if not other.type_id.startswith("vehicle."):
+                contact = Contact("static", other.type_id)
+            else:
+                contact = Contact("vehicle", f"{other.type_id} {other.id}" if index is None else f"car {index}")
+            found[contact.name] = contact
+        return [found[name] for name in sorted(found)]
 
 
 def _place(agents: Agents, i: int, up_m: float) -> carla.Transform:

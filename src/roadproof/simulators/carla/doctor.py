@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from roadproof.datatypes import Control, Observation, VehicleState
-from roadproof.errors import RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL, may_show
 from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch
 from roadproof.simulators.carla.simulator import CarlaSimulator
-from roadproof.simulators.checks import Check, check_simulator
+from roadproof.simulators.checks import BrokenPromiseError, Check, SimulatorReport, check_simulator, checked
 from roadproof.simulators.protocol import PaintKind
 
 STRETCH_M, CANVAS_AT_M = 60.0, 30.0
@@ -25,75 +23,47 @@ AHEAD = Control(0.0, throttle=0.6)
 COLOURS = ((200, 40, 40), (40, 180, 40), (50, 60, 200), (220, 220, 220))
 
 
-@dataclass(frozen=True, slots=True)
-class Findings:
-    """What `examine` found, in order."""
-
-    where: str
-    checks: tuple[Check, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Everything works."""
-        return all(check.passed for check in self.checks)
-
-    def __str__(self) -> str:
-        lines = [f"{'ok  ' if check.passed else 'BAD '} {check.name}: {check.detail}" for check in self.checks]
-        bad = sum(not check.passed for check in self.checks)
-        verdict = "everything works" if not bad else f"{bad} of {len(self.checks)} do not work"
-        return "\n".join([f"CARLA server at {self.where}", *lines, verdict])
-
-
-def examine(simulator: CarlaSimulator, told: Callable[[Check], object] = lambda _: None) -> Findings:
+def examine(simulator: CarlaSimulator, on_check: Callable[[Check], object] = lambda _: None) -> SimulatorReport:
     """Drive a server, not yet connected, over a straight stretch of the map it has loaded.
 
     Args:
         simulator: not yet entered.
-        told: of each finding as it is made.
+        on_check: called with each check as it is made.
 
     Returns:
-        Findings on connection, map, pictures, speed, repeatability, road, paint, native paint, traffic and clean-up.
-        Whatever goes wrong is a finding; only what cannot be done without it is left out.
+        Checks of connection, map, pictures, speed, repeatability, road, paint, native paint, traffic and clean-up.
+        Whatever goes wrong is a failed check; only what cannot be done without it is left out.
     """
     checks: list[Check] = []
 
     def found(name: str, look: Callable[[], str]) -> bool:
-        try:
-            check = Check(name, True, look())
-        except _Bad as bad:
-            check = Check(name, False, str(bad))
-        except RoadproofError as error:
-            check = Check(name, False, str(error))
+        check = checked(name, look)
         checks.append(check)
-        told(check)
+        on_check(check)
         return check.passed
 
-    patient = _Patient(simulator)
+    server = _Examination(simulator)
     try:
-        if found("connection", patient.connection) and found("map", patient.map):
+        if found("connection", server.connection) and found("map", server.map):
             for name, look in (
-                ("pictures", patient.pictures),
-                ("speed", patient.speed),
-                ("repeatability", patient.repeatability),
-                ("road", patient.road),
-                ("paint", patient.paint),
-                ("native paint", patient.native),
-                ("traffic", patient.traffic),
+                ("pictures", server.pictures),
+                ("speed", server.speed),
+                ("repeatability", server.repeatability),
+                ("road", server.road),
+                ("paint", server.paint),
+                ("native paint", server.native),
+                ("traffic", server.traffic),
             ):
                 found(name, look)
     finally:
         simulator.__exit__(None, None, None)
-    if patient.connected:
-        found("clean-up", patient.clean_up)
-    return Findings(simulator.where, tuple(checks))
+    if server.connected:
+        found("clean-up", server.clean_up)
+    return SimulatorReport(tuple(checks))
 
 
-class _Bad(Exception):  # noqa: N818 - a finding, not an error
-    """Something does not work; the message says what was seen."""
-
-
-class _Patient:
-    """The server under examination; each method returns what it saw or raises `_Bad`."""
+class _Examination:
+    """The checks of a server; each method returns what it saw or raises `BrokenPromiseError`."""
 
     def __init__(self, simulator: CarlaSimulator) -> None:
         self._simulator = simulator
@@ -127,9 +97,7 @@ class _Patient:
         report = check_simulator(
             self._simulator, self.scenario, steps=STEPS, only=("observation", "picture", "start", "clock", "units")
         )
-        for check in report.checks:
-            if not check.passed:
-                raise _Bad(f"{check.name}: {check.detail}")
+        report.require()
         return "frames fit their pictures; start, clock and units are right"
 
     def speed(self) -> str:
@@ -157,18 +125,18 @@ class _Patient:
             & (np.arange(len(scene.asphalt)) > 0.6 * len(scene.asphalt))[:, None]
         )
         if here.sum() < 100:
-            raise _Bad("the semantic camera sees no road ahead; paint will not show. Is the server 0.9.14 or newer?")
+            raise BrokenPromiseError(
+                "the semantic camera sees no road ahead; paint will not show. Is the server 0.9.14 or newer?"
+            )
         height, level = float(np.median(scene.height_m[here])), float(scene.picture[here].mean()) / 255
         if abs(height) > 0.1:
-            raise _Bad(f"the road is {height:+.2f} m from the plane of the canvas; paint will not show")
+            raise BrokenPromiseError(f"the road is {height:+.2f} m from the plane of the canvas; paint will not show")
         return f"{height:+.3f} m from the plane of the canvas, level {level:.2f} (full light: {ASPHALT_LEVEL})"
 
     def paint(self) -> str:
         only = ("homography", "paint", "transparency", "colours")
         report = check_simulator(self._simulator, self.scenario, steps=STEPS, only=only)
-        for check in report.checks:
-            if not check.passed:
-                raise _Bad(f"{check.name}: {check.detail}")
+        report.require()
         return f"{self._simulator.paint}: {report.checks[1].detail}; {report.checks[3].detail}"
 
     def native(self) -> str:
@@ -210,7 +178,7 @@ class _Patient:
             session = again.session
             left = {actor.id for actor in session.ask("its actors", session.world.get_actors)} - self._before
         if left:
-            raise _Bad(f"{len(left)} actors are left")
+            raise BrokenPromiseError(f"{len(left)} actors are left")
         return "nothing is left, settings are put back"
 
     def _drive(self) -> list[Observation]:

@@ -51,19 +51,8 @@ WalkerControl: TypeAlias = tuple[tuple[Level, Level, Level], Mps, bool]
 """Direction, m/s, jump."""
 
 Weather: TypeAlias = Annotated[tuple[Number, ...], Meta(min_length=14, max_length=14)]
-Settings: TypeAlias = tuple[
-    bool,
-    bool,
-    Annotated[list[bool | Number], Meta(max_length=2)],
-    bool,
-    Number,
-    Int32,
-    Number,
-    bool,
-    Number,
-    Number,
-    bool,
-]
+FixedStep: TypeAlias = Annotated[list[bool | Number], Meta(max_length=2)]
+Settings: TypeAlias = tuple[bool, bool, FixedStep, bool, Number, Int32, Number, bool, Number, Number, bool]
 Side: TypeAlias = Annotated[int, Meta(ge=0, le=2**16)]
 Texture: TypeAlias = tuple[Side, Side, list[tuple[Byte, Byte, Byte, Byte]]]
 """Width, height, and RGBA row by row."""

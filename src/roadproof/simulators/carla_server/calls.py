@@ -36,7 +36,7 @@ from roadproof.simulators.carla_server.arguments import (
     WirePose,
     read,
 )
-from roadproof.simulators.carla_server.places import spawn_points
+from roadproof.simulators.carla_server.pieces import spawn_points
 from roadproof.simulators.carla_server.requests import Request
 from roadproof.simulators.carla_server.sensors import check_camera
 from roadproof.simulators.carla_server.wire import DONE, ORIGIN, WORLD_STREAM, Value, granted, refused

@@ -1,4 +1,4 @@
-"""The pieces of road that clients can paint, each by the name of its object.
+"""What a map has for clients: spawn points, and pieces of road that can be painted, by the names of their objects.
 
 Convention:
     A piece's picture covers it once. How it lies there differs from piece to piece, as it does in CARLA's own towns, so
@@ -16,7 +16,9 @@ from PIL import Image
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.roads.roadmap import RoadMap
+from roadproof.simulators.carla_server.wire import Pose6
 
+SPAWN_EVERY_M, SPAWN_UP_M = 15.0, 0.3
 PIECE_M = 20.0
 STRAIGHT_RAD = 0.02
 TURNS = 4
@@ -64,7 +66,7 @@ def road_pieces(map_name: str, roads: RoadMap) -> tuple[Piece, ...]:
             if not inside.any() or float(np.ptp(lane.headings_rad[inside])) > STRAIGHT_RAD:
                 continue
             middle = begin + PIECE_M / 2
-            x, y, z = (float(np.interp(middle, lane.stations_m, lane.centre[:, axis])) for axis in range(3))
+            x, y, z, _ = lane.at(middle)
             heading = float(lane.headings_rad[inside].mean())
             left_m = (width_m - lane.width_m) / 2
             placement = CanvasPlacement(
@@ -78,3 +80,15 @@ def road_pieces(map_name: str, roads: RoadMap) -> tuple[Piece, ...]:
             number = len(pieces)
             pieces.append(Piece(f"Road_Road_{map_name}_{number}", placement, number % TURNS, number % 2 == 1))
     return tuple(pieces)
+
+
+def spawn_points(roads: RoadMap) -> list[Pose6]:
+    """Places along the driving lanes, outside of junctions."""
+    places: list[Pose6] = []
+    for lane in roads.lanes:
+        if lane.kind != "driving" or lane.junction is not None:
+            continue
+        for k in range(int(lane.length_m // SPAWN_EVERY_M)):
+            x, y, z, heading = lane.at((k + 0.5) * SPAWN_EVERY_M)
+            places.append((x, -y, z + SPAWN_UP_M, 0.0, -math.degrees(heading), 0.0))
+    return places

@@ -12,10 +12,9 @@ from roadproof.geometry import CameraModel
 from roadproof.roads.roadmap import RoadMap, Surface
 from roadproof.simulators.town.engine import Node, Path, Texture, core
 from roadproof.simulators.town.ground import LitGround
-from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.meshes import MeshBuilder
 from roadproof.simulators.town.models import PAINTS, Body, car, person
-from roadproof.simulators.town.shading import mesh_node, shaded, turned
+from roadproof.simulators.town.shading import Layer, dress, mesh_node, shaded, turned
 from roadproof.simulators.town.streets import KERB_M
 from roadproof.traffic.agents import NOBODY, Agents
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import UInt8
 
-from roadproof.simulators.town.meshes import Mesh, MeshBuilder
+from roadproof.simulators.town.meshes import Mesh, MeshBuilder, lofted
 from roadproof.simulators.town.shading import rgba
 from roadproof.simulators.town.weather import Sky
 
@@ -23,12 +23,8 @@ def dome() -> tuple[Mesh, UInt8[np.ndarray, "n 4"]]:
     a, e = np.meshgrid(azimuth, elevation)
     points = SKY_M * np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1).reshape(-1, 3)
     uv = np.stack([a / (2 * math.pi), 0.002 + 0.996 * np.clip(e, 0, None) / (math.pi / 2)], axis=-1).reshape(-1, 2)
-    i, j = np.meshgrid(np.arange(up), np.arange(around), indexing="ij")
-    first = (i * (around + 1) + j).ravel()
-    above = first + around + 1
-    triangles = np.concatenate([np.stack([first, first + 1, above + 1], -1), np.stack([first, above + 1, above], -1)])
     n = len(points)
-    mesh = Mesh(points.round(4), np.zeros((n, 3)), uv.round(5), np.ones((n, 3)), triangles)
+    mesh = Mesh(points.round(4), np.zeros((n, 3)), uv.round(5), np.ones((n, 3)), lofted(up + 1, around))
     return mesh, np.full((n, 4), 255, np.uint8)
 
 

@@ -12,7 +12,7 @@ from roadproof.datatypes import VehicleState
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.simulators.town.canvas import COARSEST, NEAREST_M, PATCH_PX, Raster, RoadPatch, copies, reductions_for
 from roadproof.simulators.town.engine import VERTEX, Path, Texture, fill_texture, make_node, make_texture, refill_node
-from roadproof.simulators.town.layers import Layer, dress
+from roadproof.simulators.town.shading import Layer, dress
 
 PIECE_CORNERS = 12
 # The renderer interpolates between the texel hit and the one before it: half a texel too late.

@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageChops, ImageDraw, ImageFilter
+from scipy.spatial import ConvexHull
 
 from roadproof.roads.lanes import Lane
 from roadproof.roads.roadmap import RoadMap
@@ -294,8 +295,8 @@ def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> 
     run = -sun[:2] / sun[2]
     for solid in scenery.solids:
         if solid.casts_shadow:
-            base = solid.corners
-            pen.polygon(canvas.points(_hull(np.concatenate([base, base + run * solid.height_m]))), fill=255)
+            ends = np.concatenate([solid.corners, solid.corners + run * solid.height_m])
+            pen.polygon(canvas.points(ends[ConvexHull(ends).vertices]), fill=255)
     crowns = _crowns(scenery.trees, run, np.random.default_rng(seed))
     for tree, (centres, radii) in zip(scenery.trees, crowns, strict=True):
         foot = np.array([tree.x_m, tree.y_m])
@@ -347,21 +348,3 @@ def _damp(ground: Ground, wetness: float) -> Image.Image:
         for factor in (1 - 0.10 * wetness, paved_damp(wetness))
     )
     return Image.composite(hard, soft, ground.hard)
-
-
-def _hull(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """Convex hull, by Andrew's monotone chain."""
-    ordered = sorted((float(x), float(y)) for x, y in points)
-    return np.array(_half_hull(ordered) + _half_hull(ordered[::-1]))
-
-
-def _half_hull(ordered: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    kept: list[tuple[float, float]] = []
-    for x, y in ordered:
-        while len(kept) > 1:
-            (ax, ay), (bx, by) = kept[-2:]
-            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                break
-            kept.pop()
-        kept.append((x, y))
-    return kept[:-1]

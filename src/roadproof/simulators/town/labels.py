@@ -32,12 +32,12 @@ from roadproof.simulators.town.engine import (
     make_pipe,
     make_texture,
 )
-from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
 from roadproof.simulators.town.models import PAINTS, Body, car, person
 from roadproof.simulators.town.renderer import CULL_M, whole
 from roadproof.simulators.town.scenery import TREES, Scenery
 from roadproof.simulators.town.screens import Screens
+from roadproof.simulators.town.shading import Layer, dress
 from roadproof.simulators.town.streets import KERB_M, build_streets
 from roadproof.traffic.agents import Agents
 

@@ -9,9 +9,8 @@ from roadproof.simulators.town import textures
 from roadproof.simulators.town.canvas import GRAIN_TILE_M
 from roadproof.simulators.town.engine import Node, Texture, fill_texture, make_texture
 from roadproof.simulators.town.ground import FINE_M, Ground, LitGround
-from roadproof.simulators.town.layers import Layer
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
-from roadproof.simulators.town.shading import mesh_node, rgba, shaded
+from roadproof.simulators.town.shading import Layer, mesh_node, rgba, shaded
 from roadproof.simulators.town.streets import Streets
 from roadproof.simulators.town.weather import Sky
 

@@ -71,6 +71,14 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
     return builder.build()
 
 
+def lofted(rings: int, sides: int) -> Int[np.ndarray, "t 3"]:
+    """Triangles between rings of points, each of which ends with its first point once more."""
+    ring, side = np.meshgrid(np.arange(rings - 1), np.arange(sides), indexing="ij")
+    first = (ring * (sides + 1) + side).ravel()
+    above = first + sides + 1
+    return np.concatenate([np.stack([first, first + 1, above + 1], -1), np.stack([first, above + 1, above], -1)])
+
+
 class MeshBuilder:
     """Collects faces; `build` joins them."""
 
@@ -172,12 +180,7 @@ class MeshBuilder:
             [np.column_stack([radius * share * circle, np.full(sides + 1, height)]) for height, share in rings]
         )
         outward = np.tile(np.column_stack([circle, np.zeros(sides + 1)]), (len(rings), 1))
-        ring, side = np.meshgrid(np.arange(len(rings) - 1), np.arange(sides), indexing="ij")
-        first = (ring * (sides + 1) + side).ravel()
-        above = first + sides + 1
-        triangles = np.concatenate(
-            [np.stack([first, first + 1, above + 1], -1), np.stack([first, above + 1, above], -1)]
-        )
+        triangles = lofted(len(rings), sides)
         self.add(pose.place(points), outward @ pose.rotation.T, np.zeros((len(points), 2)), albedo, triangles)
 
     def ribbon(

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from roadproof.simulators.town.meshes import ORIGIN, Mesh, MeshBuilder, Pose, Rgb
+from roadproof.simulators.town.meshes import ORIGIN, Mesh, MeshBuilder, Pose, Rgb, lofted
 
 GLASS: Rgb = (0.13, 0.16, 0.19)
 SKY_IN_GLASS: Rgb = (0.36, 0.42, 0.48)
@@ -146,33 +146,22 @@ def _wheel(builder: MeshBuilder, x: float, y: float, side: int) -> None:
 def _lamps(builder: MeshBuilder, shape: _Shape) -> None:
     front, back = shape.body[-2], shape.body[0]
     w = shape.width_m
+    tail, z = back[0] - 0.016, back[2]
+    x, nose = front[0] + 0.065, front[2]
     for side in (1, -1):
-        inner, outer = side * 0.48 * w, side * 0.88 * w
-        y = sorted((inner, outer))
-        tail = back[0] - 0.016
-        builder.quad(
-            np.array(
-                [
-                    (tail, y[1], back[2] - 0.20),
-                    (tail, y[0], back[2] - 0.20),
-                    (tail, y[0], back[2] - 0.04),
-                    (tail, y[1], back[2] - 0.04),
-                ]
-            ),
-            albedo=(0.66, 0.07, 0.06),
-        )
-        x, z = front[0] + 0.065, front[2]
-        builder.quad(
-            np.array(
-                [(x, y[0], z - 0.20), (x, y[1], z - 0.20), (x - 0.02, y[1], z - 0.06), (x - 0.02, y[0], z - 0.06)]
-            ),
-            albedo=(0.93, 0.93, 0.89),
-        )
+        low, high = sorted((side * 0.48 * w, side * 0.88 * w))
+        _panel(builder, (tail, tail), (high, low), (z - 0.20, z - 0.04), (0.66, 0.07, 0.06))
+        _panel(builder, (x, x - 0.02), (low, high), (nose - 0.20, nose - 0.06), (0.93, 0.93, 0.89))
     plate = back[0] - 0.02
-    builder.quad(
-        np.array([(plate, 0.26, 0.56), (plate, -0.26, 0.56), (plate, -0.26, 0.67), (plate, 0.26, 0.67)]),
-        albedo=(0.9, 0.9, 0.86),
-    )
+    _panel(builder, (plate, plate), (0.26, -0.26), (0.56, 0.67), (0.9, 0.9, 0.86))
+
+
+def _panel(
+    builder: MeshBuilder, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], albedo: Rgb
+) -> None:
+    """A flat face across the car from its lower edge (x[0], z[0]) to its upper one (x[1], z[1])."""
+    corners = [(x[0], y[0], z[0]), (x[0], y[1], z[0]), (x[1], y[1], z[1]), (x[1], y[0], z[1])]
+    builder.quad(np.array(corners), albedo=albedo)
 
 
 def person(kind: int, stride: float) -> Mesh:
@@ -189,26 +178,18 @@ def person(kind: int, stride: float) -> Mesh:
     builder = MeshBuilder()
     for side in (1, -1):
         swing = side * stride
-        _limb(builder, (0.0, 0.09 * side, 0.86), (0.13 * swing, 0.09 * side, 0.46), 0.095, 0.072, tuple(trousers))
-        _limb(
-            builder,
-            (0.13 * swing, 0.09 * side, 0.46),
-            (0.27 * swing - 0.04, 0.09 * side, 0.07),
-            0.072,
-            0.055,
-            tuple(trousers),
-        )
+        hip, knee = (0.0, 0.09 * side, 0.86), (0.13 * swing, 0.09 * side, 0.46)
+        _limb(builder, hip, knee, 0.095, 0.072, tuple(trousers))
+        _limb(builder, knee, (0.27 * swing - 0.04, 0.09 * side, 0.07), 0.072, 0.055, tuple(trousers))
         foot = Pose(0.27 * swing, 0.09 * side)
         builder.box((-0.09, -0.05, 0.0), (0.17, 0.05, 0.09), foot, (0.10, 0.09, 0.09))
-        _limb(builder, (0.0, 0.23 * side, 1.42), (-0.12 * swing, 0.27 * side, 1.12), 0.062, 0.05, tuple(shirt))
-        _limb(
-            builder, (-0.12 * swing, 0.27 * side, 1.12), (-0.10 * swing + 0.10, 0.25 * side, 0.86), 0.048, 0.035, skin
-        )
+        elbow = (-0.12 * swing, 0.27 * side, 1.12)
+        _limb(builder, (0.0, 0.23 * side, 1.42), elbow, 0.062, 0.05, tuple(shirt))
+        _limb(builder, elbow, (-0.10 * swing + 0.10, 0.25 * side, 0.86), 0.048, 0.035, skin)
     torso = [(0.82, 0.72), (0.95, 0.76), (1.20, 0.86), (1.40, 1.0), (1.47, 0.72), (1.52, 0.32)]
     builder.tube(torso, 0.205, ORIGIN, tuple(shirt), 10)
-    builder.tube(
-        [(1.48, 0.5), (1.54, 0.52), (1.60, 0.95), (1.67, 1.0), (1.74, 0.8), (1.78, 0.3)], 0.098, ORIGIN, skin, 8
-    )
+    head = [(1.48, 0.5), (1.54, 0.52), (1.60, 0.95), (1.67, 1.0), (1.74, 0.8), (1.78, 0.3)]
+    builder.tube(head, 0.098, ORIGIN, skin, 8)
     builder.tube([(1.64, 1.0), (1.70, 1.1), (1.76, 0.9), (1.80, 0.45), (1.81, 0.0)], 0.105, Pose(-0.015, 0.0), hair, 8)
     return builder.build()
 
@@ -224,6 +205,4 @@ def _limb(
     angle = np.linspace(0, 2 * math.pi, 7)
     circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(7)])
     points = np.concatenate([circle * lower + bottom, circle * upper + top])
-    i = np.arange(6)
-    triangles = np.concatenate([np.stack([i, i + 1, i + 8], -1), np.stack([i, i + 8, i + 7], -1)])
-    builder.add(points, np.concatenate([circle, circle]), np.zeros((14, 2)), albedo, triangles)
+    builder.add(points, np.concatenate([circle, circle]), np.zeros((14, 2)), albedo, lofted(2, 6))

@@ -17,7 +17,7 @@ from roadproof.datatypes import Control, VehicleState
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.scenery import Solid
-from roadproof.simulators.tracker.body import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
+from roadproof.simulators.tracker.judge import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
 
 WHEEL_RADIUS_M = 0.33
 MASS_KG = 1500.0

@@ -25,11 +25,10 @@ from roadproof.simulators.town.canvas_node import CanvasNode
 from roadproof.simulators.town.engine import Node, Path, Screen, Texture, core, ground_stage, make_pipe, make_texture
 from roadproof.simulators.town.ground import LitGround, build_ground, light_ground
 from roadproof.simulators.town.land import CELL_M, Land
-from roadproof.simulators.town.layers import Layer, dress
 from roadproof.simulators.town.materials import split_by_atlas, static_textures
 from roadproof.simulators.town.scenery import Scenery
 from roadproof.simulators.town.screens import Screens
-from roadproof.simulators.town.shading import mesh_node, shaded
+from roadproof.simulators.town.shading import Layer, dress, mesh_node, shaded
 from roadproof.simulators.town.streets import build_streets
 from roadproof.simulators.town.weather import SKIES, Sky, sky_picture
 from roadproof.traffic.agents import Agents

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 from roadproof.roads.lanes import Lane
+from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.roadmap import RoadMap
-from roadproof.simulators.town.meshes import Mesh, MeshBuilder, Pose, Rgb
+from roadproof.simulators.town.meshes import FACE, UNIT, Mesh, MeshBuilder, Pose, Rgb
 from roadproof.simulators.town.models import PAINTS, Body, car
 
 MARGIN_M = 45.0
@@ -41,8 +42,7 @@ class Solid:
     @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
         """Its footprint, counter-clockwise."""
-        a, b = self.half_m
-        return self.pose.place(np.array([(-a, -b, 0), (a, -b, 0), (a, b, 0), (-a, b, 0)], float))[:, :2]
+        return edge_corners(self.pose, *self.half_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,13 +150,13 @@ class _Edge:
     def __init__(self, lane: Lane) -> None:
         self.lane = lane
         self.points = lane.right
-        self.stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lane.right, axis=0), axis=1))])
+        self.stations = polyline_stations(lane.right)
         self.length_m = float(self.stations[-1])
 
     def pose(self, station_m: float, right_m: float) -> Pose:
         """A place beside the edge, turned along it."""
         s = min(max(station_m, 0.3), self.length_m - 0.3)
-        (x0, x1), (y0, y1) = (np.interp([s - 0.3, s + 0.3], self.stations, self.points[:, k]).tolist() for k in (0, 1))
+        (x0, y0), (x1, y1) = interpolated(np.array([s - 0.3, s + 0.3]), self.stations, self.points[:, :2]).tolist()
         yaw = math.atan2(y1 - y0, x1 - x0)
         return Pose((x0 + x1) / 2, (y0 + y1) / 2, yaw).ahead(station_m - s, -right_m)
 
@@ -257,16 +257,11 @@ def _town_house(site: _Site, pose: Pose, width: float, depth: float, storeys: in
         _walls(site.builder(f"facade{facade}"), pose, half, (0.0, SHOP_M), (7.5, 2 * STOREY_M), tint)
     _walls(site.builder(f"facade{facade}"), pose, half, (SHOP_M, top), (7.5, 2 * STOREY_M), tint)
     stone, (a, b) = site.builder("concrete"), half
-    stone.box(
-        (-a - 0.12, -b - 0.12, SHOP_M - 0.12),
-        (a + 0.12, b + 0.12, SHOP_M + 0.12),
-        pose,
-        (0.74, 0.72, 0.70),
-        faces="xXyYZz",
-    )
-    stone.box(
-        (-a - 0.25, -b - 0.25, top - 0.1), (a + 0.25, b + 0.25, top + 0.4), pose, (0.80, 0.78, 0.74), faces="xXyYZz"
-    )
+    for out, low, high, grey in (
+        (0.12, SHOP_M - 0.12, SHOP_M + 0.12, (0.74, 0.72, 0.70)),
+        (0.25, top - 0.1, top + 0.4, (0.80, 0.78, 0.74)),
+    ):
+        stone.box((-a - out, -b - out, low), (a + out, b + out, high), pose, grey, faces="xXyYZz")
     if rng.random() < 0.5:
         _gable(site, pose, (a + 0.2, b + 0.2), top + 0.35, 2.6, ROOFS[int(rng.integers(len(ROOFS)))])
     site.solids.append(Solid("building", pose, half, top + 0.4))
@@ -378,7 +373,6 @@ def _plant(site: _Site, pose: Pose, height_m: float) -> None:
             [(x - dx, y - dy, 0.0), (x + dx, y + dy, 0.0), (x + dx, y + dy, height_m), (x - dx, y - dy, height_m)]
         )
         shade = np.array([[0.82], [0.82], [1.0], [1.0]]) * np.ones(3)
-        uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-        builder.add(corners, np.array([0.0, 0.0, 1.0]), uv, shade, np.array([[0, 1, 2], [0, 2, 3]]))
+        builder.add(corners, np.array([0.0, 0.0, 1.0]), UNIT, shade, FACE)
     site.trees.append(Tree(pose.x_m, pose.y_m, height_m, kind))
     site.take(edge_corners(pose, 1.2, 1.2))

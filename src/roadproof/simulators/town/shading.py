@@ -1,15 +1,49 @@
-"""Meshes under the light of a weather: vertex colours, and nodes that carry them."""
+"""How meshes are drawn: in which order, in what light, and the nodes that carry their vertex colours."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
+from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from roadproof.simulators.town.engine import VERTEX, Node, make_node
-from roadproof.simulators.town.meshes import Mesh
+from roadproof.simulators.town.engine import VERTEX, Node, Path, core, make_node
+from roadproof.simulators.town.meshes import Mesh, Pose
 from roadproof.simulators.town.weather import Sky
+
+
+class Layer(IntEnum):
+    """Order of drawing; up to the pavement nothing is tested for depth."""
+
+    GROUND = 1
+    PAINT = 2
+    CANVAS = 3
+    SHADE = 4
+    PAVEMENT = 5
+    PAVEMENT_SHADE = 6
+    SOLID = 10
+    SMALL = 11
+    CUT_OUT = 20
+    FAR_LAND = 21
+    HAZE = 22
+    SKY = 23
+    RAIN = 30
+
+
+def dress(path: Path, layer: Layer) -> None:
+    """Set how a node is drawn from its layer."""
+    path.set_bin("fixed", int(layer))
+    if layer in (Layer.GROUND, Layer.PAINT, Layer.CANVAS, Layer.SHADE, Layer.PAVEMENT_SHADE, Layer.RAIN):
+        path.set_depth_test(False)
+        path.set_depth_write(layer is Layer.GROUND)
+    if layer in (Layer.SHADE, Layer.PAVEMENT_SHADE, Layer.HAZE, Layer.RAIN):
+        path.set_transparency(core.TransparencyAttrib.M_alpha)
+        path.set_depth_write(False)
+    if layer is Layer.CUT_OUT:
+        path.set_transparency(core.TransparencyAttrib.M_binary)
+    if layer in (Layer.CUT_OUT, Layer.SKY, Layer.HAZE, Layer.RAIN):
+        path.set_two_sided(True)
 
 
 def shaded(mesh: Mesh, sky: Sky, sunlit: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 4"]:
@@ -21,9 +55,8 @@ def shaded(mesh: Mesh, sky: Sky, sunlit: Float[np.ndarray, " n"]) -> UInt8[np.nd
 
 def turned(mesh: Mesh, yaw_rad: float) -> Mesh:
     """The mesh with its normals turned, for light."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Mesh(mesh.points, (mesh.normals @ rotation.T).round(4), mesh.uv, mesh.albedo, mesh.triangles)
+    normals = mesh.normals @ Pose(0.0, 0.0, yaw_rad).rotation.T
+    return replace(mesh, normals=normals.round(4))
 
 
 def rgba(colour: Float[np.ndarray, "n 3"], alpha: float = 1.0) -> UInt8[np.ndarray, "n 4"]:

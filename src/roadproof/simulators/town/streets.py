@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.roads.lanes import Lane, MarkLine
+from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
 
@@ -93,7 +94,7 @@ def _mark(paint: MeshBuilder, line: MarkLine) -> None:
     kinds = line.mark.kind.split()
     for i, kind in enumerate(kinds):
         shift = (len(kinds) - 1) * width - 2 * width * i
-        stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
+        stations = polyline_stations(line.points)
         if stations[-1] < 0.3:
             continue
         pieces = [(0.0, float(stations[-1]))] if kind == "solid" else _dashes(line.start_m, float(stations[-1]))
@@ -123,7 +124,7 @@ def _stripe(
     bends = len(inside) > 2 and float(np.linalg.norm(inside[0] - 2 * inside[len(inside) // 2] + inside[-1])) > 0.05
     count = max(2, int(np.ceil((span[1] - span[0]) / (1.0 if bends else PAINT_STEP_M))) + 1)
     s = np.linspace(*span, count)
-    centre = np.column_stack([np.interp(s, stations, points[:, k]) for k in range(3)])
+    centre = interpolated(s, stations, points)
     along = np.gradient(centre[:, :2], axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     left = np.column_stack([-along[:, 1], along[:, 0], np.zeros(count)])
@@ -151,8 +152,7 @@ def _arm(paint: MeshBuilder, roads: RoadMap, lane: Lane, *, crossing: bool) -> N
 
 def _at(lane: Lane, station_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Left and right border of a lane at a station."""
-    left = np.array([np.interp(station_m, lane.stations_m, lane.left[:, k]) for k in range(3)])
-    right = np.array([np.interp(station_m, lane.stations_m, lane.right[:, k]) for k in range(3)])
+    left, right = (interpolated(station_m, lane.stations_m, border) for border in (lane.left, lane.right))
     return left, right
 
 

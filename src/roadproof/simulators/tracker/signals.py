@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from roadproof.datatypes import Event, EventKind, VehicleState
 from roadproof.roads.lanes import Lane
+from roadproof.roads.polylines import interpolated
 from roadproof.roads.roadmap import RoadMap
 
 LIGHT_REACH_M = 10.0
@@ -172,13 +173,14 @@ def stop_line(roads: RoadMap, light: TriggerVolume) -> StopLine:
     # The nearest lane depends on the direction asked for, and that of the lane is not known yet.
     lane, station_m = min(
         (_lane_at(roads, light, light.yaw_rad + k * math.pi / 2) for k in range(4)),
-        key=lambda found: math.dist(_at(*found)[:2], (light.x_m, light.y_m)),
+        key=lambda found: math.dist(found[0].at(found[1])[:2], (light.x_m, light.y_m)),
     )
-    x, y, heading = _at(lane, station_m)
+    x, y, _, heading = lane.at(station_m)
     left_m = (light.y_m - y) * math.cos(heading) - (light.x_m - x) * math.sin(heading)
     turned = light.yaw_rad - heading
     half_m = light.half_x_m * abs(math.sin(turned)) + light.half_y_m * abs(math.cos(turned))
-    x, y, heading = _at(*_entry(roads, lane, station_m))
+    entered, entered_m = _entry(roads, lane, station_m)
+    x, y, _, heading = entered.at(entered_m)
     return StopLine(x - left_m * math.sin(heading), y + left_m * math.cos(heading), heading, LINE_SHARE * half_m)
 
 
@@ -189,7 +191,7 @@ def places_ahead(roads: RoadMap, state: VehicleState) -> Float[np.ndarray, "n 2"
     places = [np.array([[state.x_m, state.y_m]])]
     while True:
         stations = np.arange(station_m, min(station_m + left_m, lane.length_m), LOOK_STEP_M)
-        places.append(np.column_stack([np.interp(stations, lane.stations_m, lane.centre[:, axis]) for axis in (0, 1)]))
+        places.append(interpolated(stations, lane.stations_m, lane.centre[:, :2]))
         left_m -= lane.length_m - station_m
         if left_m <= 0.0 or len(lane.successors) != 1:
             return np.concatenate(places)
@@ -210,12 +212,6 @@ def _entry(roads: RoadMap, lane: Lane, station_m: float) -> tuple[Lane, float]:
         way, way_m = roads.lanes[way.successors[0]], 0.0
         seen.add(way.index)
     return way, way_m
-
-
-def _at(lane: Lane, station_m: float) -> tuple[float, float, float]:
-    """x, y and heading of a lane's centre."""
-    x, y = (float(np.interp(station_m, lane.stations_m, lane.centre[:, axis])) for axis in (0, 1))
-    return x, y, float(np.interp(station_m, lane.stations_m, lane.headings_rad))
 
 
 def _near(middles: Float[np.ndarray, "n d"], place: tuple[float, ...], reach_m: float) -> list[int]:

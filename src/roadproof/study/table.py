@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TypeAlias
 
 from roadproof.driving.intervals import Mean
@@ -55,6 +56,11 @@ class Heading:
     span: int = 1
 
 
+def headings(*texts: str) -> tuple[Heading, ...]:
+    """Headings over a column each."""
+    return tuple(map(Heading, texts))
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Table:
     """A table as people read it.
@@ -94,14 +100,8 @@ class Table:
     @property
     def flat_header(self) -> tuple[str, ...]:
         """One heading a column, those above it first."""
-        stacks: list[list[str]] = [[] for _ in range(self.columns)]
-        for row in self.header:
-            at = 0
-            for heading in row:
-                for stack in stacks[at : at + heading.span]:
-                    stack += [heading.text] if heading.text else []
-                at += heading.span
-        return tuple(": ".join(stack) for stack in stacks)
+        rows = [[heading.text for heading in row for _ in range(heading.span)] for row in self.header]
+        return tuple(": ".join(filter(None, stack)) for stack in zip(*rows, strict=True))
 
 
 def slug(text: str) -> str:
@@ -145,33 +145,17 @@ def in_latex(table: Table) -> str:
     )
 
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "_": r"\_",
-    "%": r"\%",
-    "^": r"\textasciicircum{}",
-    "~": r"\textasciitilde{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    "≥": r"$\geq$",
-    "×": r"$\times$",
-    "±": r"$\pm$",
-    "−": "$-$",
-    "–": "--",
-    "’": "'",
+_LATEX = str.maketrans({
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",
+    "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", "≥": r"$\geq$", "×": r"$\times$", "±": r"$\pm$", "−": "$-$", "–": "--", "’": "'",
     "…": r"\ldots{}",
-}
+})  # fmt: skip
 
 
 def latex_text(text: str) -> str:
     """Text that LaTeX prints as it is."""
-    return "".join(_LATEX.get(letter, letter) for letter in " ".join(text.split()))
+    return " ".join(text.split()).translate(_LATEX)
 
 
 def _markdown_row(cells: list[str]) -> str:
@@ -203,10 +187,10 @@ def _latex_cell(cell: Cell) -> str:
 
 def _rules(row: tuple[Heading, ...]) -> list[str]:
     """A thin line under every heading that spans columns."""
-    rules: list[str] = []
-    at = 1
-    for heading in row:
-        if heading.span > 1:
-            rules.append(f"\\cmidrule(lr){{{at}-{at + heading.span - 1}}}")
-        at += heading.span
+    ends = accumulate(heading.span for heading in row)
+    rules = [
+        f"\\cmidrule(lr){{{end - heading.span + 1}-{end}}}"
+        for heading, end in zip(row, ends, strict=True)
+        if heading.span > 1
+    ]
     return ["".join(rules)] if rules else []

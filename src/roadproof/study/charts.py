@@ -5,7 +5,7 @@ Every method keeps its colour, line and marker in all charts (Okabe and Ito's co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from roadproof.report.formatting import in_words
-from roadproof.report.study.blocks import compared, overall
-from roadproof.report.study.folder import Found, History
-from roadproof.report.study.results import Results
-from roadproof.report.study.statistics import mean_over_scenarios
+from roadproof.study.history import Course
+from roadproof.study.kept_jobs import KeptJob
+from roadproof.study.results import Block, Results
+from roadproof.study.statistics import mean_over_scenarios
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -54,36 +54,18 @@ def style(results: Results, method: str) -> dict[str, Any]:
 
 def by_figures(results: Results) -> Picture:
     """Deviation and penalty of every method for each K, with their intervals."""
-    blocks = overall(results)
     figure = Figure(figsize=(10.0, 3.9), layout="constrained")
-    count = len(results.methods)
-    for column, block in enumerate(blocks):
+    for column, block in enumerate(results.overall):
         axes = figure.add_subplot(1, 2, column + 1)
         for number, method in enumerate(results.methods):
-            means = [mean_over_scenarios(block.values(results, method.name, each)) for each in results.figures]
-            at = np.arange(len(means)) + (number - (count - 1) / 2) * min(0.12, 0.6 / count)
-            kept = [(x, mean) for x, mean in zip(at.tolist(), means, strict=True) if mean is not None]
-            ends = [
-                [mean.value - (mean.value if mean.low is None else mean.low) for _, mean in kept],
-                [(mean.value if mean.high is None else mean.high) - mean.value for _, mean in kept],
-            ]
-            axes.errorbar(
-                [x for x, _ in kept],
-                [mean.value for _, mean in kept],
-                yerr=ends,
-                label=plain(method.name),
-                linewidth=1.5,
-                elinewidth=1.1,
-                capsize=2.5,
-                markersize=5.5,
-                **style(results, method.name),
-            )
+            _draw_means(axes, results, block, method.name, number - (len(results.methods) - 1) / 2)
         axes.set_xticks(range(len(results.figures)), results.figures)
         axes.set_xlim(-0.5, len(results.figures) - 0.5)
         axes.set_ylim(bottom=0.0)
-        label(axes, "K, figures of the pattern", f"{block.metric.title.lower()}, {block.metric.unit}")
+        named = f"{block.metric.title.lower()}, {block.metric.unit}"
+        _label(axes, "K, figures of the pattern", named)
     legend(figure)
-    how = f"penalty {'in traffic' if blocks[1].traffic else 'alone on the road'}"
+    how = f"penalty {'in traffic' if results.overall[1].traffic else 'alone on the road'}"
     return Picture(
         "by-figures",
         f"Deviation and infraction penalty for each K at {in_words(results.home)}, driven, {how}: means over scenarios "
@@ -92,32 +74,52 @@ def by_figures(results: Results) -> Picture:
     )
 
 
-def progress(results: Results, found: Sequence[Found]) -> Picture | None:
+def _draw_means(axes: Axes, results: Results, block: Block, method: str, place: float) -> None:
+    """A method's means with their intervals, beside those of others."""
+    means = [mean_over_scenarios(results.values(block, method, each)) for each in results.figures]
+    apart = place * min(0.12, 0.6 / len(results.methods))
+    kept = [(x + apart, mean) for x, mean in enumerate(means) if mean is not None]
+    ends = [
+        [mean.value - (mean.value if mean.low is None else mean.low) for _, mean in kept],
+        [(mean.value if mean.high is None else mean.high) - mean.value for _, mean in kept],
+    ]
+    axes.errorbar(
+        [x for x, _ in kept],
+        [mean.value for _, mean in kept],
+        yerr=ends,
+        label=plain(method),
+        linewidth=1.5,
+        elinewidth=1.1,
+        capsize=2.5,
+        markersize=5.5,
+        **style(results, method),
+    )
+
+
+def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
     """Deviation of the best pattern so far against simulator calls and against seconds, driven."""
-    names = compared(results.methods)
-    histories: dict[str, dict[str, list[History]]] = {}
-    for each in found:
-        history = each.history() if each.job.method in names else None
-        if history is not None:
-            histories.setdefault(each.job.figures, {}).setdefault(each.job.method, []).append(history)
-    shown = [figures for figures in results.figures if figures in histories]
+    courses: dict[str, dict[str, list[Course]]] = {}
+    for job in jobs:
+        course = job.deviation() if job.id.method in results.compared else None
+        if course is not None:
+            courses.setdefault(job.id.figures, {}).setdefault(job.id.method, []).append(course)
+    shown = [figures for figures in results.figures if figures in courses]
     if not shown:
         return None
     figure = Figure(figsize=(max(3.0 * len(shown), 6.0), 5.6), layout="constrained")
     grid: Any = figure.subplots(2, len(shown), squeeze=False, sharey="col")
-    axis_of: tuple[tuple[str, Callable[[History], np.ndarray]], ...] = (
-        ("simulator calls", lambda history: history.calls),
-        ("seconds of search", lambda history: history.seconds),
-    )
     for column, figures in enumerate(shown):
-        for row, (name, axis) in enumerate(axis_of):
+        for row, (field, name) in enumerate((("calls", "simulator calls"), ("seconds", "seconds of search"))):
             axes: Axes = grid[row, column]
-            for method, own in histories[figures].items():
-                _draw_course(axes, [axis(each) for each in own], own, plain(method), style(results, method))
+            for method, own in courses[figures].items():
+                at = [np.asarray(getattr(course, field), np.float64) for course in own]
+                best = [np.asarray(course.best, np.float64) for course in own]
+                _draw_course(axes, at, best, plain(method), style(results, method))
             axes.set_xscale("log")
             _plain_ticks(axes)
             axes.set_ylim(bottom=0.0)
-            label(axes, name, "deviation of the best so far, m" if column == 0 else "")
+            reached = "deviation of the best so far, m" if column == 0 else ""
+            _label(axes, name, reached)
             if row == 0:
                 axes.set_title(f"K = {figures}", fontsize=10, color=INK)
     legend(figure)
@@ -138,19 +140,18 @@ def _plain_ticks(axes: Axes) -> None:
 
 
 def _draw_course(
-    axes: Axes, places: Sequence[np.ndarray], own: Sequence[History], name: str, look: Mapping[str, Any]
+    axes: Axes, places: Sequence[np.ndarray], reached: Sequence[np.ndarray], name: str, look: Mapping[str, Any]
 ) -> None:
     """A line with its band, or a point with its range where each search was driven but once."""
-    if all(len(each.deviation_m) == 1 for each in own):
-        reached = np.concatenate([each.deviation_m for each in own])
+    if all(len(each) == 1 for each in reached):
         middle = float(np.median(reached))
-        ends = [[middle - float(reached.min())], [float(reached.max()) - middle]]
-        at = float(np.median(np.concatenate(list(places))))
+        ends = [[middle - float(np.min(reached))], [float(np.max(reached)) - middle]]
+        at = float(np.median(np.concatenate(places)))
         point: dict[str, Any] = {**look, "linestyle": "none", "zorder": 5}
         axes.errorbar([at], [middle], yerr=ends, label=name, capsize=3, markersize=7, **point)
         return
     line: dict[str, Any] = {**look, "marker": ""}
-    x, values = _aligned(places, [each.deviation_m for each in own])
+    x, values = _aligned(places, reached)
     axes.plot(x, np.median(values, 0), label=name, linewidth=1.9, **line)
     axes.fill_between(x, values.min(0), values.max(0), color=look["color"], alpha=0.14, linewidth=0)
 
@@ -165,8 +166,7 @@ def _aligned(
     return x, np.stack(steps)
 
 
-def label(axes: Axes, x: str, y: str) -> None:
-    """The house's axes."""
+def _label(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x, color=MUTED, fontsize=9)
     axes.set_ylabel(y, color=MUTED, fontsize=9)
     axes.tick_params(colors=MUTED, labelsize=9, length=3, width=0.6)
@@ -176,9 +176,9 @@ def label(axes: Axes, x: str, y: str) -> None:
     axes.set_axisbelow(True)
 
 
-def legend(figure: Figure, extra: Mapping[str, Any] | None = None) -> None:
+def legend(figure: Figure) -> None:
     """One legend for all axes, above them."""
-    entries: dict[str, Any] = dict(extra or {})
+    entries: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
         for handle, name in zip(handles, labels, strict=True):

@@ -19,7 +19,7 @@ BEFORE_M = 9.0
 SIZE_PX = (400, 300)
 
 
-def views(
+def snapshots(
     simulator: Simulator, scenario: Scenario, pattern: Pattern, clean: Episode, weathers: Sequence[Weather]
 ) -> dict[str, bytes]:
     """Camera pictures of a pattern as JPEG files, by name: "view-clear-noon.jpg".

@@ -9,7 +9,6 @@ OUT/figures/*.png
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import roadproof
@@ -17,24 +16,27 @@ from roadproof.io.files import write_atomically
 from roadproof.report.formatting import in_words
 from roadproof.report.html import data_url, environment
 from roadproof.report.plots import save
-from roadproof.report.study.blocks import DEVIATION, PENALTY
-from roadproof.report.study.charts import Picture, by_figures, progress
-from roadproof.report.study.folder import Found, read_found, reference_of
-from roadproof.report.study.layouts import GAPS, paper_tables
-from roadproof.report.study.pictures import gallery, in_weathers, trajectories
-from roadproof.report.study.results import BLACK, Method, Record, Results, results_of
-from roadproof.report.study.table import Table, in_latex, in_markdown, markdown_text
-from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
+from roadproof.study.charts import Picture, by_figures, progress
+from roadproof.study.folder import reference_of
+from roadproof.study.kept_jobs import KeptJob, StatedMethod, read_jobs
+from roadproof.study.paper_tables import GAPS, paper_tables
+from roadproof.study.pictures import gallery, in_weathers, trajectories
+from roadproof.study.plan import BLACK
+from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, results_of
+from roadproof.study.rows import Frame
+from roadproof.study.table import Table, in_latex, in_markdown, markdown_text
+from roadproof.study.table_notes import counted
+from roadproof.study.transfer_matrix import transfer_map, transfer_table
 
 
-def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Sequence[Record] = ()) -> Path:
+def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = None) -> Path:
     """Make every table and figure of a study.
 
     Args:
-        records: its rows.
+        rows: the study's, see `folder.read_table`.
         folder: of the study, for what its jobs left there.
         out: where the files go; older ones of the same names are replaced.
-        transfer: rows of the same patterns driven by other controllers, see `transfer.transfer_of`.
+        transfer: rows of the same patterns driven by other controllers; None where nobody drove them.
 
     Returns:
         The page.
@@ -43,24 +45,21 @@ def write_study(records: Iterable[Record], folder: Path, out: Path, transfer: Se
         StudyError: there is nothing to show, or a file of a job is damaged.
         OutputError: a file cannot be written.
     """
-    rows = list(records)
-    found = read_found(folder, rows)
-    named = reference_of(folder)
-    methods = {job.method.name: replace(job.method, reference=job.method.name == named) for job in found.values()}
-    results = results_of(rows, methods.values())
-    drawn = (by_figures(results), progress(results, tuple(found.values())), trajectories(results, found))
-    matrices = [transfer_of(transfer, metric) for metric in (DEVIATION, PENALTY)] if transfer else []
-    shown = (*drawn, gallery(results, found), in_weathers(results, found), *map(transfer_map, matrices))
+    check_jobs(rows)
+    jobs = read_jobs(folder, rows)
+    results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder))
+    driven = [] if transfer is None else [(transfer, metric) for metric in (DEVIATION, PENALTY)]
+    drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))
+    shown = (*drawn, gallery(results, jobs), in_weathers(results, jobs), *(transfer_map(*each) for each in driven))
     pictures = [picture for picture in shown if picture is not None]
     for picture in pictures:
         save(picture.figure, out / "figures" / f"{picture.name}.png")
-    tables = [*paper_tables(results), *map(transfer_table, matrices)]
+    tables = [*paper_tables(results), *(transfer_table(*each) for each in driven)]
     # A list of what was missing does not outlive the gaps.
     (out / f"{GAPS}.tex").unlink(missing_ok=True)
     for table in tables:
         _write(out / f"{table.name}.tex", in_latex(table))
-    name = folder.resolve().name
-    sentence = _sentence(results, found.values())
+    name, sentence = folder.resolve().name, _sentence(results, jobs.values())
     _write(out / "tables.md", _markdown(name, sentence, results, tables, pictures))
     _write(out / "tables.html", _page(name, sentence, results, tables, pictures, out))
     return out / "tables.html"
@@ -76,11 +75,7 @@ def _page(
         (len(kinds), "scenarios", ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))),
         (", ".join(results.figures), "K", black),
         (len(results.methods), "methods", ", ".join(map(described, results.methods))),
-        (
-            f"{jobs - gaps} of {jobs}",
-            "jobs done",
-            f"{gaps} failed or missing, listed below" if gaps else "",
-        ),
+        (f"{jobs - gaps} of {jobs}", "jobs done", f"{gaps} failed or missing, listed below" if gaps else ""),
     ]
     return environment().get_template("study.html.jinja").render(
         version=roadproof.__version__,
@@ -110,25 +105,23 @@ def _markdown(name: str, sentence: str, results: Results, tables: Sequence[Table
     )
 
 
-def described(method: Method) -> str:
-    """A method and what is known of it, as "GradOpt (Group, T=3)"."""
+def described(method: StatedMethod) -> str:
+    """A method and what is known of it, as "GradOpt (group, T=3)"."""
     if method.search == "gradopt":
         return f"{method.name} ({method.scheme}, T={method.trajectories})"
     return f"{method.name} ({method.search})" if method.search not in ("", method.name) else method.name
 
 
-def _sentence(results: Results, found: Iterable[Found]) -> str:
+def _sentence(results: Results, jobs: Iterable[KeptJob]) -> str:
     """What the study was, in a sentence."""
-    controllers = list(dict.fromkeys(job.controller for job in found))
-    scenarios = f"{len(results.kinds)} scenario{'s' if len(results.kinds) != 1 else ''}"
-    weathers = [in_words(weather) for weather in results.weathers]
-    also = f", judged also at {', '.join(weathers[1:])}" if weathers[1:] else ""
-    traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
-    seeds = (
-        "seed " + str(results.seeds[0]) if len(results.seeds) == 1 else f"seeds {', '.join(map(str, results.seeds))}"
-    )
+    controllers = dict.fromkeys(job.controller for job in jobs)
+    home, *others = map(in_words, results.weathers)
     against = f" against {', '.join(controllers)}" if controllers else ""
-    return f"Patterns{against} on {scenarios}, {seeds}, found at {weathers[0]}{also}, driven{traffic}."
+    seeds = f"seed{'s' if len(results.seeds) > 1 else ''} {', '.join(map(str, results.seeds))}"
+    also = f", judged also at {', '.join(others)}" if others else ""
+    traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
+    scenarios = counted(len(results.kinds), "scenario")
+    return f"Patterns{against} on {scenarios}, {seeds}, found at {home}{also}, driven{traffic}."
 
 
 def _write(path: Path, text: str) -> None:

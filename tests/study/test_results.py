@@ -1,26 +1,27 @@
 import pytest
 
-from hand_made_study import BO, GRADOPT, bad, row
+from hand_made_study import BO, GRADOPT, bad, results, row
 from roadproof.errors import StudyError
-from roadproof.report.study.results import JobId, results_of
+from roadproof.study.results import DEVIATION, PENALTY, Block
+from roadproof.study.rows import JobId
 
 
 def test_drives_in_traffic_become_one_mean(records):
-    results = results_of(records)
-    assert results.figures == ("1", "5")
-    assert results.home == "clear-noon"
-    assert [method.name for method in results.methods] == ["GradOpt", "BO"]
-    points = results.values("points", "GradOpt", "1", weather="clear-noon", traffic=True)
+    found = results(records)
+    assert found.figures == ("1", "5")
+    assert found.home == "clear-noon"
+    assert [method.name for method in found.methods] == ["GradOpt", "BO"]
+    points = found.values(Block("", PENALTY, "clear-noon", True), "GradOpt", "1")
     # 2 · 2.0 + 1 and 2 · 2.0 + 2
-    assert points["left-01", "0"] == 5.5
-    assert set(results.values("points", "BO", "5", weather="rainy-noon", traffic=False, kind="left")) == {
-        ("left-01", "0"),
-        ("left-02", "0"),
-    }
+    assert points["left-01", 0] == 5.5
+    left = found.values(Block("", PENALTY, "rainy-noon", False, "left"), "BO", "5")
+    assert set(left.index) == {("left-01", 0), ("left-02", 0)}
+    every = found.values(Block("", DEVIATION, "clear-noon", False), "BO")
+    assert every["left-01", 0, "5"] == every["left-01", 0, "1"] + 1.0 == 3.0
 
 
 def test_one_black_figure_stands_first():
-    assert results_of([row(figures=k) for k in ("10", "2", "1-b", "1")]).figures == ("1-b", "1", "2", "10")
+    assert results([row(figures=k) for k in ("10", "2", "1-b", "1")]).figures == ("1-b", "1", "2", "10")
 
 
 def test_what_failed_or_is_missing_is_said():
@@ -36,14 +37,14 @@ def test_what_failed_or_is_missing_is_said():
         row("left-03", traffic=True),
         row("left-03", traffic=True),
     ]
-    gaps = results_of(rows, (GRADOPT, BO)).gaps()
+    gaps = results(rows, (GRADOPT, BO)).gaps()
     assert gaps == {
         JobId("left-01", "1", "GradOpt", 0): "0 of 2 drives at clear noon in traffic",
         JobId("left-01", "1", "BO", 0): "its process died",
         JobId("left-02", "1", "GradOpt", 0): "1 of 2 drives at clear noon in traffic",
         JobId("left-03", "1", "BO", 0): "no row; not done yet",
     }
-    assert len(results_of(rows).gaps(["GradOpt"], {("clear-noon", False)})) == 0
+    assert len(results(rows).gaps(["GradOpt"], {("clear-noon", False)})) == 0
 
 
 @pytest.mark.parametrize(
@@ -58,5 +59,5 @@ def test_what_failed_or_is_missing_is_said():
 )
 def test_rows_that_cannot_be_compared_are_named(rows, message):
     with pytest.raises(StudyError, match=message) as caught:
-        results_of(rows)
+        results(rows)
     assert "\n" not in str(caught.value)

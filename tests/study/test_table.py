@@ -4,7 +4,7 @@ import pytest
 
 from roadproof.driving.intervals import Mean
 from roadproof.errors import StudyError
-from roadproof.report.study.table import Estimate, Heading, Table, in_latex, in_markdown, latex_text, markdown_text
+from roadproof.study.table import Estimate, Heading, Table, in_latex, in_markdown, latex_text, markdown_text
 
 HOSTILE = "<b>_BO_ 100% $x^2$ {a} \\end{table} #1 & ~ | `c` *d* [e](f)"
 

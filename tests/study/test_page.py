@@ -6,30 +6,34 @@ import shutil
 
 import numpy as np
 import pytest
+from pandas import concat
 from PIL import Image
 
 from made_up_study import METHODS, made_up_study, write_made_up_study
 from roadproof.errors import PatternError, StudyError
-from roadproof.report.study.folder import read_found
-from roadproof.report.study.page import write_study
-from roadproof.report.study.results import JobId
+from roadproof.study.folder import write_table
+from roadproof.study.kept_jobs import read_jobs
 from roadproof.study.methods import BlackBoxPlan
+from roadproof.study.page import write_tables
+from roadproof.study.rows import JobId
 
 HOSTILE = "<b>_all_ 100% $x"
+
+
+def finished_study():
+    """With a hostile name."""
+    whole = made_up_study()
+    methods = (METHODS[0], METHODS[3], BlackBoxPlan(name=HOSTILE, search="random", calls=20))
+    scenarios = (whole.scenarios[0], whole.scenarios[3], whole.scenarios[4])
+    return made_up_study(scenarios=scenarios, figures=("1-b", 3), methods=methods)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """Folder, rows and page of a study with a failed job and a hostile name."""
-    folder = tmp_path_factory.mktemp("study")
-    whole = made_up_study()
-    methods = (METHODS[0], METHODS[3], BlackBoxPlan(name=HOSTILE, search="random", calls=20))
-    study = made_up_study(
-        scenarios=(whole.scenarios[0], whole.scenarios[3], whole.scenarios[4]), figures=("1-b", 3), methods=methods
-    )
+    folder, study = tmp_path_factory.mktemp("study"), finished_study()
     frame = write_made_up_study(folder, study, failing={(study.scenarios[1].name, 3, "BO")})
-    records = frame.to_dict("records")
-    return folder, records, write_study(records, folder, folder / "tables")
+    return folder, frame, write_tables(frame, folder, folder / "tables")
 
 
 def test_every_file_is_there(finished):
@@ -64,8 +68,8 @@ def test_what_failed_is_in_every_kind_of_file(finished):
 
 
 def test_the_same_rows_give_the_same_tables(finished, tmp_path):
-    folder, records, page = finished
-    again = write_study(records, folder, tmp_path)
+    folder, rows, page = finished
+    again = write_tables(rows, folder, tmp_path)
     assert (tmp_path / "tables.md").read_text() == (page.parent / "tables.md").read_text()
     assert again.read_text() == page.read_text()
 
@@ -74,13 +78,13 @@ def test_a_list_of_gaps_goes_when_they_are_filled(tmp_path):
     study = made_up_study(scenarios=made_up_study().scenarios[:2], figures=(1,), methods=(METHODS[0], METHODS[3]))
     for failing in ({(study.scenarios[1].name, 1, "BO")}, set()):
         frame = write_made_up_study(tmp_path, study, failing=failing)
-        page = write_study(frame.to_dict("records"), tmp_path, tmp_path / "tables")
+        page = write_tables(frame, tmp_path, tmp_path / "tables")
         assert page.with_name("missing.tex").exists() == bool(failing)
 
 
 def test_a_weather_never_names_a_file_elsewhere(finished):
-    folder, records, _ = finished
-    job = next(each for each in read_found(folder, records).values() if each.view("clear-noon") is not None)
+    folder, rows, _ = finished
+    job = next(each for each in read_jobs(folder, rows).values() if each.view("clear-noon") is not None)
     assert (job.view("rainy-noon"), job.view("hard-rain-noon")) == (pytest.approx(180, abs=3), None)
     other = next(each for each in job.folder.parent.iterdir() if each != job.folder)
     (job.folder / "view-").mkdir()
@@ -88,40 +92,68 @@ def test_a_weather_never_names_a_file_elsewhere(finished):
 
 
 def test_a_weather_of_the_rows_never_names_a_table_elsewhere(finished, tmp_path):
-    folder, records, _ = finished
-    moved = [{**row, "weather": str(row["weather"]).replace("rainy-noon", "../../up/rain")} for row in records]
-    write_study(moved, folder, tmp_path / "study" / "tables")
+    folder, rows, _ = finished
+    moved = rows.assign(weather=rows["weather"].str.replace("rainy-noon", "../../up/rain"))
+    write_tables(moved, folder, tmp_path / "study" / "tables")
     assert [path.name for path in tmp_path.iterdir()] == ["study"]
     assert [path.name for path in (tmp_path / "study").iterdir()] == ["tables"]
     assert (tmp_path / "study" / "tables" / "up-rain-alone-bo.tex").exists()
 
 
 def test_a_damaged_view_is_named(finished, tmp_path):
-    folder, records, _ = finished
+    folder, rows, _ = finished
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
-    job = next(each for each in read_found(tmp_path, records).values() if each.view("clear-noon") is not None)
+    job = next(each for each in read_jobs(tmp_path, rows).values() if each.view("clear-noon") is not None)
     (job.folder / "view-clear-noon.jpg").write_bytes(b"no picture")
     with pytest.raises(StudyError, match=r"view-clear-noon\.jpg cannot be read"):
         job.view("clear-noon")
 
 
 def test_a_folder_of_an_older_plan_is_not_taken(finished, tmp_path):
-    folder, records, _ = finished
+    folder, rows, _ = finished
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
-    found = read_found(folder, records)
+    found = read_jobs(folder, rows)
     assert len(found) == 18
     job, kept = next((job, each) for job, each in found.items() if each.paths() is not None)
-    older = tmp_path / "jobs" / "zzzz"
-    shutil.copytree(kept.folder, older)
-    rows = json.loads((older / "rows.json").read_text())
-    rows["rows"][0]["deviation_m"] += 1.0
-    (older / "rows.json").write_text(json.dumps(rows))
-    assert read_found(tmp_path, records)[job].folder == tmp_path / "jobs" / kept.folder.name
+    # The same names and the same numbers, but the key of other settings.
+    for name in ("0000", "zzzz"):
+        shutil.copytree(kept.folder, tmp_path / "jobs" / name)
+    assert {each.folder for each in read_jobs(tmp_path, rows).values()} == {
+        tmp_path / "jobs" / key for key in rows["job"]
+    }
+    assert read_jobs(tmp_path, rows)[job].folder == tmp_path / "jobs" / kept.folder.name
+
+
+def test_rows_without_the_keys_of_their_jobs_are_refused_and_gathered_again(finished, tmp_path):
+    folder, rows, page = finished
+    shutil.copytree(folder / "jobs", tmp_path / "jobs")
+    with pytest.raises(StudyError, match=r"do not say which job they belong to.*run the study again") as refused:
+        write_tables(rows.drop(columns="job"), tmp_path, tmp_path / "tables")
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "tables").exists()
+    jobs = finished_study().jobs
+    for job in jobs:
+        path = tmp_path / "jobs" / job.key / "rows.json"
+        old = json.loads(path.read_text())
+        assert {row.pop("job") for row in old["rows"]} == {job.key}
+        path.write_text(json.dumps(old))
+    again = write_table(jobs, tmp_path)
+    assert again.equals(rows)
+    # Rows alone, as they are published, need no keys.
+    (tmp_path / "alone").mkdir()
+    write_tables(rows.drop(columns="job"), tmp_path / "alone", tmp_path / "out")
+    assert (tmp_path / "out" / "overall-bo.tex").read_text() == (page.parent / "overall-bo.tex").read_text()
+
+
+def test_a_key_never_names_a_folder_elsewhere(finished):
+    folder, rows, _ = finished
+    with pytest.raises(StudyError, match=r"job '\.\./jobs' is not a plain name"):
+        read_jobs(folder, rows.assign(job="../jobs"))
 
 
 def test_pictures_need_no_files_of_jobs(finished, tmp_path):
-    _, records, _ = finished
-    page = write_study(records, tmp_path, tmp_path / "out")
+    _, rows, _ = finished
+    page = write_tables(rows, tmp_path, tmp_path / "out")
     assert [path.name for path in (tmp_path / "out" / "figures").iterdir()] == ["by-figures.png"]
     assert page.exists()
 
@@ -136,20 +168,20 @@ def test_pictures_need_no_files_of_jobs(finished, tmp_path):
     ],
 )
 def test_damaged_files_are_named(finished, tmp_path, name, content, error, message):
-    folder, records, _ = finished
+    folder, rows, _ = finished
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
-    found = read_found(tmp_path, records)
-    job = next(each for each in found.values() if each.job.method == "BO" and (each.folder / "paths.npz").exists())
+    found = read_jobs(tmp_path, rows)
+    job = next(each for each in found.values() if each.id.method == "BO" and (each.folder / "paths.npz").exists())
     (job.folder / name).write_bytes(content)
     with pytest.raises(error, match=message):
-        again = read_found(tmp_path, records)[job.job]
-        again.paths(), again.history(), again.pattern()
+        again = read_jobs(tmp_path, rows)[job.id]
+        again.paths(), again.deviation(), again.pattern()
 
 
 def test_paths_that_are_no_paths_are_named(finished, tmp_path):
-    folder, records, _ = finished
+    folder, rows, _ = finished
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
-    found = read_found(tmp_path, records)
+    found = read_jobs(tmp_path, rows)
     job = next(iter(found))
     np.savez(found[job].folder / "paths.npz", clean_xy=np.zeros((3, 3)), painted_xy=np.zeros((2, 2)))
     with pytest.raises(StudyError, match=r"holds \(3, 3\), expected finite x, y"):
@@ -157,10 +189,10 @@ def test_paths_that_are_no_paths_are_named(finished, tmp_path):
 
 
 def test_a_job_that_failed_has_a_folder_without_files(finished):
-    folder, records, _ = finished
-    failing = next(row for row in records if isinstance(row["error"], str))
-    found = read_found(folder, records)[JobId(failing["scenario"], "3", "BO", 0)]
-    assert (found.paths(), found.pattern(), found.history()) == (None, None, None)
+    folder, rows, _ = finished
+    failing = rows[rows["error"].notna()].iloc[0]
+    found = read_jobs(folder, rows)[JobId(failing["scenario"], "3", "BO", 0)]
+    assert (found.paths(), found.pattern(), found.deviation()) == (None, None, None)
 
 
 @pytest.mark.parametrize(
@@ -171,36 +203,29 @@ def test_a_job_that_failed_has_a_folder_without_files(finished):
         (
             {"kind": "surrogate", "calls": [9], "seconds": [1], "best": [7.0],
              "driven": {"calls": [15], "seconds": [60.0], "best": [1.5]}},
-            ([15.0], [60.0], [1.5]),
+            ((15,), (60.0,), (1.5,)),
         ),
         (
             {"kind": "closed loop", "calls": [2, 3], "seconds": [1, 2], "best": [4.0, 7.0], "deviation_m": [0.2, 0.1]},
-            ([2.0, 3.0], [1.0, 2.0], [0.2, 0.1]),
+            ((2, 3), (1.0, 2.0), (0.2, 0.1)),
         ),
     ],
 )  # fmt: skip
 def test_a_history_is_of_driving_alone(finished, tmp_path, content, expected):
-    folder, records, _ = finished
+    folder, rows, _ = finished
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
-    job = next(iter(read_found(tmp_path, records).values()))
+    job = next(iter(read_jobs(tmp_path, rows).values()))
     stated = {"format": "roadproof-study-history", "version": 1} | content
     (job.folder / "history.json").write_text(json.dumps(stated))
-    history = job.history()
-    if expected is None:
-        assert history is None
-    else:
-        assert (history.calls.tolist(), history.seconds.tolist(), history.deviation_m.tolist()) == expected
+    course = job.deviation()
+    assert (None if course is None else (course.calls, course.seconds, course.best)) == expected
 
 
 def test_transfer_has_its_matrix_in_the_page(finished, tmp_path):
-    _, records, _ = finished
-    rows = [
-        {**row, "found_on": "cil", "driven_by": driver}
-        for row in records
-        for driver in ("cil", "pilotnet")
-        if not isinstance(row["error"], str)
-    ]
-    page = write_study(records, tmp_path, tmp_path / "out", rows)
+    _, rows, _ = finished
+    driven = rows[rows["error"].isna()].assign(found_on="cil")
+    both = concat([driven, driven.assign(controller="pilotnet")])
+    page = write_tables(rows, tmp_path, tmp_path / "out", both)
     assert "driven by" in page.read_text()
     assert (tmp_path / "out" / "figures" / "transfer-deviation.png").exists()
     assert (tmp_path / "out" / "transfer-deviation.tex").exists()

@@ -1,17 +1,18 @@
 import pytest
+from pandas import DataFrame
 from PIL import Image
 
 from roadproof.errors import StudyError
 from roadproof.report.plots import save
-from roadproof.report.study.blocks import PENALTY
-from roadproof.report.study.table import Estimate
-from roadproof.report.study.transfer import transfer_map, transfer_of, transfer_table
+from roadproof.study.results import PENALTY
+from roadproof.study.table import Estimate
+from roadproof.study.transfer_matrix import transfer_map, transfer_table
 
 
-def drive(found_on, driven_by, deviation_m, scenario="left-01", **changed):
+def drive(found_on, controller, deviation_m, scenario="left-01", **changed):
     return {
         "found_on": found_on,
-        "driven_by": driven_by,
+        "controller": controller,
         "scenario": scenario,
         "figures": "3",
         "method": "GradOpt",
@@ -34,7 +35,7 @@ DRIVES = [
 
 
 def test_the_matrix_is_found_on_by_driven_by():
-    table = transfer_table(transfer_of(DRIVES))
+    table = transfer_table(DataFrame(DRIVES))
     assert [heading.text for heading in table.header[1]] == ["found on", "cil", "pilotnet", "robust"]
     shown = [[cell.value if isinstance(cell, Estimate) else cell for cell in row] for row in table.rows]
     assert shown == [["cil", "1.50", "0.50", "0.25"], ["pilotnet", "0.30", "1.50", "–"]]
@@ -44,13 +45,13 @@ def test_the_matrix_is_found_on_by_driven_by():
 
 
 def test_the_penalty_has_a_matrix_of_its_own():
-    table = transfer_table(transfer_of(DRIVES, PENALTY))
+    table = transfer_table(DataFrame(DRIVES), PENALTY)
     assert table.rows[0][1].value == "3.00"
     assert table.name == "transfer-infraction-penalty"
 
 
 def test_the_heat_map_is_a_picture(tmp_path):
-    picture = transfer_map(transfer_of(DRIVES))
+    picture = transfer_map(DataFrame(DRIVES))
     save(picture.figure, tmp_path / "map.png")
     with Image.open(tmp_path / "map.png") as drawn:
         assert drawn.size[0] > 300
@@ -60,14 +61,14 @@ def test_the_heat_map_is_a_picture(tmp_path):
 
 @pytest.mark.parametrize(
     ("rows", "message"),
-    [([], "no rows"), ([{"found_on": "cil"}], "no column 'driven_by'"), ([drive("a", "b", float("nan"))], "is nan")],
+    [([], "no rows"), ([{"found_on": "cil"}], "no column 'controller'"), ([drive("a", "b", float("nan"))], "is nan")],
 )
 def test_rows_that_make_no_matrix_are_named(rows, message):
     with pytest.raises(StudyError, match=message):
-        transfer_of(rows)
+        transfer_table(DataFrame(rows))
 
 
 def test_one_source_of_patterns_is_not_the_worst_of_any():
-    table = transfer_table(transfer_of([each for each in DRIVES if each["found_on"] == "cil"]))
+    table = transfer_table(DataFrame([each for each in DRIVES if each["found_on"] == "cil"]))
     assert not any(cell.best for cell in table.rows[0][1:])
     assert "bold" not in table.note

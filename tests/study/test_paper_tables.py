@@ -1,9 +1,9 @@
 import dataclasses
 
-from hand_made_study import BO, GRADOPT, bad, row
-from roadproof.report.study.blocks import DEVIATION, reference
-from roadproof.report.study.layouts import ablation_table, methods_table, paper_tables
-from roadproof.report.study.results import Method, results_of
+from hand_made_study import BO, GRADOPT, bad, results, row
+from roadproof.study.kept_jobs import StatedMethod
+from roadproof.study.paper_tables import ablation_table, methods_table, paper_tables
+from roadproof.study.results import DEVIATION
 
 
 def text(cell):
@@ -11,7 +11,7 @@ def text(cell):
 
 
 def tables_of(records, methods=(GRADOPT, BO)):
-    return {table.name: table for table in paper_tables(results_of(records, methods))}
+    return {table.name: table for table in paper_tables(results(records, methods))}
 
 
 def rows_of(table):
@@ -69,7 +69,7 @@ def test_cost_stands_beside_what_was_found(records):
 
 def test_the_ablation_compares_variants_over_what_all_have():
     variants = [
-        Method(name=name, search="gradopt", scheme=scheme, trajectories=t)
+        StatedMethod(name=name, search="gradopt", scheme=scheme, trajectories=t)
         for name, scheme, t in (("R", "random", 3), ("G3", "group", 3), ("A", "group-all", 3), ("G1", "group", 1))
     ]
     rows = [
@@ -78,22 +78,22 @@ def test_the_ablation_compares_variants_over_what_all_have():
         for k in (1, 2)
     ]
     rows[0] = bad(scenario="left-01", method="R")
-    table = ablation_table(results_of(rows, variants), variants, DEVIATION)
+    table = ablation_table(results(rows, variants), variants, DEVIATION)
     assert [(heading.text, heading.span) for heading in table.header[0]] == [
         ("", 1), ("Group", 2), ("Group-All", 1), ("Random", 1),
     ]  # fmt: skip
     assert [heading.text for heading in table.header[1]] == ["K", "T=1", "T=3", "T=3", "T=3"]
     assert rows_of(table) == [("1", "7.00", "7.00", "11.00", "8.00")]
     assert "1 job: left-01, K = 1, R, seed 0 (no luck)" in table.note
-    assert reference(variants).name == "G3"
-    named = [dataclasses.replace(each, reference=each.name == "BO") for each in (*variants, BO)]
-    assert reference(named).name == "BO", "what the plan names"
+    rows.append(row(method="BO"))
+    assert results(rows, [*variants, BO]).reference.name == "G3"
+    assert results(rows, [*variants, BO], "BO").reference.name == "BO", "what the plan names"
 
 
 def test_variants_that_differ_otherwise_go_by_their_names():
     variants = [dataclasses.replace(GRADOPT, name=name) for name in ("short", "long")]
     rows = [row(method=method.name) for method in variants]
-    table = ablation_table(results_of(rows, variants), variants, DEVIATION)
+    table = ablation_table(results(rows, variants), variants, DEVIATION)
     assert [heading.text for heading in table.header[1]] == ["K", "short", "long"]
 
 
@@ -127,7 +127,7 @@ def test_one_method_one_k_one_weather_give_what_makes_sense():
 
 def test_without_gradopt_the_first_method_is_compared():
     names = ("random", "TPE")
-    methods = [Method(name=name, search=name.lower()) for name in names]
+    methods = [StatedMethod(name=name, search=name.lower()) for name in names]
     tables = tables_of([row(method=name, search_calls=5) for name in names], methods)
     assert "overall-tpe" in tables
     assert tables["overall-tpe"].title.startswith("random and TPE")
@@ -140,7 +140,7 @@ def test_methods_whose_names_look_alike_keep_their_files_apart():
 
 
 def test_an_unknown_search_is_compared_too():
-    assert methods_table(results_of([row(method="own")])).rows[0][1] == "own"
+    assert methods_table(results([row(method="own")])).rows[0][1] == "own"
 
 
 def test_other_weathers_may_have_been_driven_alone(records):

@@ -9,10 +9,9 @@ A drive's folder is there when the drive is finished. Nothing is pickled.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -20,17 +19,13 @@ from jaxtyping import Float, Int, UInt8
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.episode import Episode
-from roadproof.errors import RecordingError, RoadproofError
-from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
-from roadproof.io.arrays import read_record, write_archive
-from roadproof.io.files import read_json, write_atomically, write_folder_atomically
+from roadproof.errors import RecordingError
+from roadproof.geometry import CameraModel, CropResize
+from roadproof.io.files import write_folder_atomically
+from roadproof.io.identity import require_same
+from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Push, Track
 from roadproof.scenarios import Scenario
-
-FORMAT = "roadproof-record"
-FORMAT_VERSION = 1
-_ABOUT = "about"
-_PER_FRAME = ("frame_number", "frames", "steer", "right_m")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -38,15 +33,18 @@ class Drive:
     """One recorded drive and its frames that show the canvas.
 
     Args:
-        name: names its folder.
+        name: name of its folder.
         push: how it was perturbed.
-        episode: the whole drive; its steer is what was done.
-        frame_number: step of each kept frame, rising.
-        frames: the controller's input there, (F, H, W, 3).
-        steer: what the driver answered to each of them.
-        right_m: offset from the clean drive at each of them, positive to the right.
-        calls: drives it took, those given up included.
+        episode: the whole drive; its steering is what was done.
+        frame_number: steps of the episode whose frames are kept, (F,).
+        frames: the controller's input at those steps, RGB, (F, H, W, 3).
+        steer: what the driver answered to each of these frames, in [−1, 1], positive to the right, (F,).
+        right_m: offset from the clean drive at each of them in metres, positive to the right, (F,).
+        calls: drives of the simulator that it took, those given up included.
         note: what the user should know; empty where there is nothing.
+
+    Raises:
+        RecordingError: there is no frame, lengths differ, or a step is not one of the episode.
     """
 
     name: str
@@ -59,9 +57,15 @@ class Drive:
     calls: int = 1
     note: str = ""
 
+    def __post_init__(self) -> None:
+        steps, count = self.frame_number, len(self.frames)
+        lengths = {values.shape for values in (steps, self.steer, self.right_m)}
+        if not count or lengths != {(count,)} or steps.min() < 0 or steps.max() >= len(self.episode):
+            raise RecordingError(f"drive {self.name} does not fit its episode of {len(self.episode)} steps")
+
     @property
-    def deviation_m(self) -> float:
-        """Largest offset from the clean drive, positive to the right."""
+    def offset_m(self) -> float:
+        """Largest offset from the clean drive in metres, positive to the right."""
         return float(self.right_m[np.abs(self.right_m).argmax()])
 
     @property
@@ -152,23 +156,13 @@ def write_settings(settings: Settings, folder: Path) -> None:
         RecordingError: it holds a recording with other settings; the message names the first.
         OutputError: it cannot be written.
     """
-    path, content = folder / "record.json", _to_json(settings)
+    path = folder / "record.json"
     if path.exists():
-        before = read_json(path, FORMAT, FORMAT_VERSION, RecordingError)
-        same = before.get("driver") == settings.driver
-        if same and before.setdefault("answers", settings.answers) != settings.answers:
-            raise RecordingError(
-                f"{folder} holds a recording of another {settings.driver or 'driver'}, which answers otherwise, as "
-                "before a training; choose another folder, or remove it"
-            )
-        for key, value in content.items():
-            if before.get(key) != value:
-                raise RecordingError(
-                    f"{folder} holds a recording with {key} {before.get(key)!r}, now it is {value!r}; "
-                    "choose another folder"
-                )
+        before = _SETTINGS.content(path)
+        _SETTINGS.made(path, before)  # damage is named as such
+        require_same(folder, "a recording", before, _SETTINGS.stated(settings), RecordingError)
         return
-    write_atomically(path, lambda part: part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
+    _SETTINGS.write(path, settings)
 
 
 def write_drive(drive: Drive, folder: Path) -> None:
@@ -180,9 +174,7 @@ def write_drive(drive: Drive, folder: Path) -> None:
 
     def write(part: Path) -> None:
         drive.episode.save(part / "episode.npz")
-        about = {"push": str(drive.push), "calls": drive.calls, "note": drive.note}
-        arrays: dict[str, Any] = {name: getattr(drive, name) for name in _PER_FRAME}
-        write_archive(part / "drive.npz", arrays | {_ABOUT: np.array(json.dumps(about))})
+        _DRIVE.write(part / "drive.npz", drive)
 
     write_folder_atomically(folder / drive.name, write)
 
@@ -197,25 +189,7 @@ def read_drive(name: str, folder: Path) -> Drive | None:
     path = folder / name / "drive.npz"
     if not path.parent.is_dir():
         return None
-    remedy = f"remove {path.parent} and record it again"
-    about, stored = read_record(path, _PER_FRAME, RecordingError, remedy, header=_ABOUT)
-    arrays: dict[str, Any] = stored
-    try:
-        drive = Drive(
-            name=name,
-            push=Push(about["push"]),
-            episode=Episode.load(path.with_name("episode.npz")),
-            calls=int(about["calls"]),
-            note=str(about["note"]),
-            **arrays,
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise RecordingError(f"{path} is damaged ({error}); {remedy}") from None
-    steps = len(drive.episode)
-    counts = {len(values) for values in (drive.frame_number, drive.frames, drive.steer, drive.right_m)}
-    if counts != {len(drive.frames)} or not len(drive.frames) or int(drive.frame_number.max()) >= steps:
-        raise RecordingError(f"{path} does not fit its episode of {steps} steps; remove {path.parent}, record it again")
-    return drive
+    return _DRIVE.read(path, name=name, episode=Episode.load(path.with_name("episode.npz")))
 
 
 def load_drives(folder: Path) -> Drives:
@@ -227,7 +201,7 @@ def load_drives(folder: Path) -> Drives:
     """
     if not (folder / "record.json").is_file():
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
-    settings = _from_json(read_json(folder / "record.json", FORMAT, FORMAT_VERSION, RecordingError), folder)
+    settings = _SETTINGS.read(folder / "record.json")
     plans = settings.trajectories.plans()
     drives = [read_drive(plan.name, folder) for plan in plans]
     missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]
@@ -236,53 +210,41 @@ def load_drives(folder: Path) -> Drives:
     return Drives(settings=settings, drives=tuple(drive for drive in drives if drive is not None))
 
 
-def _to_json(settings: Settings) -> dict[str, Any]:
-    trajectories, how = settings.trajectories, settings.trajectories.perturbation
-    content = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        **asdict(settings),
-        "trajectories": {
-            "count": trajectories.count,
-            "scheme": str(trajectories.scheme),
-            **_told(how),
-        },
-    }
-    return json.loads(json.dumps(content))  # tuples become lists, as they will be read
+class _Trajectories(TypedDict):
+    """Trajectories in record.json: flat, with the keys of one kind of perturbation."""
+
+    count: int
+    scheme: Scheme
+    swerve_m: NotRequired[tuple[float, ...]]
+    weave_m: NotRequired[tuple[float, ...]]
+    noise_deg: NotRequired[tuple[int, int]]
 
 
-def _told(how: Swerve | SteeringNoise) -> dict[str, Any]:
+def _stated(trajectories: Trajectories) -> dict[str, object]:
+    how = trajectories.perturbation
+    stated: dict[str, object] = {"count": trajectories.count, "scheme": trajectories.scheme}
     if isinstance(how, SteeringNoise):
-        return {"noise_deg": astuple(how)}
-    return {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
+        return stated | {"noise_deg": (how.low_deg, how.high_deg)}
+    return stated | {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
 
 
-def _from_json(content: dict[str, Any], folder: Path) -> Settings:
-    try:
-        scenario, chosen = content["scenario"], content["trajectories"]
-        return Settings(
-            scenario=Scenario(
-                **scenario
-                | {
-                    "start": VehicleState(**scenario["start"]),
-                    "canvas": CanvasPlacement(**scenario["canvas"]),
-                    "goal_m": (float(scenario["goal_m"][0]), float(scenario["goal_m"][1])),
-                }
-            ),
-            weather=Weather(content["weather"]),
-            trajectories=Trajectories(
-                count=chosen["count"],
-                scheme=Scheme(chosen["scheme"]),
-                perturbation=Swerve(tuple(map(float, chosen["swerve_m"])), tuple(map(float, chosen.get("weave_m", ()))))
-                if "swerve_m" in chosen
-                else SteeringNoise(*map(int, chosen["noise_deg"])),
-            ),
-            window=Window(**content["window"]),
-            seed=int(content["seed"]),
-            driver=str(content["driver"]),
-            camera=CameraModel(**content["camera"]),
-            view=CropResize(**content["view"]),
-            dt_s=float(content["dt_s"]),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, RoadproofError) as error:
-        raise RecordingError(f"{folder / 'record.json'} is incomplete or damaged ({error}); record it again") from None
+def _meant(stated: _Trajectories) -> Trajectories:
+    noise = stated.get("noise_deg")
+    how = SteeringNoise(*noise) if noise else Swerve(stated.get("swerve_m", ()), stated.get("weave_m", ()))
+    return Trajectories(count=stated["count"], scheme=stated["scheme"], perturbation=how)
+
+
+_SETTINGS = RecordFile(
+    kind=Settings,
+    name="roadproof-record",
+    error=RecordingError,
+    remedy="record it again",
+    forms={"trajectories": Form(_Trajectories, _stated, _meant)},
+)
+_DRIVE = RecordFile(
+    kind=Drive,
+    error=RecordingError,
+    remedy="remove its folder and record it again",
+    elsewhere=("name", "episode"),
+    header="about",
+)

@@ -1,4 +1,4 @@
-"""What drives to learn from are made of: random ways through a map, and the knocks that make recovery worth recording.
+"""Random scenarios to learn from, and the disturbances that make the expert's recovery worth recording.
 
 Convention:
     Offsets and headings are positive to the left, `steer` to the right, as everywhere.
@@ -10,11 +10,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from roadproof.datatypes import Command, Control, VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.lanes import Lane
 from roadproof.roads.maps import check_canvas, scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.roads.routes import Route
@@ -55,18 +55,18 @@ def random_scenario(
     command: Command = Command.FOLLOW,
     displacement: Displacement | None = None,
 ) -> Scenario:
-    """A random way through a map, 60 to 150 m long, with a canvas at a random place on it.
+    """A random route through a map, 60 to 150 m long, with a canvas at a random place on it.
 
     Args:
         roads: the map.
         map_name: its name.
         generator: where the randomness comes from.
         name: of the scenario.
-        command: one of the junctions on the way asks for it; follow asks for nothing.
+        command: one of the junctions on the route asks for it; follow asks for nothing.
         displacement: how the car starts; None starts it at rest in the middle of its lane.
 
     Raises:
-        ScenarioError: the map has no such way.
+        ScenarioError: the map has no such route.
     """
     driving = [lane for lane in roads.lanes if lane.kind == "driving"]
     lengths = np.array([lane.length_m for lane in driving])
@@ -74,7 +74,7 @@ def random_scenario(
         lane = driving[int(generator.choice(len(driving), p=lengths / lengths.sum()))]
         at_m, reach_m = generator.uniform(0.0, lane.length_m), generator.uniform(*LENGTHS_M)
         goal = _walk(roads, lane.index, at_m, reach_m, generator)
-        start = _start(*_on(lane.centre, lane.stations_m, lane.headings_rad, at_m), displacement, generator)
+        start = _start(lane, at_m, displacement, generator)
         if goal is None or math.dist(goal, (start.x_m, start.y_m)) < 20.0:
             continue
         try:
@@ -97,10 +97,10 @@ def random_scenario(
         except ScenarioError:
             continue
         return scenario
-    raise ScenarioError(f"no way of {LENGTHS_M[0]:.0f} m with the command {command.name} was found on map {map_name}")
+    raise ScenarioError(f"no route of {LENGTHS_M[0]:.0f} m with the command {command.name} was found on map {map_name}")
 
 
-class Knocks:
+class Disturbance:
     """Disturbs the controls of one drive: triangles on the steering, steps on the pedals, with pauses between them.
 
     Args:
@@ -152,26 +152,12 @@ def _walk(
     end = roads.lanes[lane]
     if end.junction is not None:
         return None
-    x, y, _ = _on(end.centre, end.stations_m, end.headings_rad, left_m)
+    x, y, *_ = end.at(left_m)
     return x, y
 
 
-def _on(
-    centre: Float[np.ndarray, "n 3"],
-    stations_m: Float[np.ndarray, " n"],
-    headings: Float[np.ndarray, " n"],
-    at_m: float,
-) -> tuple[float, float, float]:
-    return (
-        float(np.interp(at_m, stations_m, centre[:, 0])),
-        float(np.interp(at_m, stations_m, centre[:, 1])),
-        float(np.interp(at_m, stations_m, headings)),
-    )
-
-
-def _start(
-    x: float, y: float, yaw: float, displacement: Displacement | None, generator: np.random.Generator
-) -> VehicleState:
+def _start(lane: Lane, at_m: float, displacement: Displacement | None, generator: np.random.Generator) -> VehicleState:
+    x, y, _, yaw = lane.at(at_m)
     aside = turn = speed = 0.0
     if displacement is not None:
         d = displacement

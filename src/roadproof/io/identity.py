@@ -1,0 +1,69 @@
+"""What a folder was made of: named parts, kept with what was made, so that one thing is never taken for another."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+from roadproof.errors import RoadproofError
+
+ANSWERS = "answers"
+"""The part that says which controller it was (`controllers.identity`), whatever it is called."""
+
+_MOST_CHARACTERS = 60
+
+
+def stated(parts: object) -> str:
+    """Parts as one text, the same for the same parts."""
+    return json.dumps(parts, sort_keys=True, default=str)
+
+
+def digest(text: str) -> str:
+    """SHA-256 of a text, 64 hexadecimal digits."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def require_same(
+    folder: Path, what: str, before: object, now: Mapping[str, object], error: type[RoadproofError]
+) -> None:
+    """Refuse to go on in a folder where something of other parts was begun.
+
+    Args:
+        folder: that was begun.
+        what: it holds, for the message: "a run".
+        before: its parts, as JSON has them. A part that is not among them is not compared: the folder is older than
+            the word.
+        now: the parts of what is to be done in it.
+        error: what to raise.
+
+    Raises:
+        error: a part differs; the message names the first, with what it was and what it is.
+    """
+    known = cast("dict[str, object]", before) if isinstance(before, dict) else {}
+    for part, value in cast("dict[str, object]", json.loads(json.dumps(now, default=str))).items():
+        if part not in known or known[part] == value:
+            continue
+        if part == ANSWERS:
+            raise error(
+                f"{folder} holds {what} of another controller, which answers otherwise, as before a training; choose "
+                "another folder, or remove it"
+            )
+        name, was, now_is = _first_difference(part, known[part], value)
+        raise error(f"{folder} holds {what} with {name} {was}, now it is {now_is}; choose another folder, or remove it")
+
+
+def _first_difference(name: str, before: object, now: object) -> tuple[str, str, str]:
+    """Which leaf of a part differs, and what it was and is, cut to a few words."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        one, other = cast("dict[str, object]", before), cast("dict[str, object]", now)
+        key = next(key for key in one | other if one.get(key) != other.get(key))
+        return _first_difference(f"{name}.{key}", one.get(key), other.get(key))
+    texts = [repr(each) for each in cast("list[object]", [before, now])]
+    if max(map(len, texts)) > _MOST_CHARACTERS:
+        same = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
+        first = max(same - _MOST_CHARACTERS // 3, 0)
+        texts = [f"…{text[first : first + _MOST_CHARACTERS]}…" for text in texts]
+    return name, texts[0], texts[1]

@@ -1,0 +1,184 @@
+"""What simulators share beside graphics and physics: they are opened before a reset, and reset before a step."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from roadproof.datatypes import Control, Observation, VehicleState, Weather
+from roadproof.errors import SimulatorError
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
+from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.routes import Route, RoutePosition
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage, Pictures
+from roadproof.simulators.tracker.drive import DriveTracker, Request, RouteTracker
+from roadproof.traffic.agents import Agents
+
+DriveT = TypeVar("DriveT", bound=DriveTracker)
+RouteDriveT = TypeVar("RouteDriveT", bound=RouteTracker)
+Opened = TypeVar("Opened", bound="TrackedSimulator[Any]")
+
+
+class TrackedSimulator(ABC, Generic[DriveT]):
+    """A simulator whose drives are tracked; a subclass opens and closes its world, moves the car and sees.
+
+    Args:
+        camera: the camera on the car.
+        input: how the controller's frame is cut from its picture.
+        dt_s: seconds per step.
+
+    Raises:
+        SimulatorError: the crop leaves the camera picture.
+    """
+
+    def __init__(self, camera: CameraModel, input: CropResize, dt_s: float) -> None:  # noqa: A002
+        if input.right_px > camera.width_px or input.bottom_px > camera.height_px:
+            raise SimulatorError(
+                f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
+                f"{camera.width_px}×{camera.height_px} pixels"
+            )
+        self._camera, self._input, self._dt_s = camera, input, dt_s
+        self._is_open = False
+        self._drive: DriveT | None = None
+
+    @property
+    def camera(self) -> CameraModel:
+        """The camera on the car; full pictures have its size."""
+        return self._camera
+
+    @property
+    def input(self) -> CropResize:
+        """How the controller's frame is cut from the camera picture."""
+        return self._input
+
+    @property
+    def dt_s(self) -> float:
+        """Simulated seconds per step."""
+        return self._dt_s
+
+    @property
+    def state(self) -> VehicleState:
+        """Where the car is now.
+
+        Raises:
+            SimulatorError: there was no reset.
+        """
+        return self._running().state
+
+    def __enter__(self: Opened) -> Opened:
+        self._open()
+        self._is_open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end_drive()
+        self._close()
+        self._is_open = False
+
+    def reset(
+        self,
+        scenario: Scenario,
+        *,
+        weather: Weather = Weather.CLEAR_NOON,
+        pattern: PatternImage | None = None,
+        cars: int = 0,
+        pedestrians: int = 0,
+        seed: int = 0,
+        full_pictures: Pictures = False,
+    ) -> Observation:
+        """Begin a drive; see `roadproof.simulators.protocol.Simulator.reset`.
+
+        Raises:
+            SimulatorError: the simulator is not open, cannot begin, or an argument does not fit.
+            ScenarioError: the scenario does not fit its map.
+        """
+        if not self._is_open:
+            raise SimulatorError("the simulator is closed; use it in a with-block")
+        shape = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
+        if pattern is not None and (pattern.shape != shape or pattern.dtype != np.uint8):
+            raise SimulatorError(
+                f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {shape} (RGBA)"
+            )
+        request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, full_pictures)
+        self._drive = self._begin(request)
+        return self._observe(self._drive)
+
+    def step(self, control: Control) -> Observation:
+        """Drive on for `dt_s`; values of the control outside their range are clipped.
+
+        Raises:
+            SimulatorError: there was no reset, or the simulator does not answer.
+        """
+        drive = self._running()
+        self._advance(drive, control.clipped())
+        drive.steps += 1
+        return self._observe(drive)
+
+    def _running(self) -> DriveT:
+        if self._drive is None:
+            raise SimulatorError("there is no drive; call reset first")
+        return self._drive
+
+    def _end_drive(self) -> None:
+        """Free what the drive under way holds, if there is one."""
+        self._drive = None
+
+    def _open(self) -> None:
+        """Make the world ready for the first reset."""
+
+    def _close(self) -> None:
+        """Free everything that is held."""
+
+    @abstractmethod
+    def _begin(self, request: Request) -> DriveT:
+        """End the drive under way and begin another; pattern and weather are known to be valid."""
+
+    @abstractmethod
+    def _advance(self, drive: DriveT, control: Control) -> None:
+        """Take a step."""
+
+    @abstractmethod
+    def _observe(self, drive: DriveT) -> Observation:
+        """What is seen, and what happened in the last step."""
+
+
+class RouteSimulator(TrackedSimulator[RouteDriveT]):
+    """A simulator with a map: its drives follow a route among traffic and are judged.
+
+    Route, place, cars and pedestrians are those of the current drive; without one they raise a SimulatorError.
+    """
+
+    @property
+    def route(self) -> Route:
+        """The way to the goal."""
+        return self._running().route
+
+    @property
+    def place(self) -> RoutePosition:
+        """Where the car is along the route."""
+        return self._running().place
+
+    @property
+    def cars(self) -> Agents:
+        """The other cars as they are now."""
+        return self._running().cars
+
+    @property
+    def pedestrians(self) -> Agents:
+        """The people as they are now."""
+        return self._running().pedestrians
+
+    @abstractmethod
+    def road_map(self, name: str) -> RoadMap:
+        """The map a scenario names; it needs no drive.
+
+        Raises:
+            ScenarioError: there is no such map, or it cannot be read.
+            SimulatorError: the simulator does not answer.
+        """

@@ -1,0 +1,72 @@
+"""How a search went, against simulator calls and seconds: history.json in the folder of a job."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from roadproof.errors import StudyError
+from roadproof.io.files import read_json
+from roadproof.io.records import record
+
+FORMAT, VERSION = "roadproof-study-history", 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Course:
+    """A value as a search went on: three lists of equal length.
+
+    Args:
+        calls: simulator calls when each value was known.
+        seconds: since the search began, of each.
+        best: the value of the best pattern so far.
+    """
+
+    calls: tuple[int, ...]
+    seconds: tuple[float, ...]
+    best: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.calls) == len(self.seconds) == len(self.best):
+            raise ValueError("its lists are not equally long")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class History(Course):
+    """The course of a search in its own measure, and what is known of it in metres.
+
+    Args:
+        kind: whether the values come from drives, or from composited frames.
+        measure: what the search makes large.
+        deviation_m: of a search that drives: metres, by the pattern that was best by then in the search's measure.
+        driven: of a search on composited frames: metres, by the pattern that was driven in the end, if one was.
+    """
+
+    kind: Literal["closed loop", "surrogate"]
+    measure: str = ""
+    deviation_m: tuple[float, ...] | None = None
+    driven: Course | None = None
+
+    @property
+    def deviation(self) -> Course | None:
+        """The metres that the best patterns reached when driven, never a value of the surrogate; None where unknown."""
+        if self.kind == "surrogate":
+            return self.driven if self.driven is not None and self.driven.best else None
+        return Course(calls=self.calls, seconds=self.seconds, best=self.deviation_m) if self.deviation_m else None
+
+    def to_json(self) -> bytes:
+        """The file's content."""
+        kept = {name: value for name, value in asdict(self).items() if value is not None}
+        return (json.dumps({"format": FORMAT, "version": VERSION, **kept}) + "\n").encode()
+
+
+def read_history(path: Path) -> History:
+    """Read what `History.to_json` wrote.
+
+    Raises:
+        StudyError: the file is missing, damaged or of another format.
+    """
+    again = "remove its folder and run the study again"
+    return record(read_json(path, FORMAT, VERSION, StudyError), History, path, StudyError, again)

@@ -1,0 +1,244 @@
+"""The paper's tables, from one study: ablation, methods against each other overall, by scenario type and by weather.
+
+Where the study has no traffic, penalties are those of drives alone. A table that would have nothing to compare is left
+out. In every row that compares two methods both means are over the cases that both have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from roadproof.driving.intervals import Mean
+from roadproof.report.formatting import MISSING, in_words
+from roadproof.scenarios import KINDS
+from roadproof.study.kept_jobs import StatedMethod
+from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, PENALTY, Block, Metric, Results
+from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios, paired
+from roadproof.study.table import Cell, Estimate, Heading, Table, headings, slug
+from roadproof.study.table_notes import table_note
+
+SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}
+GAPS = "missing"
+"""The table of what failed or is missing; there is none where nothing is."""
+
+
+def paper_tables(results: Results) -> tuple[Table, ...]:
+    """Every table that makes sense for a study, in the paper's order; what failed comes last."""
+    tables = [methods_table(results)]
+    gradopt = [method for method in results.methods if method.search == "gradopt"]
+    if len(gradopt) > 1:
+        tables += [ablation_table(results, gradopt, metric) for metric in (DEVIATION, PENALTY)]
+    taken: set[str] = set()
+    for theirs in results.rivals:
+        name = slug(theirs.name)
+        while name in taken:
+            name += "-2"
+        taken.add(name)
+        tables += _against(results, results.reference.name, theirs.name, name)
+    return (*tables, *gaps_table(results))
+
+
+def _against(results: Results, ours: str, theirs: str, name: str) -> list[Table]:
+    """The tables of two methods."""
+    home, busy, alone = results.home, results.has(traffic=True), not results.has(traffic=False)
+
+    def table(kind: str, title: str, blocks: Sequence[Block]) -> Table:
+        return _compare_table(results, ours, theirs, blocks, f"{kind}-{name}", f"{ours} and {theirs}: {title}")
+
+    differences = f"{ours} and {theirs}: differences pair by pair"
+    tables = [
+        table("overall", f"all scenarios, {in_words(home)}", results.overall),
+        _paired_table(results, ours, theirs, results.overall, f"paired-{name}", differences),
+    ]
+    kinds = [kind for kind in KINDS if kind in results.kinds.values()]
+    if len(kinds) > 1:
+
+        def by_type(metric: Metric, traffic: bool) -> list[Block]:
+            return [Block(kind.capitalize(), metric, home, traffic, kind) for kind in kinds]
+
+        tables.append(table("type-penalty", "infraction penalty by scenario type", by_type(PENALTY, busy)))
+        if busy and not alone:
+            tables.append(table("type-static", "penalty by scenario type, static only", by_type(PENALTY, False)))
+        tables.append(table("type-deviation", "deviation by scenario type", by_type(DEVIATION, alone)))
+    others = results.weathers[1:]
+    if others:
+        blocks = [_penalty_at(results, weather, busy) for weather in others]
+        tables.append(table("weathers", f"infraction penalty in other weathers than {in_words(home)}", blocks))
+    for weather in others:
+        blocks = [Block(each.title, each, weather, alone) for each in (DEVIATION, PENALTY)]
+        where = "in traffic" if alone else "alone on the road"
+        tables.append(table(f"{slug(weather)}-alone", f"all scenarios, {in_words(weather)}, {where}", blocks))
+    return tables
+
+
+def _penalty_at(results: Results, weather: str, busy: bool) -> Block:
+    """The penalty in a weather; a study may have traffic in its first one alone, which is then said."""
+    traffic = results.has(traffic=True, weather=weather)
+    heading = in_words(weather).capitalize() + (" (alone)" if busy and not traffic else "")
+    return Block(heading, PENALTY, weather, traffic)
+
+
+def _compare_table(results: Results, ours: str, theirs: str, blocks: Sequence[Block], name: str, title: str) -> Table:
+    """The paper's layout: for each K and block theirs, ours, and in how many cases ours is at least theirs."""
+    rows: list[tuple[Cell, ...]] = []
+    for figures in results.figures:
+        cells: list[Cell] = [figures]
+        for block in blocks:
+            found = paired(results.values(block, ours, figures), results.values(block, theirs, figures))
+            cells += [*_row_of([found.theirs, found.ours]), _share(found.at_least)] if found else [MISSING] * 3
+        rows.append(tuple(cells))
+    said = f"% ≥: cases (scenario and seed) in which {ours} is at least {theirs}, of those that both have."
+    return Table(
+        name=name,
+        title=title,
+        note=table_note(results, blocks, (ours, theirs), said),
+        header=(
+            (Heading(""), *(Heading(block.heading, 3) for block in blocks)),
+            headings("K", *(theirs, ours, "% ≥") * len(blocks)),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _paired_table(results: Results, ours: str, theirs: str, blocks: Sequence[Block], name: str, title: str) -> Table:
+    """Mean differences with intervals, ties, and Wilcoxon's test, for each K and for all together."""
+    rows: list[tuple[Cell, ...]] = []
+    for block in blocks:
+        wanted = [*results.figures, *([None] if len(results.figures) > 1 else [])]
+        for number, figures in enumerate(wanted):
+            found = paired(results.values(block, ours, figures), results.values(block, theirs, figures))
+            where = (block.heading if number == 0 else "", figures or "all")
+            if found is None:
+                rows.append((*where, *[MISSING] * 6))
+                continue
+            p = MISSING if found.p is None else "< 0.001" if found.p < 0.001 else f"{found.p:.3f}"
+            share = Estimate(found.at_least, 0, unit="%")
+            counts = (str(found.difference.count), str(len(found.by_scenario)))
+            rows.append((*where, Estimate(found.difference), share, str(found.ties), p, *counts))
+    said = (
+        f"Difference: {ours} less {theirs}, above 0 where {ours} is stronger. p: two-sided Wilcoxon signed-rank "
+        "test of the scenarios’ mean differences, not corrected for the number of rows."
+    )
+    return Table(
+        name=name,
+        title=title,
+        note=table_note(results, blocks, (ours, theirs), said),
+        header=(headings("", "K", "difference", "% ≥", "ties", "p", "pairs", "scenarios"),),
+        rows=tuple(rows),
+        left=2,
+    )
+
+
+def ablation_table(results: Results, variants: Sequence[StatedMethod], metric: Metric) -> Table:
+    """The paper's ablation: one metric for each K and variant of GradOpt, over the cases that all variants have."""
+    traffic = results.has(traffic=True) if metric is PENALTY else not results.has(traffic=False)
+    ordered = sorted(variants, key=lambda method: (list(SCHEMES).index(method.scheme), method.trajectories))
+    facts = [(method.scheme, method.trajectories) for method in ordered]
+    labels = [
+        f"T={method.trajectories}" if facts.count((method.scheme, method.trajectories)) == 1 else method.name
+        for method in ordered
+    ]
+    names = [method.name for method in ordered]
+    block = Block(metric.title, metric, results.home, traffic)
+    rows: list[tuple[Cell, ...]] = []
+    for figures in results.figures:
+        values = [results.values(block, name, figures) for name in names]
+        common = values[0].index
+        for own in values[1:]:
+            common = common.intersection(own.index, sort=False)
+        rows.append((figures, *_row_of([mean_over_scenarios(own.loc[common]) for own in values])))
+    spans = {scheme: sum(method.scheme == scheme for method in ordered) for scheme in SCHEMES}
+    return Table(
+        name=f"ablation-{slug(metric.title)}",
+        title=f"Variants of GradOpt: {metric.title.lower()}, {in_words(results.home)}",
+        note=table_note(results, [block], names, "Each row is over the cases that all variants have."),
+        header=(
+            (Heading(""), *(Heading(SCHEMES[scheme], span) for scheme, span in spans.items() if span)),
+            headings("K", *labels),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def methods_table(results: Results) -> Table:
+    """What every method found, and what finding it took: simulator calls and seconds of the search."""
+    blocks = results.overall
+    lane = replace(blocks[0], metric=LEFT_LANE)
+    names = [method.name for method in results.methods]
+    rows: list[tuple[Cell, ...]] = []
+    for figures in results.figures:
+        shown = [
+            _row_of([mean_over_scenarios(results.values(block, name, figures)) for name in names]) for block in blocks
+        ]
+        for number, name in enumerate(names):
+            searches = results.drives[(results.drives["method"] == name) & (results.drives["figures"] == figures)]
+            costs = searches.drop_duplicates(JOB)
+            rows.append((
+                figures if number == 0 else "",
+                name,
+                str(len(costs)),
+                _rounded(costs["search_calls"]),
+                _rounded(costs["search_seconds"]),
+                *(column[number] for column in shown),
+                _spread(results.drives_of(blocks[0], [name], figures)["deviation_m"]),
+                _share(mean_over_scenarios(results.values(lane, name, figures))),
+            ))  # fmt: skip
+    said = (
+        "Simulator calls and seconds: mean of one search, without judging its pattern. Median "
+        "and quartiles: over all drives, each from a start of its own. Leave the lane: share of those drives."
+    )
+    columns = ("patterns", "simulator calls", "seconds", "deviation", "penalty", "median", "leave the lane")
+    return Table(
+        name="methods",
+        title=f"What each method found and what it cost, {in_words(results.home)}",
+        note=table_note(results, blocks, names, said),
+        header=(
+            (*headings("", "", ""), Heading("Search", 2), Heading("Found", 4)),
+            headings("K", "method", *columns),
+        ),
+        rows=tuple(rows),
+        left=2,
+    )
+
+
+def gaps_table(results: Results) -> tuple[Table, ...]:
+    """Every job that failed or is not complete, and why; no table where all are done."""
+    gaps = results.gaps()
+    if not gaps:
+        return ()
+    return (
+        Table(
+            name=GAPS,
+            title="What failed or is missing",
+            note=f"{len(gaps)} of {len(results.jobs)} jobs. The same study run again tries them again.",
+            header=(headings("scenario", "K", "method", "seed", "why"),),
+            rows=tuple((*map(str, job), reason) for job, reason in gaps.items()),
+            left=5,
+        ),
+    )
+
+
+def _row_of(means: Sequence[Mean | None]) -> list[Cell]:
+    """Means side by side, the highest marked; equal ones all, unless all are equal."""
+    values = [mean.value for mean in means if mean is not None]
+    top = max(values, default=0.0)
+    one = min(values, default=0.0) < top - EQUAL
+    return [MISSING if mean is None else Estimate(mean, best=one and mean.value >= top - EQUAL) for mean in means]
+
+
+def _spread(values: Values) -> str:
+    """Median and quartiles."""
+    if values.empty:
+        return MISSING
+    low, middle, high = values.quantile([0.25, 0.5, 0.75])
+    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _share(mean: Mean | None) -> str:
+    return MISSING if mean is None else f"{mean.value:.0%}"
+
+
+def _rounded(values: Values) -> str:
+    mean = values.mean()
+    return MISSING if values.empty else f"{mean:.0f}" if mean >= 10 or mean == int(mean) else f"{mean:.1f}"

@@ -1,0 +1,234 @@
+"""The rows of a study as numbers to be compared: a case is one pattern in one weather, alone or in traffic."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from roadproof.errors import StudyError
+from roadproof.report.formatting import in_words
+from roadproof.study.kept_jobs import StatedMethod
+from roadproof.study.plan import BLACK
+from roadproof.study.rows import Frame, JobColumns, JobId
+from roadproof.study.statistics import Values
+
+JOB, CONDITION = list(JobId._fields), ["weather", "traffic"]
+NUMBERS = ["deviation_m", "left_lane", "points", "clean_points", "search_calls", "search_seconds"]
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A column of the rows, and how tables call it."""
+
+    column: str
+    title: str
+    unit: str
+
+
+DEVIATION = Metric("deviation_m", "Deviation", "m")
+LEFT_LANE = Metric("left_lane", "Leave the lane", "share of drives")
+PENALTY = Metric("points", "Infraction penalty", "points")
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Columns of a table that belong together: one metric under one condition.
+
+    Args:
+        heading: over them.
+        metric: what they hold.
+        weather: of the drives.
+        traffic: whether there were others on the road.
+        kind: of the scenarios; None takes all.
+    """
+
+    heading: str
+    metric: Metric
+    weather: str
+    traffic: bool
+    kind: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Results:
+    """A study's numbers. All of them but the costs are of driving.
+
+    Args:
+        drives: the rows of jobs that came to their end, one a drive.
+        failures: why a job did not come to its end.
+        methods: in the rows' order.
+        named: the method that the plan compares with the others; None where it names none.
+        kinds: of each scenario.
+        figures: K, in order, one black figure first.
+        seeds: in order.
+        weathers: of the drives; patterns were found in the first.
+    """
+
+    drives: Frame
+    failures: Mapping[JobId, str]
+    methods: tuple[StatedMethod, ...]
+    named: str | None
+    kinds: Mapping[str, str]
+    figures: tuple[str, ...]
+    seeds: tuple[int, ...]
+    weathers: tuple[str, ...]
+
+    @property
+    def home(self) -> str:
+        """The weather in which patterns were found."""
+        return self.weathers[0]
+
+    def has(self, *, traffic: bool, weather: str | None = None) -> bool:
+        """Whether any drive, of a weather or at all, was in traffic, or alone."""
+        drives = self.drives if weather is None else self.drives[self.drives["weather"] == weather]
+        return bool((drives["traffic"] == traffic).any())
+
+    @property
+    def overall(self) -> tuple[Block, Block]:
+        """Deviation alone and penalty in traffic, as the paper has them, in the weather in which patterns were found.
+
+        Where the study drove only alone, or only in traffic, both are of that.
+        """
+        return (
+            Block(DEVIATION.title, DEVIATION, self.home, not self.has(traffic=False)),
+            Block(PENALTY.title, PENALTY, self.home, self.has(traffic=True)),
+        )
+
+    @property
+    def reference(self) -> StatedMethod:
+        """What others are compared with: the plan's method, else GradOpt in groups of three, any GradOpt, the first."""
+        named = [method for method in self.methods if method.name == self.named]
+        gradopt = [method for method in self.methods if method.search == "gradopt"]
+        usual = [method for method in gradopt if (method.scheme, method.trajectories) == ("group", 3)]
+        return [*named, *usual, *gradopt, *self.methods][0]
+
+    @property
+    def rivals(self) -> tuple[StatedMethod, ...]:
+        """The methods that the reference is compared with; other variants of GradOpt have the ablation."""
+        ours = self.reference
+        return tuple(method for method in self.methods if method.search != "gradopt" and method != ours)
+
+    @property
+    def compared(self) -> list[str]:
+        """Names of the reference and its rivals; in pictures, variants of GradOpt would only hide one another."""
+        return [self.reference.name, *(method.name for method in self.rivals)]
+
+    def drives_of(self, block: Block, methods: Collection[str], figures: str | None = None) -> Frame:
+        """The drives under a block's condition over the patterns of some methods, of one K or all."""
+        drives = self.drives
+        kept = drives["method"].isin(methods)
+        wanted = {"figures": figures, "weather": block.weather, "traffic": block.traffic, "kind": block.kind}
+        for column, value in wanted.items():
+            if value is not None:
+                kept &= drives[column] == value
+        return drives[kept]
+
+    def values(self, block: Block, method: str, figures: str | None = None) -> Values:
+        """A block's metric of every scenario and seed, the mean of their drives; with None for K, of every K too."""
+        cases = ["scenario", "seed", *([] if figures else ["figures"])]
+        return self.drives_of(block, [method], figures).groupby(cases, sort=False)[block.metric.column].mean()
+
+    @property
+    def jobs(self) -> tuple[JobId, ...]:
+        """Every combination of the scenarios, K, methods and seeds that occur, done or not."""
+        names = [method.name for method in self.methods]
+        return tuple(JobId(*job) for job in product(self.kinds, self.figures, names, self.seeds))
+
+    def gaps(
+        self, methods: Collection[str] | None = None, conditions: Collection[tuple[str, bool]] | None = None
+    ) -> dict[JobId, str]:
+        """What a table of these methods, weathers and traffic lacks, and why.
+
+        Args:
+            methods: names; None takes all.
+            conditions: weather and whether in traffic; None takes all that occur.
+        """
+        counts = self.drives.groupby([*JOB, *CONDITION]).size().unstack(CONDITION, fill_value=0)
+        kept = counts[[where for where in counts if conditions is None or where in conditions]]
+        most, of_job = dict(kept.max()), kept.to_dict("index")
+        found: dict[JobId, str] = {}
+        for job in self.jobs:
+            if methods is not None and job.method not in methods:
+                continue
+            own = of_job.get(job, {})
+            lacking = [where for where in own if own[where] < most[where]]
+            if job not in of_job:
+                found[job] = self.failures.get(job, "no row; not done yet")
+            elif lacking:
+                found[job] = "; ".join(
+                    f"{own[where]} of {most[where]} drives at {in_words(where[0])}{' in traffic' if where[1] else ''}"
+                    for where in lacking
+                )
+        return found
+
+
+def results_of(rows: Frame, methods: Iterable[StatedMethod] = (), named: str | None = None) -> Results:
+    """Sort a study's rows into drives and failures.
+
+    Args:
+        rows: of the study; the first weather is the one in which patterns were found.
+        methods: what is known of them besides their names.
+        named: the method that the plan compares with the others.
+
+    Raises:
+        StudyError: there is no row, a column is missing, a number is not finite, or every job failed.
+    """
+    check_jobs(rows)
+    is_bad = (rows["error"].notna() & (rows["error"] != "")).astype(bool)
+    bad, drives = rows[is_bad], rows[~is_bad]
+    failures = {JobId(*row): reason for *row, reason in bad[[*JOB, "error"]].itertuples(index=False)}
+    if drives.empty:
+        job, reason = next(iter(failures.items()))
+        raise StudyError(f"no job came to its end; the first of {len(failures)} that failed ({job}): {reason}")
+    _check_columns(drives, [*CONDITION, *NUMBERS])
+    for name in NUMBERS:
+        check_finite(drives, name)
+    known = {method.name: method for method in methods}
+    return Results(
+        drives=drives.astype({"traffic": bool, **dict.fromkeys(NUMBERS, float)}),
+        failures=failures,
+        methods=tuple(known.get(name, StatedMethod(name=name)) for name in rows["method"].unique()),
+        named=named,
+        kinds=dict(zip(rows["scenario"], rows["kind"], strict=True)),
+        figures=tuple(sorted(rows["figures"].unique(), key=_by_number)),
+        seeds=tuple(sorted(map(int, rows["seed"].unique()))),
+        weathers=tuple(drives["weather"].unique()),
+    )
+
+
+def check_jobs(rows: Frame) -> None:
+    """See that rows say which job each belongs to, and whether it failed.
+
+    Raises:
+        StudyError: there is no row, or a column is missing.
+    """
+    if rows.empty:
+        raise StudyError("the study has no rows yet; run it first")
+    _check_columns(rows, [name for name in (*JobColumns.__annotations__, "error") if name != "job"])
+
+
+def check_finite(rows: Frame, column: str) -> None:
+    """See that a column holds finite numbers.
+
+    Raises:
+        StudyError: it does not; names the first that is none.
+    """
+    try:
+        wrong = rows[~np.isfinite(rows[column].astype(float))]
+    except (TypeError, ValueError) as error:
+        raise StudyError(f"{column} of the rows is not all numbers ({error}); run the study again") from None
+    for *job, value in wrong[[*JOB, column]].itertuples(index=False):
+        raise StudyError(f"{JobId(*job)}: {column} is {value}, expected a finite number; run the study again")
+
+
+def _by_number(figures: str) -> tuple[int, str]:
+    return (0, "") if figures == BLACK else (int(figures) if figures.isdecimal() else 1 << 30, figures)
+
+
+def _check_columns(rows: Frame, columns: Iterable[str]) -> None:
+    for column in columns:
+        if column not in rows:
+            raise StudyError(f"the study's rows have no column {column!r}; run the study again, finished jobs are kept")
