@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from roadproof.errors import StudyError
-from roadproof.io.files import read_json
-from roadproof.io.records import record
-
-FORMAT, VERSION = "roadproof-study-history", 1
+from roadproof.io.records import RecordFile
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,8 +55,16 @@ class History(Course):
 
     def to_json(self) -> bytes:
         """The file's content."""
-        kept = {name: value for name, value in asdict(self).items() if value is not None}
-        return (json.dumps({"format": FORMAT, "version": VERSION, **kept}) + "\n").encode()
+        kept = {name: value for name, value in _FILE.stated(self).items() if value is not None}
+        return (json.dumps({"format": _FILE.name, "version": _FILE.version, **kept}) + "\n").encode()
+
+
+_FILE = RecordFile(
+    kind=History,
+    name="roadproof-study-history",
+    error=StudyError,
+    remedy="remove its folder and run the study again",
+)
 
 
 def read_history(path: Path) -> History:
@@ -68,5 +73,4 @@ def read_history(path: Path) -> History:
     Raises:
         StudyError: the file is missing, damaged or of another format.
     """
-    again = "remove its folder and run the study again"
-    return record(read_json(path, FORMAT, VERSION, StudyError), History, path, StudyError, again)
+    return _FILE.read(path)
