@@ -333,7 +333,7 @@ def _recorded(run: Run) -> Fields | None:
                 "name": name,
                 "push": MISSING if kept is None else str(kept.push),
                 "frames": MISSING if kept is None else str(len(kept.frames)),
-                "aside": MISSING if drive is None else _aside(-drive.deviation_m),
+                "aside": MISSING if drive is None else _aside(-drive.offset_m),
                 "note": "" if drive is None else drive.note,
             }
         )
