@@ -8,7 +8,16 @@ import pytest
 import torch
 from safetensors import SafetensorError
 
-from roadproof.attacks import AttackResult, GradOpt, PathDeviation, Published, SteeringShift, Surrogate, attack
+from roadproof.attacks import (
+    AttackResult,
+    GradOpt,
+    PathDeviation,
+    Published,
+    SteeringShift,
+    Surrogate,
+    attack,
+    kept_attack,
+)
 from roadproof.attacks.gradopt import Rung, dropping, gradopt, random_search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.methods import method_of
@@ -298,6 +307,34 @@ def test_a_result_is_the_same_when_loaded(tmp_path):
     np.testing.assert_allclose(loaded.history, result.history, atol=1e-6)
     for name in ("group", "surrogate_shift", "by_group", "cost", "checks", "space", "method", "seed"):
         assert getattr(loaded, name) == getattr(result, name), name
+
+
+def test_a_search_that_was_kept_is_read_and_one_of_other_parts_is_refused(tmp_path):
+    controller, asked = pull_to_the_right(), {"objective": SteeringShift(), "method": QUICK}
+
+    def kept(recordings=recording_set(), space=SearchSpace(figures=1), **changed):  # noqa: B008
+        return kept_attack(tmp_path, recordings, controller, space, **asked | changed)
+
+    first = kept()
+    stamp = (tmp_path / "result.json").stat().st_mtime_ns
+    np.testing.assert_allclose(kept().history, first.history)
+    assert (tmp_path / "result.json").stat().st_mtime_ns == stamp
+    one, *others = recording_set().recordings
+    for message, changed in {
+        "holds a search with seed 0, now it is 1": {"seed": 1},
+        "holds a search with space.figures 1, now it is 2": {"space": SearchSpace(figures=2)},
+        "holds a search with method.iterations 20, now it is 30": {"method": dataclasses.replace(QUICK, iterations=30)},
+        "holds a search with recordings '": {
+            "recordings": dataclasses.replace(
+                recording_set(), recordings=(dataclasses.replace(one, frames=one.frames // 2), *others)
+            )
+        },
+    }.items():
+        with pytest.raises(RoadproofError, match=message):
+            kept(**changed)
+    # A result made elsewhere, or older than the word, does not say what it was made of.
+    first.save(tmp_path)
+    assert kept(seed=1).seed == 0
 
 
 def test_a_controller_for_other_frames_or_one_that_answers_nan_is_refused():

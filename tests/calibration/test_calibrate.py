@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import needs
-from roadproof.calibration import CalibrationReport, Method, calibrate, replays_needed
+from roadproof.calibration import Calibrated, CalibrationReport, Method, calibrate, replays_needed
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.drives import Swerve, Trajectories, Window, record
@@ -124,6 +124,24 @@ def test_the_set_and_its_report_survive_their_files(two_paint, tmp_path):
     (tmp_path / "report.json").write_text("{")
     with pytest.raises(CalibrationError, match="not valid JSON"):
         CalibrationReport.load(tmp_path / "report.json")
+
+
+def test_a_calibration_is_kept_for_its_own_drives_and_method(two_paint, drives, tmp_path):
+    assert Calibrated.kept(tmp_path, drives, Method.TWO_PAINT) is None
+    two_paint.save(tmp_path)
+    assert Calibrated.kept(tmp_path, drives, Method.TWO_PAINT).report == two_paint.report
+    with pytest.raises(CalibrationError, match="holds a calibration with method 'two-paint', now it is 'pose'"):
+        Calibrated.kept(tmp_path, drives, Method.POSE)
+    clean, *others = drives.drives
+    steered = dataclasses.replace(clean, episode=dataclasses.replace(clean.episode, steer=clean.episode.steer + 0.01))
+    again = dataclasses.replace(drives, drives=(steered, *others))
+    with pytest.raises(CalibrationError, match=r"holds a calibration with drives\.clean '"):
+        Calibrated.kept(tmp_path, again, Method.TWO_PAINT)
+    # Older ones say their method alone.
+    two_paint.report.save(tmp_path / "calibration" / "report.json")
+    assert Calibrated.kept(tmp_path, again, Method.TWO_PAINT).report == two_paint.report
+    with pytest.raises(CalibrationError, match="method 'two-paint', now it is 'pose'"):
+        Calibrated.kept(tmp_path, drives, Method.POSE)
 
 
 def test_a_replay_that_goes_another_way_is_refused(town, drives):

@@ -94,7 +94,7 @@ def test_the_numbers_shown_are_those_of_the_evaluation(run):
 
 def test_the_costs_shown_are_those_of_the_ledger_where_there_is_one(tmp_path):
     write_run(tmp_path)
-    ledger = Ledger(tmp_path, {"run": "this"}, ("record", "calibrate", "attack", "select", "rounds", "evaluate"))
+    ledger = Ledger(tmp_path, {"seed": 0}, ("record", "calibrate", "attack", "select", "rounds", "evaluate"))
     for stage, calls in {"record": 4, "calibrate": 6, "attack": 0, "select": 7, "evaluate": 12}.items():
         with ledger.stage(stage):
             ledger.calls(stage, calls)

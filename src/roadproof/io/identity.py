@@ -59,7 +59,7 @@ def _first_difference(name: str, before: object, now: object) -> tuple[str, str,
     """Which leaf of a part differs, and what it was and is, cut to a few words."""
     if isinstance(before, dict) and isinstance(now, dict):
         one, other = cast("dict[str, object]", before), cast("dict[str, object]", now)
-        key = next(key for key in one | other if one.get(key) != other.get(key))
+        key = next(key for key in one | other if (key in one, one.get(key)) != (key in other, other.get(key)))
         return _first_difference(f"{name}.{key}", one.get(key), other.get(key))
     texts = [repr(each) for each in cast("list[object]", [before, now])]
     if max(map(len, texts)) > _MOST_CHARACTERS:

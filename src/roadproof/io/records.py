@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar, cast, get_type_hints
+from typing import Any, ClassVar, Generic, TypeVar, cast, get_type_hints
 
 import msgspec
 import numpy as np
@@ -29,6 +29,7 @@ from roadproof.io.arrays import HEADER, MOST_BYTES, read_record, write_archive
 from roadproof.io.files import one_line, read_json, write_json
 
 T = TypeVar("T")
+SavedT = TypeVar("SavedT", bound="Saved")
 _WRONG = (KeyError, OverflowError, RecursionError, RoadproofError, TypeError, UnicodeError, ValueError)
 
 
@@ -178,7 +179,7 @@ class Saved:
         self.FILE.write(path, self)
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls: type[SavedT], path: Path) -> SavedT:
         """Read what `save` wrote.
 
         Raises:

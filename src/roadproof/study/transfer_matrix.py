@@ -77,7 +77,7 @@ def transfer_map(rows: Frame, metric: Metric = DEVIATION) -> Picture:
 
 
 def _matrix(rows: Frame, metric: Metric) -> Frame:
-    """Means over all patterns: a row for whom they were found against, a column for who drove; None for nobody."""
+    """Means over all patterns: a row for whom they were found against, a column for who drove; None where nobody."""
     if rows.empty:
         raise StudyError("the transfer has no rows; drive some patterns first")
     pairs = ["found_on", "controller"]
