@@ -73,15 +73,13 @@ def _summarise(result: CheckResult, out: Path) -> None:
     from rich.table import Table
 
     from roadproof.gate.outputs import COLUMNS, heading, rows_of, why
-    from roadproof.gate.verdict import Status
 
     console = Console(soft_wrap=True, highlight=False, markup=False)
     table = Table(*COLUMNS, box=box.SIMPLE)
     for row in rows_of(result):
         table.add_row(*row)
     console.print(table)
-    for case in result.cases:
-        if case.status is not Status.PASSED:
-            console.print(f"{case.status}: {case}", *(f"  {line}" for line in why(case)), sep="\n")
+    for case in result.not_passed:
+        console.print(f"{case.status}: {case}", *why(case), f"see it: {case.command}", sep="\n  ")
     console.print(heading(result))
     console.print(f"Results in {out}: check.json, junit.xml, summary.md")

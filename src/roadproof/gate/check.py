@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,30 +24,28 @@ import roadproof
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
-from roadproof.datatypes import Weather
-from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.drive_store import Episodes, load_episodes
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.evaluation import judge as judge_pair
+from roadproof.driving.starts import NOMINAL
 from roadproof.errors import CheckError
-from roadproof.gate.outputs import WORST, write_junit, write_summary
+from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
-from roadproof.gate.plan import CheckPlan
-from roadproof.gate.result import FILE, Case, CheckResult, Key, load_reference, worst_of
-from roadproof.gate.stretch import BARE, Paint, Stretch, known_paints, measures_of
+from roadproof.gate.plan import FRESH, CheckPlan, Key
+from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_reference, worst_of
+from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
-from roadproof.io.files import write_atomically
 from roadproof.io.locks import working_in
-from roadproof.patterns import read_paint, save_pattern
+from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.stress_test import OnProgress, stress_test
 from roadproof.processes import require_picklable
-from roadproof.report.film import FILM, POSTER, film_trial
+from roadproof.report.film import FILM, STRIP, film_trial
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
 
 OUTPUTS = (FILE, "junit.xml", "summary.md", WORST)
-FRESH = "fresh attack"
 
 
 def run_check(
@@ -78,15 +75,14 @@ def run_check(
         SimulatorError: the simulator is not there or stopped answering.
         OutputError: the folder cannot be written, or another process works in it.
     """
-    before: Mapping[Key, Case] | None = None
+    before: Mapping[Key, Case] = {}
     if processes > 1:
         require_picklable(controller)
     with working_in(folder):
         clear(folder)
         if compare and plan.reference is not None:
-            before = load_reference(plan.reference, architecture_of(controller), plan.budget)
+            before = load_reference(plan.reference, architecture_of(controller), plan)
         run = _Run(plan, controller, folder, before, device, processes, on_progress)
-        run.check_reference()
         places = places_of(plan, device)
         cases = tuple(case for place in places for case in run.cases(place))
         result = CheckResult(
@@ -94,8 +90,7 @@ def run_check(
             controller=plan.controller,
             architecture=architecture_of(controller),
             budget=plan.budget,
-            predicted=plan.budget == "smoke",
-            compared=before is not None,
+            compared=bool(before),
             cases=cases,
         )
         pictured = run.film(places, cases)
@@ -127,58 +122,67 @@ class _Run:
     plan: CheckPlan
     controller: Controller
     folder: Path
-    before: Mapping[Key, Case] | None
+    before: Mapping[Key, Case]
     device: str
     processes: int
     on_progress: OnProgress
 
-    def check_reference(self) -> None:
-        """See that nothing that the reference tells of is left out now.
-
-        Raises:
-            CheckError: a case is.
-        """
-        if self.before is None:
-            return
-        plan = self.plan
-        for scenario, weather, kind, name in self.before:
-            stored = {each.name for each in plan.stored.get(scenario, ())}
-            driven = {Kind.BARE: True, Kind.STORED: name in stored, Kind.RANDOM: plan.random > 0, Kind.FRESH: True}
-            here = scenario in {each.name for each in plan.scenarios} and weather in plan.weathers
-            if not (here and driven[kind]):
-                raise CheckError(
-                    f"the reference {plan.reference} has {scenario}, {weather}, {name}, which the plan leaves out; put "
-                    "it back, or make the reference again with --accept"
-                )
-
     def cases(self, place: Place) -> list[Case]:
+        plan = self.plan
         with place.opening() as world:
-            view = world.input
-            size = (view.height_px, view.width_px)
-            fresh = self.plan.budget == "full"
+            size = (world.input.height_px, world.input.width_px)
+            fresh = plan.budget == "full"
             require_usable(self.controller, size=size, device=self.device, gradients=fresh)
             scenario = place.begun_in(world)
-            paints = known_paints(self.plan, scenario, self.folder / "patterns" / scenario.name)
+            paints = known_paints(plan, scenario, self.folder / "patterns" / scenario.name)
             if fresh:
-                paints += tuple(self._fresh(world, scenario, seed, size) for seed in self.plan.seeds)
+                paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
+            images = {paint.name: raster(paint.pattern) for paint in paints}
             drives = self.folder / "drives" / scenario.name
-            stretch = Stretch.of(self.plan, world, self.controller, scenario, place.weathers, paints, drives)
-            groups = [(Kind.BARE, BARE), *dict.fromkeys((paint.kind, paint.case) for paint in paints)]
-            named = {group: tuple(p for p in paints if (p.kind, p.case) == group) for group in groups}
-            for weather in place.weathers:
-                for group, painted in named.items():
-                    self._comparable((scenario.name, weather, *group), stretch.conditions(weather, group[0], painted))
+            episodes = Episodes.of(world, self.controller, scenario, images, drives)
+            stretch = Stretch(plan=plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
+            told = {
+                key: (stretch.conditions(key, painted), painted)
+                for key in plan.keys
+                if key[0] == scenario.name and key[1] in place.weathers
+                for painted in [tuple(paint for paint in paints if (paint.kind, paint.case) == key[2:])]
+            }
+            for key, (conditions, _) in told.items():
+                self._check_comparable(key, conditions)
             stage = f"Driving {scenario.name}, {', '.join(place.weathers)}"
             stretch.drive(place.opening, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
-            return [case for weather in place.weathers for case in self._judged(place, stretch, weather, named)]
+            return [self._judged(place, stretch, key, *each) for key, each in told.items()]
 
-    def _comparable(self, key: Key, conditions: str) -> None:
-        stored = None if self.before is None else self.before.get(key)
+    def _check_comparable(self, key: Key, conditions: str) -> None:
+        stored = self.before.get(key)
         if stored is not None and stored.conditions != conditions:
             raise CheckError(
                 f"the reference {self.plan.reference} has {stored} with other patterns, starts, seeds or recordings; "
                 "make it again with --accept, from a controller that you trust"
             )
+
+    def _judged(self, place: Place, stretch: Stretch, key: Key, conditions: str, paints: tuple[Paint, ...]) -> Case:
+        plan, (scenario, weather, kind, name) = self.plan, key
+        drives = stretch.painted(weather, paints) if paints else stretch.bare(weather)
+        measures = measures_of(kind, drives)
+        stored = self.before.get(key)
+        status, reasons = judge(measures, plan.limits[kind], plan.change, stored and stored.measures)
+        # Where there is none over paint, the drives past the bare road are to be seen.
+        shown = paints or stretch.paints
+        worst = worst_of(drives) or JudgedDrive(seed=shown[0].drives[0][0], start=NOMINAL, wrong="", clean="")
+        pattern = worst.paint or str(shown[0].path)
+        return Case(
+            scenario=scenario,
+            weather=weather,
+            kind=kind,
+            name=name,
+            conditions=conditions,
+            measures=dict(measures),
+            status=status,
+            reasons=reasons,
+            command=command_of(plan, place, weather, pattern, worst.seed, self.folder / "show"),
+            drives=drives,
+        )
 
     def _fresh(self, world: Simulator, scenario: Scenario, seed: int, size: tuple[int, int]) -> Paint:
         """What a fresh attack finds; the folder is this controller's own."""
@@ -202,38 +206,7 @@ class _Run:
         path = self.folder / "patterns" / scenario.name / f"{name}.json"
         save_pattern(found.pattern, path)
         drives = tuple((seed, k) for k in range(plan.starts.count))
-        return Paint(name=name, kind=Kind.FRESH, case=FRESH, pattern=found.pattern, path=path, drives=drives)
-
-    def _judged(
-        self,
-        place: Place,
-        stretch: Stretch,
-        weather: Weather,
-        named: Mapping[tuple[Kind, str], tuple[Paint, ...]],
-    ) -> Generator[Case]:
-        plan = self.plan
-        bare = stretch.bare(weather)
-        for (kind, name), paints in named.items():
-            drives = stretch.painted(weather, paints, bare) if paints else bare
-            measures = measures_of(kind, drives)
-            key = stretch.scenario.name, weather, kind, name
-            stored = None if self.before is None else self.before.get(key)
-            status, reasons = judge(measures, plan.limits[kind], plan.change, stored and stored.measures)
-            worst = worst_of(drives)
-            pattern = worst.paint if worst and worst.paint else str((paints or stretch.paints)[0].path)
-            seed = paints[0].drives[0][0] if worst is None else worst.seed
-            yield Case(
-                scenario=key[0],
-                weather=weather,
-                kind=kind,
-                name=name,
-                conditions=stretch.conditions(weather, kind, paints),
-                measures=dict(measures),
-                status=status,
-                reasons=reasons,
-                command=command_of(plan, place, weather, pattern, seed, self.folder / "show"),
-                drives=drives,
-            )
+        return Paint(name, Kind.FRESH, FRESH, found.pattern, path, drives)
 
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
         """Leave a picture, and say which case it shows: of those that do not pass, if any, the one furthest astray."""
@@ -241,7 +214,7 @@ class _Run:
         wrong = [each for each in painted if each[0].status is not Status.PASSED]
         if not painted:
             return None
-        case, worst = max(wrong or painted, key=lambda each: each[1].deviation_m or 0.0)
+        case, worst = max(wrong or painted, key=lambda each: each[1].deviation_m)
         place = next(p for p in places if p.scenario.name == case.scenario and case.weather in p.weathers)
         drives = self.folder / "drives" / case.scenario
         (drives / FILM).unlink(missing_ok=True)
@@ -270,5 +243,5 @@ class _Run:
                 seconds=0.0,
             )
             film_trial(world, shown, read_paint(Path(worst.paint)), drives)
-        write_atomically(self.folder / WORST, lambda part: shutil.copyfile(drives / POSTER, part))
+        write_worst(drives / STRIP, self.folder / WORST)
         return case

@@ -1,50 +1,13 @@
-"""What a check drives and what it lets pass, as a TOML file says it.
-
-format = "roadproof-check"
-version = 1
-controller = "pilotnet"
-scenarios = ["left-03", "straight-*"]     # names or patterns of names
-scenario_file = "own.toml"                # beside the plan; left out, the built-in scenarios
-budget = "smoke"                          # or "full"; --budget wins
-patterns = "patterns"                     # *.json for all scenarios, SCENARIO/*.json for one
-random = 5                                # random patterns a seed
-figures = 5                               # of random patterns and fresh attacks
-seeds = [0, 1]                            # each has starts, random patterns and a fresh attack of its own
-
-[starts]                                  # of every seed, as in a study; these are the defaults
-count = 5
-right_m = 0.3
-turned_rad = 0.05
-faster_mps = 2.0
-
-[smoke]                                   # the recorded world
-recordings = ["recordings"]               # folders with runs that are named after their scenarios
-weathers = ["clear-noon"]
-
-[full]                                    # a simulator, and a fresh attack for every scenario and seed
-simulator = "town"                        # or carla://HOST:PORT
-weathers = ["clear-noon", "rainy-noon"]   # attacks are found in the first
-
-[limits]                                  # the greatest values that pass
-bare = { failed = 0.0 }                   # share of the drives on the bare road that fail; this is the default
-stored = { deviation_m = 0.5, left_lane = 0.0 }
-random = { deviation_m = 0.3, left_lane = 0.0 }
-fresh = { deviation_m = 1.5 }
-
-[change]                                  # against a stored reference; both must be exceeded to fail
-reference = "reference"                   # REFERENCE/BUDGET/check.json, beside the plan
-deviation_m = { absolute = 0.1, relative = 0.2 }
-left_lane = { absolute = 0.1, relative = 0.2 }
-"""
+"""What a check drives and what it lets pass, as a TOML file says it; docs/check.md has one with every key."""
 
 from __future__ import annotations
 
 import fnmatch
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 from roadproof.controllers.loading import runs_code
 from roadproof.datatypes import Weather
@@ -58,10 +21,16 @@ from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
 from roadproof.study.plan import StartPlan
 from roadproof.study.reading import build, one_of, within
 
+Key: TypeAlias = tuple[str, Weather, Kind, str]
+"""What tells a case from the others: scenario, weather, and kind and name of the paint."""
+
+BARE, RANDOM, FRESH = "bare road", "random patterns", "fresh attack"
 FORMAT = "roadproof-check"
 FORMAT_VERSION = 1
 BudgetName = Literal["smoke", "full"]
 BUDGETS: tuple[BudgetName, ...] = get_args(BudgetName)
+RANGES = {"deviation_m": (0.01, 100.0), "left_lane": (0.0, 1.0), "failed": (0.0, 1.0)}
+MEASURES = {kind: ("failed",) if kind is Kind.BARE else ("deviation_m", "left_lane") for kind in Kind}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,53 +78,18 @@ class CheckPlan:
             right_m=self.starts.right_m, turned_rad=self.starts.turned_rad, faster_mps=self.starts.faster_mps
         )
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Bare:
-    failed: float = 0.0
-
-    def __post_init__(self) -> None:
-        within(self.failed, "failed", 0.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Painted:
-    deviation_m: float | None = None
-    left_lane: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.deviation_m is not None:
-            within(self.deviation_m, "deviation_m", 0.01, 100.0)
-        if self.left_lane is not None:
-            within(self.left_lane, "left_lane", 0.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Limits:
-    bare: _Bare = _Bare()
-    stored: _Painted = _Painted()
-    random: _Painted = _Painted()
-    fresh: _Painted = _Painted()
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Change:
-    reference: str
-    deviation_m: Change | None = None
-    left_lane: Change | None = None
-    failed: Change | None = None
-
-    def __post_init__(self) -> None:
-        if not self.measures:
-            raise CheckError("change has no measure, expected deviation_m, left_lane or failed")
-        for name, change in self.measures.items():
-            within(change.absolute, f"{name}.absolute", 0.0, 100.0)
-            within(change.relative, f"{name}.relative", 0.0, 100.0)
-
     @property
-    def measures(self) -> dict[str, Change]:
-        named = {"deviation_m": self.deviation_m, "left_lane": self.left_lane, "failed": self.failed}
-        return {name: change for name, change in named.items() if change is not None}
+    def keys(self) -> tuple[Key, ...]:
+        """Every case."""
+        found: list[Key] = []
+        for scenario in self.scenarios:
+            painted = [(Kind.STORED, each.name) for each in self.stored.get(scenario.name, ())]
+            painted += [(Kind.RANDOM, RANDOM)] if self.random else []
+            painted += [(Kind.FRESH, FRESH)] if self.budget == "full" else []
+            found += [
+                (scenario.name, weather, *each) for weather in self.weathers for each in ((Kind.BARE, BARE), *painted)
+            ]
+        return tuple(found)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -180,7 +114,7 @@ class _Stated:
 
     controller: str
     scenarios: tuple[str, ...]
-    limits: dict[str, Any]
+    limits: dict[str, dict[str, float]]
     scenario_file: str | None = None
     budget: str = "smoke"
     patterns: str | None = None
@@ -190,14 +124,12 @@ class _Stated:
     starts: dict[str, Any] = field(default_factory=dict[str, Any])
     smoke: dict[str, Any] | None = None
     full: dict[str, Any] = field(default_factory=dict[str, Any])
-    change: dict[str, Any] | None = None
+    change: dict[str, str | dict[str, Any]] = field(default_factory=dict[str, str | dict[str, Any]])
 
     def __post_init__(self) -> None:
         one_of(self.budget, "budget", BUDGETS)
         within(self.random, "random", 0, 1000)
         within(self.figures, "figures", 1, MAX_FIGURES)
-        each_once(self.seeds, "seeds")
-        each_once(self.scenarios, "scenarios")
         for seed in self.seeds:
             within(seed, "seeds", 0, MAX_SEED)
 
@@ -245,8 +177,9 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         raise CheckError('a smoke check drives in recordings; add [smoke] with recordings = ["FOLDER"]')
     weathers = full.weathers if chosen == "full" or smoke is None else smoke.weathers
     each_once(weathers, "weathers")
-    change = None if stated.change is None else build(_Change, stated.change, "change")
-    limits = asdict(build(_Limits, stated.limits, "limits"))
+    each_once(stated.seeds, "seeds")
+    each_once(stated.scenarios, "scenarios")
+    change, reference = _change(stated.change, folder)
     plan = CheckPlan(
         controller=stated.controller,
         scenarios=scenarios,
@@ -262,12 +195,42 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         if smoke is not None and chosen == "smoke"
         else {},
         simulator=full.simulator,
-        limits={kind: {k: v for k, v in limits[kind].items() if v is not None} for kind in Kind},
-        change={} if change is None else change.measures,
-        reference=None if change is None else _beside(folder, change.reference, "reference") / chosen / "check.json",
+        limits=_limits(stated.limits),
+        change=change,
+        reference=reference and reference / chosen / "check.json",
     )
     _check_drives(plan)
     return plan
+
+
+def _limits(stated: dict[str, dict[str, float]]) -> dict[Kind, dict[str, float]]:
+    found: dict[Kind, dict[str, float]] = {kind: {} for kind in Kind}
+    found[Kind.BARE] = {"failed": 0.0}
+    for kind, limits in stated.items():
+        one_of(kind, "a key of limits", tuple(Kind))
+        for name, limit in limits.items():
+            one_of(name, f"a key of limits.{kind}", MEASURES[Kind(kind)])
+            within(limit, f"limits.{kind}.{name}", *RANGES[name])
+            found[Kind(kind)][name] = limit
+    return found
+
+
+def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict[str, Change], Path | None]:
+    """How much worse each measure may be, and than what."""
+    if not stated:
+        return {}, None
+    reference = stated.pop("reference", None)
+    if not isinstance(reference, str) or not stated:
+        raise CheckError(f"change needs reference, a folder beside the plan, and one of {', '.join(RANGES)}")
+    found: dict[str, Change] = {}
+    for name, table in stated.items():
+        one_of(name, "a key of change", tuple(RANGES))
+        if isinstance(table, str):
+            raise CheckError(f"change.{name} is {table!r}, expected {{ absolute = ..., relative = ... }}")
+        found[name] = build(Change, table, f"change.{name}")
+        within(found[name].absolute, f"change.{name}.absolute", 0.0, 100.0)
+        within(found[name].relative, f"change.{name}.relative", 0.0, 100.0)
+    return found, _beside(folder, reference, "reference")
 
 
 def _check_drives(plan: CheckPlan) -> None:

@@ -6,13 +6,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import roadproof
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartOffset
 from roadproof.errors import CheckError
-from roadproof.gate.plan import BudgetName
+from roadproof.gate.plan import BudgetName, CheckPlan, Key
 from roadproof.gate.verdict import Estimate, Kind, Status
 from roadproof.io.files import read_json, write_atomically
 from roadproof.io.records import record
@@ -21,37 +21,35 @@ FILE = "check.json"
 FORMAT = "roadproof-check-result"
 FORMAT_VERSION = 1
 
-Key: TypeAlias = tuple[str, Weather, Kind, str]
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class JudgedDrive:
     """One drive of a case.
 
     Args:
-        paint: file of the pattern; empty on the bare road.
         seed: that its start was drawn with.
         start: how it began beside the scenario's start.
-        deviation_m: from the drive on the bare road; None for that one itself.
-        lateral_m: largest offset from that drive's path, left positive.
         wrong: what went wrong, in words; empty where nothing did.
         clean: file of the drive on the bare road.
-        painted: file of the drive over paint.
+        painted: file of the drive over paint; empty on the bare road, as the next.
+        paint: file of the pattern.
+        deviation_m: between the two; 0 on the bare road, as the next.
+        lateral_m: largest offset of the painted one from the other's path, left positive.
     """
 
-    paint: str
     seed: int
     start: StartOffset
-    deviation_m: float | None
-    lateral_m: float | None
     wrong: str
     clean: str
-    painted: str
+    painted: str = ""
+    paint: str = ""
+    deviation_m: float = 0.0
+    lateral_m: float = 0.0
 
 
 def worst_of(drives: Sequence[JudgedDrive]) -> JudgedDrive | None:
     """The drive that went furthest astray; None where there is none."""
-    return max(drives, key=lambda each: (each.deviation_m or 0.0, bool(each.wrong)), default=None)
+    return max(drives, key=lambda each: (each.deviation_m, bool(each.wrong)), default=None)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,7 +98,6 @@ class CheckResult:
         controller: its spec.
         architecture: of the controller (`architecture_of`).
         budget: "smoke" or "full".
-        predicted: whether it drove in recordings, and nothing was driven for real.
         compared: whether there was a reference.
         cases: in the order of the plan.
     """
@@ -109,7 +106,6 @@ class CheckResult:
     controller: str
     architecture: str
     budget: BudgetName
-    predicted: bool
     compared: bool
     cases: tuple[Case, ...]
 
@@ -119,9 +115,15 @@ class CheckResult:
         found = {case.status for case in self.cases}
         return next((each for each in (Status.FAILED, Status.TOO_FEW) if each in found), Status.PASSED)
 
-    def of(self, status: Status) -> tuple[Case, ...]:
-        """The cases of one status."""
-        return tuple(case for case in self.cases if case.status is status)
+    @property
+    def predicted(self) -> bool:
+        """Whether it drove in recordings, and nothing was driven for real."""
+        return self.budget == "smoke"
+
+    @property
+    def not_passed(self) -> tuple[Case, ...]:
+        """The cases that failed, or had too few drives."""
+        return tuple(case for case in self.cases if case.status is not Status.PASSED)
 
     def save(self, path: Path) -> None:
         """Write check.json; the same bytes for the same result.
@@ -135,16 +137,17 @@ class CheckResult:
         write_atomically(path, lambda part: part.write_text(text + "\n", encoding="utf-8"))
 
 
-def load_reference(path: Path, architecture: str, budget: BudgetName) -> dict[Key, Case]:
-    """The cases of a stored check.json that can be compared with those of a check.
+def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, Case]:
+    """The cases of a stored check.json, which those of a check are compared with.
 
     Args:
         path: of the file.
         architecture: of the controller that is checked.
-        budget: of the check.
+        plan: of the check.
 
     Raises:
-        CheckError: there is none, it is damaged, or made by another version, architecture or budget.
+        CheckError: there is none, it is damaged, made by another version, architecture or budget, or has a case that
+            the plan leaves out.
     """
     again = "make it again with --accept, from a controller that you trust"
     if not path.is_file():
@@ -154,9 +157,11 @@ def load_reference(path: Path, architecture: str, budget: BudgetName) -> dict[Ke
     told = (
         ("roadproof", stored.roadproof, roadproof.__version__),
         ("a controller of architecture", stored.architecture, architecture),
-        ("budget", stored.budget, budget),
+        ("budget", stored.budget, plan.budget),
     )
     for what, before, now in told:
         if before != now:
             raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {again}")
+    if left_out := [case for case in stored.cases if case.key not in plan.keys]:
+        raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {again}")
     return {case.key: case for case in stored.cases}

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from roadproof.controllers import Controller
 from roadproof.datatypes import Ending, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
@@ -19,20 +18,18 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import Opening, make_together
 from roadproof.driving.evaluation import path_of
 from roadproof.driving.infractions import counted
-from roadproof.gate.plan import CheckPlan
+from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
 from roadproof.gate.verdict import Kind, Measures, median_95, share_95
-from roadproof.patterns import Pattern, raster, save_pattern
+from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.words import in_words
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Identified, Simulator
 
-BARE = "bare road"
 
-
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Paint:
     """A pattern and the drives over it.
 
@@ -61,33 +58,17 @@ def known_paints(plan: CheckPlan, scenario: Scenario, folder: Path) -> tuple[Pai
     """
     every = tuple((seed, k) for seed in plan.seeds for k in range(plan.starts.count))
     found = [
-        Paint(
-            name=f"stored-{each.name}",
-            kind=Kind.STORED,
-            case=each.name,
-            pattern=each.pattern,
-            path=each.path,
-            drives=every,
-        )
+        Paint(f"stored-{each.name}", Kind.STORED, each.name, each.pattern, each.path, every)
         for each in plan.stored.get(scenario.name, ())
     ]
     space = SearchSpace(figures=plan.figures)
     for seed in plan.seeds if plan.random else ():
         drawn = space.pattern(space.random((plan.random,), torch.Generator().manual_seed(seed)))
         for k in range(plan.random):
-            name = f"random-{seed}-{k + 1}"
-            save_pattern(drawn[k], folder / f"{name}.json")
+            path = folder / f"random-{seed}-{k + 1}.json"
+            save_pattern(drawn[k], path)
             start = ((seed, k % plan.starts.count),)
-            found.append(
-                Paint(
-                    name=name,
-                    kind=Kind.RANDOM,
-                    case="random patterns",
-                    pattern=drawn[k],
-                    path=folder / f"{name}.json",
-                    drives=start,
-                )
-            )
+            found.append(Paint(path.stem, Kind.RANDOM, RANDOM, drawn[k], path, start))
     return tuple(found)
 
 
@@ -98,7 +79,6 @@ class Stretch:
     Args:
         plan: of the check.
         world: open.
-        scenario: as it is driven in this world.
         weathers: that it is driven in here.
         paints: on it.
         episodes: keeps the drives.
@@ -106,25 +86,9 @@ class Stretch:
 
     plan: CheckPlan
     world: Simulator
-    scenario: Scenario
     weathers: tuple[Weather, ...]
     paints: tuple[Paint, ...]
     episodes: Episodes
-
-    @staticmethod
-    def of(
-        plan: CheckPlan,
-        world: Simulator,
-        controller: Controller,
-        scenario: Scenario,
-        weathers: tuple[Weather, ...],
-        paints: tuple[Paint, ...],
-        folder: Path,
-    ) -> Stretch:
-        """One whose drives are kept in a folder."""
-        images = {paint.name: raster(paint.pattern) for paint in paints}
-        episodes = Episodes.of(world, controller, scenario, images, folder)
-        return Stretch(plan=plan, world=world, scenario=scenario, weathers=weathers, paints=paints, episodes=episodes)
 
     def drive(self, opening: Opening, processes: int, on_drive: Callable[[int, int], object]) -> None:
         """Make the drives that are missing.
@@ -159,28 +123,14 @@ class Stretch:
         for each in self._alone(weather).values():
             file = self.episodes.file(each)
             (episode,) = load_episodes(self.episodes.folder, [file])
-            aside = self._aside_m(episode)
-            wrong = _fault(episode, aside)
-            found.append(
-                JudgedDrive(
-                    paint="",
-                    seed=each.seed,
-                    start=each.start,
-                    deviation_m=None,
-                    lateral_m=aside,
-                    wrong=wrong,
-                    clean=file,
-                    painted=file,
-                )
-            )
+            wrong = _fault(episode, self._aside_m(episode))
+            found.append(JudgedDrive(seed=each.seed, start=each.start, wrong=wrong, clean=file))
         return tuple(found)
 
-    def painted(
-        self, weather: Weather, paints: Iterable[Paint], bare: Sequence[JudgedDrive]
-    ) -> tuple[JudgedDrive, ...]:
+    def painted(self, weather: Weather, paints: Iterable[Paint]) -> tuple[JudgedDrive, ...]:
         """The drives over paint, but for those without a good drive on the bare road to compare with."""
         alone = self._alone(weather)
-        good = {each.clean for each in bare if not each.wrong}
+        good = {each.clean for each in self.bare(weather) if not each.wrong}
         found: list[JudgedDrive] = []
         for paint in paints:
             for clean in (alone[k] for k in paint.drives):
@@ -191,27 +141,36 @@ class Stretch:
                 wrong = f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}" if trial.leaves_lane else ""
                 found.append(
                     JudgedDrive(
-                        paint=str(paint.path),
                         seed=clean.seed,
                         start=clean.start,
-                        deviation_m=trial.deviation_m,
-                        lateral_m=trial.lateral_m,
                         wrong=wrong,
                         clean=trial.clean,
                         painted=trial.painted,
+                        paint=str(paint.path),
+                        deviation_m=trial.deviation_m,
+                        lateral_m=trial.lateral_m,
                     )
                 )
         return tuple(found)
 
-    def conditions(self, weather: Weather, kind: Kind, paints: Sequence[Paint]) -> str:
+    def conditions(self, key: Key, paints: Sequence[Paint]) -> str:
         """A hash of all that the drives of a case depend on, apart from the controller.
 
         A fresh attack finds another pattern for every controller, so only how it searches counts.
         """
-        plan = self.plan
+        plan, (_, weather, kind, _) = self.plan, key
         images = [] if kind is Kind.FRESH else [self.episodes.digests[paint.name] for paint in paints]
         world = self.world.identity if isinstance(self.world, Identified) else type(self.world).__qualname__
-        told = [identity(self.scenario), weather, kind, images, plan.figures, plan.seeds, asdict(plan.starts), world]
+        told = [
+            identity(self.episodes.scenario),
+            weather,
+            kind,
+            images,
+            plan.figures,
+            plan.seeds,
+            asdict(plan.starts),
+            world,
+        ]
         return hashlib.sha256(json.dumps(told, default=str).encode()).hexdigest()[:16]
 
     def _alone(self, weather: Weather) -> dict[tuple[int, int], Conditions]:
@@ -246,4 +205,4 @@ def measures_of(kind: Kind, drives: Sequence[JudgedDrive]) -> Measures:
     wrong = share_95(sum(bool(each.wrong) for each in drives), len(drives))
     if kind is Kind.BARE:
         return {"failed": wrong}
-    return {"deviation_m": median_95([each.deviation_m or 0.0 for each in drives]), "left_lane": wrong}
+    return {"deviation_m": median_95([each.deviation_m for each in drives]), "left_lane": wrong}

@@ -162,10 +162,11 @@ def in_words(name: str, found: Estimate) -> str:
 
 def shown(name: str, found: Estimate) -> str:
     """A measure's value and interval: "0.31 m (0.12 to 0.44)"."""
-    if found.low is None or found.high is None:
-        return f"{_one(name, found.value)} (no interval)"
-    return f"{_one(name, found.value)} ({_one(name, found.low, '')} to {_one(name, found.high, '')})"
+    low, high = found.low, found.high
+    return _one(name, found.value) + (
+        "" if low is None or high is None else f" ({_one(name, low)} to {_one(name, high)})"
+    )
 
 
-def _one(name: str, value: float, unit: str = " m") -> str:
-    return f"{value:.2f}{unit}" if name == "deviation_m" else f"{value:.0%}"
+def _one(name: str, value: float) -> str:
+    return f"{value:.2f} m" if name == "deviation_m" else f"{value:.0%}"
