@@ -60,6 +60,8 @@ def check(
         result = run_check(chosen, who, out, compare=not accept, device=device, processes=processes, on_progress=show)
     _summarise(result, out)
     if result.status is not Status.PASSED:
+        if accept:
+            typer.echo("This does not become the reference, since not all of it passed")
         raise typer.Exit(1)
     if accept and chosen.reference is not None:
         content = (out / FILE).read_bytes()

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -76,6 +77,7 @@ def run_check(
         OutputError: the folder cannot be written, or another process works in it.
     """
     before: Mapping[Key, Case] = {}
+    begun = time.perf_counter()
     if processes > 1:
         require_picklable(controller)
     with working_in(folder):
@@ -94,7 +96,7 @@ def run_check(
             cases=cases,
         )
         pictured = run.film(places, cases)
-        write_junit(result, folder / "junit.xml")
+        write_junit(result, time.perf_counter() - begun, folder / "junit.xml")
         write_summary(result, pictured, folder / "summary.md")
         result.save(folder / FILE)
     return result

@@ -63,21 +63,28 @@ def heading(result: CheckResult) -> str:
     return f"{result.status}: {passed}; {result.controller}, {result.budget}, {drives} drives, {where}, {beside}"
 
 
-def write_junit(result: CheckResult, path: Path) -> None:
+def write_junit(result: CheckResult, seconds: float, path: Path) -> None:
     """Write JUnit XML: a test case for each case, with a failure that says why it does not pass.
+
+    Args:
+        result: of the check.
+        seconds: that it took; each case's time is its drives' share of them.
+        path: of the file.
 
     Raises:
         OutputError: it cannot be written.
     """
-    counts = {"tests": str(len(result.cases)), "failures": str(len(result.not_passed))}
+    counts = {"tests": str(len(result.cases)), "failures": str(len(result.not_passed)), "errors": "0"}
+    counts["time"] = f"{seconds:.3f}"
+    drive_s = seconds / sum(len(case.drives) for case in result.cases)
     root = ET.Element("testsuites", counts)
-    suite = ET.SubElement(root, "testsuite", {"name": f"roadproof check {result.controller}", "errors": "0", **counts})
+    suite = ET.SubElement(root, "testsuite", {"name": f"roadproof check {result.controller}", **counts})
     told = ET.SubElement(suite, "properties")
     for name in ("roadproof", "controller", "architecture", "budget"):
         ET.SubElement(told, "property", {"name": name, "value": str(getattr(result, name))})
     for case in result.cases:
         name = {"classname": f"roadproof.{case.scenario}", "name": f"{case.weather}, {case.name}"}
-        test = ET.SubElement(suite, "testcase", name)
+        test = ET.SubElement(suite, "testcase", name, time=f"{drive_s * len(case.drives):.3f}")
         if case.status is not Status.PASSED:
             message = {"type": str(case.status), "message": "; ".join(case.reasons)}
             ET.SubElement(test, "failure", message).text = "\n".join((*why(case), f"see it: {case.command}"))

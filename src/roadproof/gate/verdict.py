@@ -139,6 +139,8 @@ def judge(
         if before is None or name not in measures or name not in before:
             continue
         now, then = measures[name].value, before[name].value
+        if measures[name].high is None:
+            undecided.append(f"too few drives: {in_words(name, measures[name])} has no interval; drive more")
         if change.is_exceeded(then, now):
             failed.append(
                 f"{in_words(name, measures[name])} was {_one(name, then)} in the reference: worse by more than "
