@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from paint_shy import PaintShy
 from recorded_drives import CANVAS, drivable_set, track
 from roadproof.coverage import Shape
 from roadproof.datatypes import Ending, VehicleState, Weather
@@ -20,7 +21,7 @@ GREEN = Pattern(BAR.shapes, BAR.boxes, torch.tensor([[0.0, 0.5, 0.0]]))
 PLAN = """
 format = "roadproof-check"
 version = 1
-controller = "paint_shy:paint_shy"
+controller = "team_folder:magenta_shy"
 scenario_file = "scenarios.toml"
 scenarios = ["test-road"]
 patterns = "patterns"
@@ -31,6 +32,7 @@ seeds = [0, 1]
 count = 3
 right_m = 0.1
 turned_rad = 0.01
+faster_mps = 0.5
 
 [smoke]
 recordings = ["recordings"]
@@ -38,6 +40,18 @@ recordings = ["recordings"]
 [limits]
 stored = { deviation_m = 0.2, left_lane = 0.0 }
 """
+
+
+class MagentaShy(PaintShy):
+    """Minds magenta alone, and not the grain of the made-up road."""
+
+    def steer(self, frames, speed_mps, command):
+        red, green, blue = frames.unbind(1)
+        return self.gain * (torch.minimum(red, blue) - green - 0.5).clamp_min(0).mean((1, 2))
+
+
+def magenta_shy():
+    return MagentaShy(gain=6.0)
 
 
 def scenario():
@@ -62,8 +76,9 @@ def write_team(folder, *, plan=PLAN, patterns=(("magenta", BAR), ("green", GREEN
 def write_recorded(run):
     """A run as `roadproof record` and `calibrate` leave it."""
     settings = Settings(
-        scenario=scenario(), weather=Weather.CLEAR_NOON, trajectories=Trajectories(count=3, perturbation=Swerve((1.0,))),
-        window=Window(), seed=0, driver="nobody", camera=CIL_CAMERA, view=CIL_INPUT, dt_s=0.05,
+        scenario=scenario(), weather=Weather.CLEAR_NOON, window=Window(),
+        trajectories=Trajectories(count=3, perturbation=Swerve((1.0,))),
+        seed=0, driver="nobody", camera=CIL_CAMERA, view=CIL_INPUT, dt_s=0.05,
     )  # fmt: skip
     write_settings(settings, run / "record")
     for name, right_m in (("clean", 0.0), ("right", 1.0), ("left", -1.0)):

@@ -54,13 +54,16 @@ MISTAKES = {
     "unknown measure": ((LIMITS, "stored = { left = 0.0 }"), "a key of limits.stored is 'left', expected one of"),
     "a measure of paint": ((LIMITS, "bare = { left_lane = 0.0 }"), "expected one of failed"),
     "a limit's type": ((LIMITS, 'stored = { left_lane = "0" }'), "expected float"),
-    "a limit's range": ((LIMITS, "stored = { left_lane = 20.0 }"), "limits.stored.left_lane is 20.0, expected 0.0 to 1"),
+    "a limit's range": (
+        (LIMITS, "stored = { left_lane = 20.0 }"),
+        "limits.stored.left_lane is 20.0, expected 0.0 to 1",
+    ),
     "no number": ((LIMITS, "stored = { deviation_m = nan }"), "limits.stored.deviation_m is nan, expected"),
     "no limit": ((LIMITS, ""), "limits has nothing for stored patterns"),
     "too few for a median": (("count = 3", "count = 2"), "too few drives: 4 a case (starts × seeds) can never show"),
     "too few for a share": ((LIMITS, "stored = { left_lane = 0.05 }"), "left_lane at most 0.05 for stored"),
     "equal starts": (
-        ("right_m = 0.1\nturned_rad = 0.01", "right_m = 0.0\nturned_rad = 0.0\nfaster_mps = 0.0"),
+        ("right_m = 0.1\nturned_rad = 0.01\nfaster_mps = 0.5", "right_m = 0.0\nturned_rad = 0.0\nfaster_mps = 0.0"),
         "starts are all the same",
     ),
     "start range": (("right_m = 0.1", "right_m = 3.0"), "right_m is 3.0, expected 0.0 to 1.0"),
@@ -68,6 +71,7 @@ MISTAKES = {
     "seed twice": (("seeds = [0, 1]", "seeds = [1, 1]"), "seeds has 1 twice"),
     "no seed": (("seeds = [0, 1]", "seeds = []"), "seeds is empty"),
     "budget": (("version = 1", 'version = 1\nbudget = "huge"'), "budget is 'huge', expected one of smoke, full"),
+    "simulator": ((LIMITS, LIMITS + '\n[full]\nsimulator = "moon"'), "simulator is 'moon', expected town or carla://"),
     "scenario": (('scenarios = ["test-road"]', 'scenarios = ["test-raod"]'), "did you mean 'test-road'"),
     "outside": (('scenario_file = "', 'scenario_file = "../'), "leaves the plan's folder"),
     "patterns": (('patterns = "patterns"', 'patterns = "nowhere"'), "patterns 'nowhere' is no folder"),
@@ -106,7 +110,10 @@ def test_a_mistake_is_named(team, name):
 def test_code_and_other_machines_need_trust(team):
     with pytest.raises(CheckError, match="runs what its author wrote"):
         load_check(team / "check.toml")
-    text = PLAN.replace("paint_shy:paint_shy", "pilotnet") + 'fresh = { left_lane = 0.0 }\n[full]\nsimulator = "carla://far:2000"'
+    text = (
+        PLAN.replace("team_folder:magenta_shy", "pilotnet")
+        + 'fresh = { left_lane = 0.0 }\n[full]\nsimulator = "carla://far:2000"'
+    )
     with pytest.raises(CheckError, match="another machine"):
         load_check(plan(team, text), budget="full")
 

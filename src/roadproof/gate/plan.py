@@ -103,10 +103,6 @@ class _Full:
     simulator: str = "town"
     weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
 
-    def __post_init__(self) -> None:
-        if self.simulator != "town" and not is_server(self.simulator):
-            raise CheckError(f"simulator is {self.simulator!r}, expected {SPECS}")
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Stated:
@@ -125,13 +121,6 @@ class _Stated:
     smoke: dict[str, Any] | None = None
     full: dict[str, Any] = field(default_factory=dict[str, Any])
     change: dict[str, str | dict[str, Any]] = field(default_factory=dict[str, str | dict[str, Any]])
-
-    def __post_init__(self) -> None:
-        one_of(self.budget, "budget", BUDGETS)
-        within(self.random, "random", 0, 1000)
-        within(self.figures, "figures", 1, MAX_FIGURES)
-        for seed in self.seeds:
-            within(seed, "seeds", 0, MAX_SEED)
 
 
 def load_check(path: Path, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
@@ -166,6 +155,13 @@ def load_check(path: Path, *, budget: str | None = None, trust: bool = False) ->
 
 
 def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
+    one_of(stated.budget, "budget", BUDGETS)
+    within(stated.random, "random", 0, 1000)
+    within(stated.figures, "figures", 1, MAX_FIGURES)
+    each_once(stated.scenarios, "scenarios")
+    each_once(stated.seeds, "seeds")
+    for seed in stated.seeds:
+        within(seed, "seeds", 0, MAX_SEED)
     chosen: BudgetName = "full" if (budget or stated.budget) == "full" else "smoke"
     listed = stated.scenario_file
     own = None if listed is None else _beside(folder, listed, "scenario_file")
@@ -173,12 +169,12 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
     scenarios = _chosen(stated.scenarios, known)
     smoke = None if stated.smoke is None else build(_Smoke, stated.smoke, "smoke")
     full = build(_Full, stated.full, "full")
+    if full.simulator != "town" and not is_server(full.simulator):
+        raise CheckError(f"simulator is {full.simulator!r}, expected {SPECS}")
     if chosen == "smoke" and smoke is None:
         raise CheckError('a smoke check drives in recordings; add [smoke] with recordings = ["FOLDER"]')
     weathers = full.weathers if chosen == "full" or smoke is None else smoke.weathers
     each_once(weathers, "weathers")
-    each_once(stated.seeds, "seeds")
-    each_once(stated.scenarios, "scenarios")
     change, reference = _change(stated.change, folder)
     plan = CheckPlan(
         controller=stated.controller,

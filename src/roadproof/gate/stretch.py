@@ -91,7 +91,7 @@ class Stretch:
     episodes: Episodes
 
     def drive(self, opening: Opening, processes: int, on_drive: Callable[[int, int], object]) -> None:
-        """Make the drives that are missing.
+        """Make the drives that are missing: past the bare road, then over paint where those went well.
 
         Args:
             opening: opens one more world, for each of several processes.
@@ -102,20 +102,33 @@ class Stretch:
             SimulatorError, ControllerError: as `driving.rollout.rollout` does.
             OutputError: they cannot be written.
         """
-        wanted: dict[Conditions, None] = {}
-        for weather in self.weathers:
-            alone = self._alone(weather)
-            wanted |= dict.fromkeys(alone.values())
-            wanted |= {replace(alone[k], paint=paint.name): None for paint in self.paints for k in paint.drives}
-        missing = [each for each in wanted if not self.episodes.has(each)]
-        made = len(wanted) - len(missing)
-        on_drive(made, len(wanted))
+        alone = [each for weather in self.weathers for each in self._alone(weather).values()]
+        total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
+        self._make(alone, opening, processes, lambda done: on_drive(done, total))
+        pairs = [pair for weather in self.weathers for paint in self.paints for pair in self._pairs(weather, paint)]
+        total = len(alone) + len(pairs)
+        painted = [painted for _, painted in pairs]
+        self._make(painted, opening, processes, lambda done: on_drive(len(alone) + done, total))
+
+    def _make(
+        self, drives: Sequence[Conditions], opening: Opening, processes: int, on_done: Callable[[int], object]
+    ) -> None:
+        missing = [each for each in drives if not self.episodes.has(each)]
+        made = len(drives) - len(missing)
+        on_done(made)
         if processes > 1 and len(missing) > 1:
-            make_together(opening, self.episodes, missing, processes, lambda done: on_drive(made + done, len(wanted)))
+            make_together(opening, self.episodes, missing, processes, lambda done: on_done(made + done))
             return
         for k, each in enumerate(missing):
             self.episodes.make(self.world, each)
-            on_drive(made + k + 1, len(wanted))
+            on_done(made + k + 1)
+
+    def _pairs(self, weather: Weather, paint: Paint) -> list[tuple[Conditions, Conditions]]:
+        """The drives over a pattern, each after the one that it is compared with, where that went well."""
+        alone = self._alone(weather)
+        good = {each.clean for each in self.bare(weather) if not each.wrong}
+        pairs = [(alone[k], replace(alone[k], paint=paint.name)) for k in paint.drives]
+        return [(clean, painted) for clean, painted in pairs if self.episodes.file(clean) in good]
 
     def bare(self, weather: Weather) -> tuple[JudgedDrive, ...]:
         """The drives on the bare road, and what went wrong in them."""
@@ -128,22 +141,19 @@ class Stretch:
         return tuple(found)
 
     def painted(self, weather: Weather, paints: Iterable[Paint]) -> tuple[JudgedDrive, ...]:
-        """The drives over paint, but for those without a good drive on the bare road to compare with."""
-        alone = self._alone(weather)
-        good = {each.clean for each in self.bare(weather) if not each.wrong}
+        """The drives over paint, each compared with the same drive on the bare road."""
         found: list[JudgedDrive] = []
         for paint in paints:
-            for clean in (alone[k] for k in paint.drives):
-                if self.episodes.file(clean) not in good:
-                    continue
-                trial = self.episodes.trial(clean, replace(clean, paint=paint.name))
+            for clean, painted in self._pairs(weather, paint):
+                trial = self.episodes.trial(clean, painted)
                 side = "left" if trial.lateral_m > 0 else "right"
-                wrong = f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}" if trial.leaves_lane else ""
                 found.append(
                     JudgedDrive(
                         seed=clean.seed,
                         start=clean.start,
-                        wrong=wrong,
+                        wrong=f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}"
+                        if trial.leaves_lane
+                        else "",
                         clean=trial.clean,
                         painted=trial.painted,
                         paint=str(paint.path),
