@@ -227,3 +227,33 @@ def test_an_architecture_is_known_by_its_shapes_not_its_weights():
     one, other = load_controller("pilotnet"), load_controller("pilotnet-b")
     assert architecture_of(one) == architecture_of(other) != architecture_of(load_controller("cil-small"))
     assert architecture_of(load_controller("cil-small")) != architecture_of(load_controller("cil"))
+
+
+def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypatch):
+    monkeypatch.chdir(team)
+    shutil.copytree(failed[0] / "drives", tmp_path / "drives")
+    left = [tmp_path / name for name in ("check.json", "junit.xml", "summary.md", "worst.jpg")]
+    command = ("check", "check.toml", "--trust", "--out", tmp_path)
+    code, said = invoke(*command)
+    assert (code, said.err) == (1, "")
+    assert "failed: test-road, clear-noon, magenta" in said.out
+    assert "see it: roadproof evaluate patterns/test-road/magenta.json --controller team_folder:magenta_shy" in said.out
+    assert all(path.exists() for path in left)
+    # Nobody takes what a check before left for the result of one that could not be run.
+    code, said = invoke(*command[:2], "--out", tmp_path)
+    assert (code, said.out) == (2, "")
+    assert "runs what its author wrote" in said.err
+    assert not any(path.exists() for path in left)
+    code, said = invoke(*command, "--accept")
+    assert code == 2
+    assert "names none; add [change]" in said.err
+    loose = PLAN.replace("deviation_m = 0.2, left_lane = 0.0", "deviation_m = 9.0") + CHANGE.replace(
+        '"reference"', '"kept"'
+    )
+    (team / "loose.toml").write_text(loose)
+    code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path, "--accept")
+    assert code == 0, said.err
+    assert (team / "kept/smoke/check.json").read_bytes() == (tmp_path / "check.json").read_bytes()
+    code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path)
+    assert code == 0
+    assert "compared with the reference" in said.out

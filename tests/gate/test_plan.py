@@ -1,12 +1,15 @@
 """A check's plan: every mistake is told before work begins."""
 
+from pathlib import Path
+
 import pytest
 
 from roadproof.datatypes import Weather
 from roadproof.errors import CheckError
 from roadproof.gate.plan import load_check
 from roadproof.gate.verdict import Kind
-from team_folder import PLAN, write_team
+from roadproof.patterns import save_pattern
+from team_folder import BAR, PLAN, write_team
 
 
 @pytest.fixture(scope="module")
@@ -14,6 +17,21 @@ def team(tmp_path_factory):
     folder = tmp_path_factory.mktemp("team")
     write_team(folder)
     return folder
+
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "check" / "check.toml"
+
+
+def test_the_plan_of_the_docs_is_the_example_and_can_be_followed(tmp_path):
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assert f"```toml\n{text}```" in (EXAMPLE.parents[2] / "docs" / "check.md").read_text(encoding="utf-8")
+    (tmp_path / "check.toml").write_text(text, encoding="utf-8")
+    save_pattern(BAR, tmp_path / "patterns" / "bar.json")
+    found = load_check(tmp_path / "check.toml", budget="full")
+    assert len(found.keys) == 5 * 2 * 4
+    assert found.reference == tmp_path / "reference" / "full" / "check.json"
+    with pytest.raises(CheckError, match="no recording of left-03 at clear-noon"):
+        load_check(tmp_path / "check.toml")
 
 
 def plan(team, text):
