@@ -30,8 +30,8 @@ seeds = [0, 1]
 
 [starts]
 count = 3
-right_m = 0.1
-turned_rad = 0.01
+right_m = 0.05
+turned_rad = 0.004
 faster_mps = 0.5
 
 [smoke]
