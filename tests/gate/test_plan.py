@@ -93,7 +93,7 @@ MISTAKES = {
     "scenario": (('scenarios = ["test-road"]', 'scenarios = ["test-raod"]'), "did you mean 'test-road'"),
     "outside": (('scenario_file = "', 'scenario_file = "../'), "leaves the plan's folder"),
     "patterns": (('patterns = "patterns"', 'patterns = "nowhere"'), "patterns 'nowhere' is no folder"),
-    "nothing painted": (('patterns = "patterns"', ""), "nothing would be painted"),
+    "nothing painted": (('patterns = "patterns"', ""), "nothing would be painted there"),
     "no smoke": (('[smoke]\nrecordings = ["recordings"]', ""), "add [smoke] with recordings"),
     "no recordings": (('recordings = ["recordings"]', 'recordings = ["nowhere"]'), "roadproof record test-road"),
     "weather": (

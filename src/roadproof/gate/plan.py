@@ -242,8 +242,9 @@ def _check_drives(plan: CheckPlan) -> None:
         drives[Kind.RANDOM] = plan.random * len(plan.seeds)
     if plan.budget == "full":
         drives[Kind.FRESH] = each
-    if len(drives) == 1:
-        raise CheckError("random is 0 and there are no stored patterns, so nothing would be painted")
+    bare = [each.name for each in plan.scenarios if not plan.stored.get(each.name)]
+    if bare and not drives.keys() & {Kind.RANDOM, Kind.FRESH}:
+        raise CheckError(f"random is 0 and {bare[0]} has no stored patterns, so nothing would be painted there")
     for kind, count in drives.items():
         limits = plan.limits[kind]
         if kind is not Kind.BARE and not limits and not plan.change:
