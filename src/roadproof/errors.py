@@ -58,3 +58,7 @@ class TrainingError(RoadproofError, ValueError):
 
 class StudyError(RoadproofError, ValueError):
     """A study's plan, or a folder with its results, is not valid."""
+
+
+class CheckError(RoadproofError, ValueError):
+    """The plan of a regression check, or what it names, is not valid."""

@@ -17,6 +17,7 @@ from roadproof import __version__
 from roadproof.cli.attack import attack
 from roadproof.cli.calibrate import calibrate
 from roadproof.cli.carla import carla
+from roadproof.cli.check import check
 from roadproof.cli.check_controller import check_controller
 from roadproof.cli.controllers import controllers
 from roadproof.cli.convert_cil import convert_cil
@@ -47,6 +48,7 @@ VERBS = (
     select,
     evaluate,
     report,
+    check,
     drive,
     scenarios,
     controllers,

@@ -109,7 +109,7 @@ def evaluate(
         on_drive(made, len(drives))
         if processes > 1 and len(missing) > 1:
             assert callable(simulator)
-            _make_together(simulator, episodes, missing, processes, lambda done: on_drive(made + done, len(drives)))
+            make_together(simulator, episodes, missing, processes, lambda done: on_drive(made + done, len(drives)))
         else:
             for k, drive in enumerate(missing):
                 episodes.make(world, drive)
@@ -170,14 +170,26 @@ def _planned(
     return pairs
 
 
-def _make_together(
+def make_together(
     opening: Opening,
     episodes: Episodes,
     drives: Sequence[Conditions],
     processes: int,
     on_done: Callable[[int], object],
 ) -> None:
-    """Deal the drives out to processes; what is done shows in the folder."""
+    """Deal the drives out to processes; what is done shows in the folder.
+
+    Args:
+        opening: makes a simulator in each of them.
+        episodes: where the drives are kept.
+        drives: that are missing.
+        processes: how many at most.
+        on_done: told how many of them are there.
+
+    Raises:
+        SimulatorError: a process died, or the simulator refuses the conditions.
+        ControllerError: the driver raises, or answers wrongly.
+    """
     shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
     with processes_beside(len(shares)) as pool:
         running = [pool.submit(_make_share, opening, episodes, share) for share in shares]

@@ -1,0 +1,87 @@
+"""`roadproof check`: a regression gate for a team's CI."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from roadproof.cli.options import Device, Processes, check_processes, choice
+
+if TYPE_CHECKING:
+    from roadproof.gate.result import CheckResult
+
+
+def check(
+    plan: Annotated[Path, typer.Argument(help="TOML file that says what is driven, and what passes.")],
+    budget: Annotated[
+        str | None,
+        typer.Option(
+            help="smoke: stored and random patterns in recordings; full: in the simulator, with fresh attacks."
+            "  [default: the plan's]",
+            show_default=False,
+        ),
+    ] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Compare with no reference; where all passes, this becomes it.")
+    ] = False,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
+    ] = False,
+    processes: Processes = 1,
+    device: Device = "cpu",
+    out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
+        "out/check"
+    ),
+) -> None:
+    """Check a controller against stored, random and fresh patterns: exit code 0 passed, 1 not, 2 not run."""
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.cli.progress import stages
+    from roadproof.controllers import load_controller
+    from roadproof.errors import CheckError
+    from roadproof.gate.check import clear, run_check
+    from roadproof.gate.plan import BUDGETS, load_check
+    from roadproof.gate.result import FILE
+    from roadproof.gate.verdict import Status
+    from roadproof.io.files import write_atomically
+    from roadproof.io.locks import hold
+
+    asked = None if budget is None else choice(budget, "budget", BUDGETS)
+    hold(out)
+    clear(out)
+    chosen = load_check(plan, budget=asked, trust=trust)
+    if accept and chosen.reference is None:
+        raise CheckError(f"--accept makes a reference, but {plan} names none; add [change] with reference")
+    if chosen.budget == "full":
+        check_processes(processes, chosen.simulator)
+    who = load_controller(chosen.controller, device=device)
+    with stages() as show:
+        result = run_check(chosen, who, out, compare=not accept, device=device, processes=processes, on_progress=show)
+    _summarise(result, out)
+    if result.status is not Status.PASSED:
+        if accept:
+            typer.echo("This does not become the reference, since not all of it passed")
+        raise typer.Exit(1)
+    if accept and chosen.reference is not None:
+        content = (out / FILE).read_bytes()
+        write_atomically(chosen.reference, lambda part: part.write_bytes(content))
+        typer.echo(f"From now on the reference is {chosen.reference}; keep it beside the plan")
+
+
+def _summarise(result: CheckResult, out: Path) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from roadproof.gate.outputs import COLUMNS, heading, rows_of, why
+
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    table = Table(*COLUMNS, box=box.SIMPLE)
+    for row in rows_of(result):
+        table.add_row(*row)
+    console.print(table)
+    for case in result.not_passed:
+        console.print(f"{case.status}: {case}", *why(case), f"see it: {case.command}", sep="\n  ")
+    console.print(heading(result))
+    console.print(f"Results in {out}: check.json, junit.xml, summary.md")

@@ -1,0 +1,249 @@
+"""A check: every case of a plan driven and judged.
+
+    OUT/check.json      verdict, and every case with its drives (`gate.result`)
+    OUT/junit.xml       a test case each, for a CI to read
+    OUT/summary.md      for people, with worst.jpg: the worst drive beside the same drive without paint
+    OUT/drives/         every drive by scenario; what is there is not driven again
+    OUT/patterns/       the random and the fresh patterns, by scenario
+    OUT/fresh/          the attacks of a full check
+
+None of the first four is there before all cases are judged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from torch import nn
+
+import roadproof
+from roadproof.controllers import Controller
+from roadproof.controllers.checks import require_usable
+from roadproof.controllers.identity import identity_of
+from roadproof.driving.drive_store import Episodes, load_episodes
+from roadproof.driving.evaluation import ATTACK, Evaluation
+from roadproof.driving.evaluation import judge as judge_pair
+from roadproof.driving.starts import NOMINAL
+from roadproof.errors import CheckError
+from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
+from roadproof.gate.places import Place, command_of, places_of
+from roadproof.gate.plan import FRESH, CheckPlan, Key
+from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_reference, worst_of
+from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
+from roadproof.gate.verdict import Kind, Status, judge
+from roadproof.io.locks import working_in
+from roadproof.patterns import raster, read_paint, save_pattern
+from roadproof.pipeline.budget import QUICK
+from roadproof.pipeline.stress_test import OnProgress, stress_test
+from roadproof.processes import require_picklable
+from roadproof.report.film import FILM, STRIP, film_trial
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import Simulator
+
+OUTPUTS = (FILE, "junit.xml", "summary.md", WORST)
+
+
+def run_check(
+    plan: CheckPlan,
+    controller: Controller,
+    folder: Path,
+    *,
+    compare: bool = True,
+    device: str = "cpu",
+    processes: int = 1,
+    on_progress: OnProgress = lambda _stage, _done, _total, _word: None,
+) -> CheckResult:
+    """Drive every case of a plan, judge it by the plan's limits, and write what came of it.
+
+    Args:
+        plan: what is driven, and what passes.
+        controller: that is checked.
+        folder: for results; an interrupted check goes on from what it holds.
+        compare: whether to compare with the plan's reference.
+        device: where attacks and recorded worlds compute.
+        processes: drives made at once, each in a process with a world of its own.
+        on_progress: told of every stage, how much of it is done, of how much, and a word on it.
+
+    Raises:
+        CheckError: the reference is missing, or of other conditions.
+        ControllerError: the controller raises, answers wrongly, or cannot travel to several processes.
+        SimulatorError: the simulator is not there or stopped answering.
+        OutputError: the folder cannot be written, or another process works in it.
+    """
+    before: Mapping[Key, Case] = {}
+    begun = time.perf_counter()
+    if processes > 1:
+        require_picklable(controller)
+    with working_in(folder):
+        clear(folder)
+        if compare and plan.reference is not None:
+            before = load_reference(plan.reference, architecture_of(controller), plan)
+        run = _Run(plan, controller, folder, before, device, processes, on_progress)
+        places = places_of(plan, device)
+        cases = tuple(case for place in places for case in run.cases(place))
+        result = CheckResult(
+            roadproof=roadproof.__version__,
+            controller=plan.controller,
+            architecture=architecture_of(controller),
+            budget=plan.budget,
+            compared=bool(before),
+            cases=cases,
+        )
+        pictured = run.film(places, cases)
+        write_junit(result, time.perf_counter() - begun, folder / "junit.xml")
+        write_summary(result, pictured, folder / "summary.md")
+        result.save(folder / FILE)
+    return result
+
+
+def clear(folder: Path) -> None:
+    """Take away what a check before left for others, so that nobody takes it for this one's."""
+    for name in OUTPUTS:
+        (folder / name).unlink(missing_ok=True)
+
+
+def architecture_of(controller: Controller) -> str:
+    """What a controller is made of, whatever it has learnt: its type, and of a module a hash of its tensors' shapes."""
+    name = type(controller).__qualname__
+    if not isinstance(controller, nn.Module):
+        return name
+    shapes = {key: list(value.shape) for key, value in controller.state_dict().items()}
+    return f"{name}-{hashlib.sha256(json.dumps(shapes).encode()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """The arguments of `run_check`."""
+
+    plan: CheckPlan
+    controller: Controller
+    folder: Path
+    before: Mapping[Key, Case]
+    device: str
+    processes: int
+    on_progress: OnProgress
+
+    def cases(self, place: Place) -> list[Case]:
+        plan = self.plan
+        with place.opening() as world:
+            size = (world.input.height_px, world.input.width_px)
+            fresh = plan.budget == "full"
+            require_usable(self.controller, size=size, device=self.device, gradients=fresh)
+            scenario = place.begun_in(world)
+            paints = known_paints(plan, scenario, self.folder / "patterns" / scenario.name)
+            if fresh:
+                paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
+            images = {paint.name: raster(paint.pattern) for paint in paints}
+            drives = self.folder / "drives" / scenario.name
+            episodes = Episodes.of(world, self.controller, scenario, images, drives)
+            stretch = Stretch(plan=plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
+            told = {
+                key: (stretch.conditions(key, painted), painted)
+                for key in plan.keys
+                if key[0] == scenario.name and key[1] in place.weathers
+                for painted in [tuple(paint for paint in paints if (paint.kind, paint.case) == key[2:])]
+            }
+            for key, (conditions, _) in told.items():
+                self._check_comparable(key, conditions)
+            stage = f"Driving {scenario.name}, {', '.join(place.weathers)}"
+            stretch.drive(place.opening, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
+            return [self._judged(place, stretch, key, *each) for key, each in told.items()]
+
+    def _check_comparable(self, key: Key, conditions: str) -> None:
+        stored = self.before.get(key)
+        if stored is not None and stored.conditions != conditions:
+            raise CheckError(
+                f"the reference {self.plan.reference} has {stored} with other patterns, starts, seeds or recordings; "
+                "make it again with --accept, from a controller that you trust"
+            )
+
+    def _judged(self, place: Place, stretch: Stretch, key: Key, conditions: str, paints: tuple[Paint, ...]) -> Case:
+        plan, (scenario, weather, kind, name) = self.plan, key
+        drives = stretch.painted(weather, paints) if paints else stretch.bare(weather)
+        measures = measures_of(kind, drives)
+        stored = self.before.get(key)
+        status, reasons = judge(measures, plan.limits[kind], plan.change, stored and stored.measures)
+        # Where there is none over paint, the drives past the bare road are to be seen.
+        shown = paints or stretch.paints
+        worst = worst_of(drives) or JudgedDrive(seed=shown[0].drives[0][0], start=NOMINAL, wrong="", clean="")
+        pattern = worst.paint or str(shown[0].path)
+        return Case(
+            scenario=scenario,
+            weather=weather,
+            kind=kind,
+            name=name,
+            conditions=conditions,
+            measures=dict(measures),
+            status=status,
+            reasons=reasons,
+            command=command_of(plan, place, weather, pattern, worst.seed, self.folder / "show"),
+            drives=drives,
+        )
+
+    def _fresh(self, world: Simulator, scenario: Scenario, seed: int, size: tuple[int, int]) -> Paint:
+        """What a fresh attack finds; the folder is this controller's own."""
+        plan, name = self.plan, f"fresh-{seed}"
+        who = identity_of(self.controller, size)
+        found = stress_test(
+            world,
+            self.controller,
+            scenario,
+            self.folder / "fresh" / f"{scenario.name}-{seed}-{who[:8]}",
+            # Its own evaluation is one drive; the cases' drives judge it.
+            budget=replace(QUICK, weathers=plan.weathers[:1], starts=0),
+            space=SearchSpace(figures=plan.figures),
+            seed=seed,
+            controller_name=plan.controller,
+            device=self.device,
+            on_progress=lambda stage, done, total, word: self.on_progress(
+                f"{scenario.name}, seed {seed}: {stage}", done, total, word
+            ),
+        )
+        path = self.folder / "patterns" / scenario.name / f"{name}.json"
+        save_pattern(found.pattern, path)
+        drives = tuple((seed, k) for k in range(plan.starts.count))
+        return Paint(name, Kind.FRESH, FRESH, found.pattern, path, drives)
+
+    def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
+        """Leave a picture, and say which case it shows: of those that do not pass, if any, the one furthest astray."""
+        painted = [(case, worst) for case in cases if case.kind is not Kind.BARE and (worst := worst_of(case.drives))]
+        wrong = [each for each in painted if each[0].status is not Status.PASSED]
+        if not painted:
+            return None
+        case, worst = max(wrong or painted, key=lambda each: each[1].deviation_m)
+        place = next(p for p in places if p.scenario.name == case.scenario and case.weather in p.weathers)
+        drives = self.folder / "drives" / case.scenario
+        (drives / FILM).unlink(missing_ok=True)
+        clean, driven = load_episodes(drives, (worst.clean, worst.painted))
+        with place.opening() as world:
+            scenario = place.begun_in(world)
+            trial = judge_pair(
+                clean,
+                driven,
+                scenario.canvas,
+                pattern=ATTACK,
+                clean_file=worst.clean,
+                painted_file=worst.painted,
+                start=worst.start,
+            )
+            shown = Evaluation(
+                scenario=scenario,
+                controller=self.plan.controller,
+                weathers=(case.weather,),
+                runs=0,
+                cars=0,
+                pedestrians=0,
+                seed=worst.seed,
+                trials=(trial,),
+                simulator_calls=0,
+                seconds=0.0,
+            )
+            film_trial(world, shown, read_paint(Path(worst.paint)), drives)
+        write_worst(drives / STRIP, self.folder / WORST)
+        return case

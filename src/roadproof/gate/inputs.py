@@ -1,0 +1,126 @@
+"""What a check's plan names: stored patterns, and the recordings that a smoke check drives in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from roadproof.datatypes import Weather
+from roadproof.drives import load_drives
+from roadproof.errors import CheckError
+from roadproof.io.files import check_name
+from roadproof.patterns import Pattern, load_pattern
+from roadproof.scenarios import Scenario, find_scenario
+
+LONGEST_STEM = 40
+"""Episodes are named after their pattern, and names have at most 100 letters."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Stored:
+    """A pattern of the plan's folder.
+
+    Args:
+        name: its file's, without the ending.
+        path: of the file.
+        pattern: what it paints.
+    """
+
+    name: str
+    path: Path
+    pattern: Pattern
+
+
+def each_once(values: tuple[Any, ...], what: str) -> None:
+    """See that a list has something in it, and nothing twice.
+
+    Raises:
+        CheckError: it is not so.
+    """
+    if not values:
+        raise CheckError(f"{what} is empty, expected at least one")
+    if twice := [value for value in values if values.count(value) > 1]:
+        raise CheckError(f"{what} has {twice[0]} twice, expected each once")
+
+
+def stored_patterns(
+    listed: str | None, folder: Path, scenarios: tuple[Scenario, ...], known: tuple[Scenario, ...]
+) -> dict[str, tuple[Stored, ...]]:
+    """The patterns of each scenario by its name: those for all, then its own.
+
+    Args:
+        listed: the folder of patterns, as the plan names it; None for no patterns.
+        folder: of the plan.
+        scenarios: those that are driven.
+        known: all that a folder may be named after.
+
+    Raises:
+        CheckError: there is no such folder, no pattern in it, or two of one name.
+        ScenarioError: a folder in it is named after no scenario.
+        PatternError: a file in it is no pattern.
+    """
+    if listed is None:
+        return {}
+    place = folder / listed
+    if not place.is_dir():
+        raise CheckError(f"patterns {listed!r} is no folder; expected one with pattern files (*.json)")
+    for each in sorted(place.iterdir()):
+        if each.is_dir():
+            find_scenario(each.name, known)
+    for_all = _patterns_in(place)
+    found = {each.name: for_all + _patterns_in(place / each.name) for each in scenarios}
+    if not any(found.values()):
+        raise CheckError(f"patterns {listed!r} holds none for these scenarios; put pattern files (*.json) there")
+    for name, patterns in found.items():
+        each_once(tuple(each.name for each in patterns), f"patterns of {name}")
+    return found
+
+
+def _patterns_in(folder: Path) -> tuple[Stored, ...]:
+    found: list[Stored] = []
+    for path in sorted(folder.glob("*.json")):
+        if len(check_name(path.stem, "pattern", CheckError)) > LONGEST_STEM:
+            raise CheckError(f"pattern {path.stem!r} has a name of more than {LONGEST_STEM} letters; shorten it")
+        found.append(Stored(name=path.stem, path=path, pattern=load_pattern(path)))
+    return tuple(found)
+
+
+def recordings_of(
+    folder: Path,
+    listed: tuple[str, ...],
+    scenarios: tuple[Scenario, ...],
+    weathers: tuple[Weather, ...],
+    controller: str,
+) -> dict[tuple[str, Weather], Path]:
+    """The run in which each scenario is driven in each weather.
+
+    Args:
+        folder: of the plan.
+        listed: the folders with runs, as the plan names them.
+        scenarios: those that are driven.
+        weathers: in which.
+        controller: its spec, for the advice where a recording is missing.
+
+    Raises:
+        CheckError: a recording is missing, or of another stretch of road.
+        RecordingError: one is damaged.
+    """
+    found: dict[tuple[str, Weather], Path] = {}
+    for place in (folder / listed for listed in listed):
+        for scenario in scenarios:
+            if not (run := place / scenario.name).is_dir():
+                continue
+            made = load_drives(run / "record").settings
+            if (made.scenario.start, made.scenario.canvas) != (scenario.start, scenario.canvas):
+                raise CheckError(f"{run} is a recording of another {scenario.name}; record it again")
+            found.setdefault((scenario.name, made.weather), run)
+    for scenario in scenarios:
+        for weather in weathers:
+            run = Path(folder / listed[0] if listed else "recordings", scenario.name)
+            if (scenario.name, weather) not in found:
+                raise CheckError(
+                    f"no recording of {scenario.name} at {weather}; make one with: roadproof record {scenario.name} "
+                    f"--weather {weather} --driver {controller} --out {run.parent}; roadproof calibrate {run}"
+                )
+    return found

@@ -1,0 +1,140 @@
+"""What a check leaves for others to read: JUnit XML for a CI, Markdown for people."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from roadproof.errors import EpisodeError
+from roadproof.gate.result import Case, CheckResult
+from roadproof.gate.verdict import Status
+from roadproof.io.arrays import read_archive
+from roadproof.io.files import write_atomically
+from roadproof.report.words import MISSING, in_words
+
+WORST = "worst.jpg"
+SHOWN_PX, BLACK = 1500, 12
+COLUMNS = ("scenario", "paint", "drives", "deviation m", "went wrong", "verdict")
+
+LEGEND = "Deviation is a median, and went wrong the share of drives that left their lane, with 95 % intervals."
+
+
+def rows_of(result: CheckResult) -> tuple[tuple[str, ...], ...]:
+    """The table: a row a case, under `COLUMNS`."""
+    return tuple(
+        (
+            f"{case.scenario}, {in_words(case.weather)}",
+            case.name,
+            str(len(case.drives)),
+            _cell(case, "deviation_m"),
+            _cell(case, "left_lane" if "left_lane" in case.measures else "failed"),
+            str(case.status),
+        )
+        for case in result.cases
+    )
+
+
+def _cell(case: Case, measure: str) -> str:
+    if (found := case.measures.get(measure)) is None:
+        return MISSING
+    scale, digits = (1, 2) if measure == "deviation_m" else (100, 0)
+    told = [f"{scale * each:.{digits}f}" for each in (found.value, found.low, found.high) if each is not None]
+    percent = "%" if scale == 100 else ""
+    return f"{told[0]}{percent} ({'–'.join(told[1:])})" if len(told) > 1 else f"{told[0]}{percent}"
+
+
+def why(case: Case) -> tuple[str, ...]:
+    """Why a case does not pass."""
+    wrong = [each for each in case.drives if each.wrong]
+    told = [f"{len(wrong)} of {len(case.drives)} drives go wrong, the first: {wrong[0].wrong}"] if wrong else []
+    return *case.reasons, *told
+
+
+def heading(result: CheckResult) -> str:
+    """The verdict in one line."""
+    drives = len({name for case in result.cases for each in case.drives for name in (each.clean, each.painted) if name})
+    where = "predicted in recordings, nothing was driven for real" if result.predicted else "driven in the simulator"
+    passed = f"{len(result.cases) - len(result.not_passed)} of {len(result.cases)} cases passed"
+    beside = "compared with the reference" if result.compared else "no reference"
+    return f"{result.status}: {passed}; {result.controller}, {result.budget}, {drives} drives, {where}, {beside}"
+
+
+def write_junit(result: CheckResult, seconds: float, path: Path) -> None:
+    """Write JUnit XML: a test case for each case, with a failure that says why it does not pass.
+
+    Args:
+        result: of the check.
+        seconds: that it took; each case's time is its drives' share of them.
+        path: of the file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    counts = {"tests": str(len(result.cases)), "failures": str(len(result.not_passed)), "errors": "0"}
+    counts["time"] = f"{seconds:.3f}"
+    drive_s = seconds / sum(len(case.drives) for case in result.cases)
+    root = ET.Element("testsuites", counts)
+    suite = ET.SubElement(root, "testsuite", {"name": f"roadproof check {result.controller}", **counts})
+    told = ET.SubElement(suite, "properties")
+    for name in ("roadproof", "controller", "architecture", "budget"):
+        ET.SubElement(told, "property", {"name": name, "value": str(getattr(result, name))})
+    for case in result.cases:
+        name = {"classname": f"roadproof.{case.scenario}", "name": f"{case.weather}, {case.name}"}
+        test = ET.SubElement(suite, "testcase", name, time=f"{drive_s * len(case.drives):.3f}")
+        if case.status is not Status.PASSED:
+            message = {"type": str(case.status), "message": "; ".join(case.reasons)}
+            ET.SubElement(test, "failure", message).text = "\n".join((*why(case), f"see it: {case.command}"))
+    ET.indent(root)
+    content: bytes = ET.tostring(root, "utf-8", xml_declaration=True)
+    write_atomically(path, lambda part: part.write_bytes(content + b"\n"))
+
+
+def write_summary(result: CheckResult, pictured: Case | None, path: Path) -> None:
+    """Write the Markdown summary.
+
+    Args:
+        result: of the check.
+        pictured: the case that `WORST` beside it shows; None where there is no picture.
+        path: of the file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    lines = [f"## roadproof check: {heading(result)}", ""]
+    lines += [_row(COLUMNS), _row(["---"] * len(COLUMNS)), *map(_row, rows_of(result))]
+    lines += ["", LEGEND]
+    for case in result.not_passed:
+        lines += ["", f"### {case.status}: {case}", "", *(f"- {reason}" for reason in why(case))]
+        lines += ["", "```sh", case.command, "```"]
+    if pictured is not None:
+        about = f"Furthest astray, {pictured}: above without paint, below with it, at the same instants"
+        lines += ["", f"![{about}]({WORST})", "", f"*{about} (`{WORST}`).*"]
+    write_atomically(path, lambda part: part.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def write_worst(strip: Path, path: Path) -> None:
+    """Write the picture of a passage: above without paint, below with it.
+
+    Args:
+        strip: what `report.film.film_trial` left.
+        path: of the JPEG.
+
+    Raises:
+        EpisodeError: there is no strip, or it is damaged.
+        OutputError: the picture cannot be written.
+    """
+    found = read_archive(strip, ("clean", "painted"), EpisodeError, "check again")
+    rows = [np.concatenate(list(found[name]), 1) for name in ("clean", "painted")]
+    whole = np.concatenate(rows)
+    # Around what was recorded, pictures of the recorded world are black.
+    picture = Image.fromarray(whole[whole.max((1, 2)) > BLACK])
+    picture = picture.resize((SHOWN_PX, round(SHOWN_PX * picture.height / picture.width)))
+    write_atomically(path, lambda part: picture.save(part, format="JPEG", quality=88))

@@ -1,0 +1,285 @@
+"""What a check drives and what it lets pass, as a TOML file says it; docs/check.md has one with every key."""
+
+from __future__ import annotations
+
+import fnmatch
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, get_args
+
+from roadproof.controllers.loading import runs_code
+from roadproof.datatypes import Weather
+from roadproof.driving.starts import StartRange
+from roadproof.errors import CheckError, RoadproofError
+from roadproof.gate.inputs import Stored, each_once, recordings_of, stored_patterns
+from roadproof.gate.verdict import Change, Kind, least_drives
+from roadproof.limits import MAX_FIGURES, MAX_SEED
+from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
+from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
+from roadproof.study.plan import StartPlan
+from roadproof.study.reading import build, one_of, within
+
+Key: TypeAlias = tuple[str, Weather, Kind, str]
+"""What tells a case from the others: scenario, weather, and kind and name of the paint."""
+
+BARE, RANDOM, FRESH = "bare road", "random patterns", "fresh attack"
+FORMAT = "roadproof-check"
+FORMAT_VERSION = 1
+BudgetName = Literal["smoke", "full"]
+BUDGETS: tuple[BudgetName, ...] = get_args(BudgetName)
+RANGES = {"deviation_m": (0.01, 100.0), "left_lane": (0.0, 1.0), "failed": (0.0, 1.0)}
+MEASURES = {kind: ("failed",) if kind is Kind.BARE else ("deviation_m", "left_lane") for kind in Kind}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CheckPlan:
+    """What one check drives, and what it lets pass; `load_check` reads it.
+
+    Args:
+        controller: its spec.
+        scenarios: where.
+        scenario_file: they are from, where that is the user's own.
+        budget: "smoke" in recordings, "full" in a simulator with fresh attacks.
+        weathers: of that budget; a fresh attack is found in the first.
+        seeds: each has starts, random patterns and a fresh attack of its own.
+        starts: drives of each seed in each case.
+        random: patterns drawn for each seed, each driven once.
+        figures: of random patterns and fresh attacks.
+        stored: patterns by name of the scenario that they are driven in.
+        recordings: run of each scenario and weather; of a smoke check.
+        simulator: its spec; of a full check.
+        limits: greatest values that pass, by kind of paint and measure.
+        change: how much worse than the reference each measure may be.
+        reference: where the check.json to compare with lies; None where nothing is compared.
+    """
+
+    controller: str
+    scenarios: tuple[Scenario, ...]
+    scenario_file: Path | None
+    budget: BudgetName
+    weathers: tuple[Weather, ...]
+    seeds: tuple[int, ...]
+    starts: StartPlan
+    random: int
+    figures: int
+    stored: Mapping[str, tuple[Stored, ...]]
+    recordings: Mapping[tuple[str, Weather], Path]
+    simulator: str
+    limits: Mapping[Kind, Mapping[str, float]]
+    change: Mapping[str, Change]
+    reference: Path | None
+
+    @property
+    def start_range(self) -> StartRange:
+        """What starts are drawn from."""
+        return StartRange(
+            right_m=self.starts.right_m, turned_rad=self.starts.turned_rad, faster_mps=self.starts.faster_mps
+        )
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Every case."""
+        found: list[Key] = []
+        for scenario in self.scenarios:
+            painted = [(Kind.STORED, each.name) for each in self.stored.get(scenario.name, ())]
+            painted += [(Kind.RANDOM, RANDOM)] if self.random else []
+            painted += [(Kind.FRESH, FRESH)] if self.budget == "full" else []
+            found += [
+                (scenario.name, weather, *each) for weather in self.weathers for each in ((Kind.BARE, BARE), *painted)
+            ]
+        return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Smoke:
+    recordings: tuple[str, ...]
+    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Full:
+    simulator: str = "town"
+    weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Stated:
+    """A plan as its file says it."""
+
+    controller: str
+    scenarios: tuple[str, ...]
+    limits: dict[str, dict[str, float]]
+    scenario_file: str | None = None
+    budget: str = "smoke"
+    patterns: str | None = None
+    random: int = 5
+    figures: int = 5
+    seeds: tuple[int, ...] = (0, 1)
+    starts: dict[str, Any] = field(default_factory=dict[str, Any])
+    smoke: dict[str, Any] | None = None
+    full: dict[str, Any] = field(default_factory=dict[str, Any])
+    change: dict[str, str | dict[str, Any]] = field(default_factory=dict[str, str | dict[str, Any]])
+
+
+def load_check(path: Path, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
+    """Read a plan for one budget, with everything that it names; see the head of this module.
+
+    Args:
+        path: of the TOML file; what it names lies beside it.
+        budget: "smoke" or "full"; None for the plan's own.
+        trust: follow it also where it runs code or calls another machine: a plan may come from anyone.
+
+    Raises:
+        CheckError: the file or something that it names is missing, damaged or unknown, a number is out of its range,
+            the drives are too few for the limits, or it is not trusted with what it asks for; the message says which.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CheckError(f"cannot read {path}: {error.strerror or error}; check the path") from None
+    except (ValueError, RecursionError) as error:
+        raise CheckError(f"{path} is not valid TOML ({error})") from None
+    try:
+        if content.pop("format", None) != FORMAT:
+            raise CheckError(f'expected format = "{FORMAT}"')
+        if (version := content.pop("version", None)) != FORMAT_VERSION:
+            raise CheckError(f"version is {version!r}, expected {FORMAT_VERSION}")
+        plan = _plan(build(_Stated, content, "the check"), path.parent, budget)
+        if not trust:
+            _check_harmless(plan)
+    except RoadproofError as error:
+        raise CheckError(f"{path}: {error}") from None
+    return plan
+
+
+def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
+    one_of(stated.budget, "budget", BUDGETS)
+    within(stated.random, "random", 0, 1000)
+    within(stated.figures, "figures", 1, MAX_FIGURES)
+    each_once(stated.scenarios, "scenarios")
+    each_once(stated.seeds, "seeds")
+    for seed in stated.seeds:
+        within(seed, "seeds", 0, MAX_SEED)
+    chosen: BudgetName = "full" if (budget or stated.budget) == "full" else "smoke"
+    listed = stated.scenario_file
+    own = None if listed is None else _beside(folder, listed, "scenario_file")
+    known = load_scenarios(own or BUILTIN_FILE)
+    scenarios = _chosen(stated.scenarios, known)
+    smoke = None if stated.smoke is None else build(_Smoke, stated.smoke, "smoke")
+    full = build(_Full, stated.full, "full")
+    if full.simulator != "town" and not is_server(full.simulator):
+        raise CheckError(f"simulator is {full.simulator!r}, expected {SPECS}")
+    if chosen == "smoke" and smoke is None:
+        raise CheckError('a smoke check drives in recordings; add [smoke] with recordings = ["FOLDER"]')
+    weathers = full.weathers if chosen == "full" or smoke is None else smoke.weathers
+    each_once(weathers, "weathers")
+    change, reference = _change(stated.change, folder)
+    plan = CheckPlan(
+        controller=stated.controller,
+        scenarios=scenarios,
+        scenario_file=own,
+        budget=chosen,
+        weathers=weathers,
+        seeds=stated.seeds,
+        starts=build(StartPlan, stated.starts, "starts"),
+        random=stated.random,
+        figures=stated.figures,
+        stored=stored_patterns(stated.patterns, folder, scenarios, known),
+        recordings=recordings_of(folder, smoke.recordings, scenarios, weathers, stated.controller)
+        if smoke is not None and chosen == "smoke"
+        else {},
+        simulator=full.simulator,
+        limits=_limits(stated.limits),
+        change=change,
+        reference=reference and reference / chosen / "check.json",
+    )
+    _check_drives(plan)
+    return plan
+
+
+def _limits(stated: dict[str, dict[str, float]]) -> dict[Kind, dict[str, float]]:
+    found: dict[Kind, dict[str, float]] = {kind: {} for kind in Kind}
+    found[Kind.BARE] = {"failed": 0.0}
+    for kind, limits in stated.items():
+        one_of(kind, "a key of limits", tuple(Kind))
+        for name, limit in limits.items():
+            one_of(name, f"a key of limits.{kind}", MEASURES[Kind(kind)])
+            within(limit, f"limits.{kind}.{name}", *RANGES[name])
+            found[Kind(kind)][name] = limit
+    return found
+
+
+def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict[str, Change], Path | None]:
+    """How much worse each measure may be, and than what."""
+    if not stated:
+        return {}, None
+    reference = stated.pop("reference", None)
+    if not isinstance(reference, str) or not stated:
+        raise CheckError(f"change needs reference, a folder beside the plan, and one of {', '.join(RANGES)}")
+    found: dict[str, Change] = {}
+    for name, table in stated.items():
+        one_of(name, "a key of change", tuple(RANGES))
+        if isinstance(table, str):
+            raise CheckError(f"change.{name} is {table!r}, expected {{ absolute = ..., relative = ... }}")
+        found[name] = build(Change, table, f"change.{name}")
+        within(found[name].absolute, f"change.{name}.absolute", 0.0, 100.0)
+        within(found[name].relative, f"change.{name}.relative", 0.0, 100.0)
+    return found, _beside(folder, reference, "reference")
+
+
+def _check_drives(plan: CheckPlan) -> None:
+    """See that every kind of paint is judged, by enough drives for what is asked of it."""
+    starts = plan.starts
+    if not any((starts.right_m, starts.turned_rad, starts.faster_mps)):
+        raise CheckError("starts are all the same, with right_m, turned_rad and faster_mps 0; then one is as many")
+    each = starts.count * len(plan.seeds)
+    drives = {Kind.BARE: each}
+    if any(plan.stored.values()):
+        drives[Kind.STORED] = each
+    if plan.random:
+        drives[Kind.RANDOM] = plan.random * len(plan.seeds)
+    if plan.budget == "full":
+        drives[Kind.FRESH] = each
+    bare = [each.name for each in plan.scenarios if not plan.stored.get(each.name)]
+    if bare and not drives.keys() & {Kind.RANDOM, Kind.FRESH}:
+        raise CheckError(f"random is 0 and {bare[0]} has no stored patterns, so nothing would be painted there")
+    for kind, count in drives.items():
+        limits = plan.limits[kind]
+        if kind is not Kind.BARE and not limits and not plan.change:
+            raise CheckError(f"limits has nothing for {kind} patterns, which are driven over; add {kind} = {{ ... }}")
+        asked = dict(limits) | ({"deviation_m": 0.0} if "deviation_m" in plan.change and kind is not Kind.BARE else {})
+        for name, limit in asked.items():
+            if count < (least := least_drives(name, limit)):
+                what = "random × seeds" if kind is Kind.RANDOM else "starts × seeds"
+                above = f" at most {limit:g}" if name != "deviation_m" else ""
+                raise CheckError(
+                    f"too few drives: {count} a case ({what}) can never show {name}{above} for {kind} with its 95 % "
+                    f"interval, expected {least} or more"
+                )
+
+
+def _check_harmless(plan: CheckPlan) -> None:
+    if runs_code(plan.controller):
+        raise CheckError(
+            f"controller {plan.controller!r} runs what its author wrote; look at it, then give --trust (trust=True)"
+        )
+    if plan.budget == "full" and is_elsewhere(plan.simulator):
+        raise CheckError(f"simulator {plan.simulator!r} is another machine; give --trust (trust=True) to call it")
+
+
+def _beside(folder: Path, listed: str, what: str) -> Path:
+    path = folder / listed
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise CheckError(f"{what} {listed!r} leaves the plan's folder; put it beside the plan")
+    return path
+
+
+def _chosen(names: tuple[str, ...], known: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
+    """Scenarios by name or pattern of names, each once, in the order first named."""
+    chosen: dict[str, Scenario] = {}
+    for name in names:
+        found = [each for each in known if fnmatch.fnmatchcase(each.name, name)] or [find_scenario(name, known)]
+        chosen |= {each.name: each for each in found}
+    return tuple(chosen.values())

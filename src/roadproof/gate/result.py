@@ -1,0 +1,167 @@
+"""What came of a check, as check.json keeps it; one that is kept is the reference of those that follow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import roadproof
+from roadproof.datatypes import Weather
+from roadproof.driving.starts import StartOffset
+from roadproof.errors import CheckError
+from roadproof.gate.plan import BudgetName, CheckPlan, Key
+from roadproof.gate.verdict import Estimate, Kind, Status
+from roadproof.io.files import read_json, write_atomically
+from roadproof.io.records import record
+
+FILE = "check.json"
+FORMAT = "roadproof-check-result"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class JudgedDrive:
+    """One drive of a case.
+
+    Args:
+        seed: that its start was drawn with.
+        start: how it began beside the scenario's start.
+        wrong: what went wrong, in words; empty where nothing did.
+        clean: file of the drive on the bare road.
+        painted: file of the drive over paint; empty on the bare road, as the next.
+        paint: file of the pattern.
+        deviation_m: between the two; 0 on the bare road, as the next.
+        lateral_m: largest offset of the painted one from the other's path, left positive.
+    """
+
+    seed: int
+    start: StartOffset
+    wrong: str
+    clean: str
+    painted: str = ""
+    paint: str = ""
+    deviation_m: float = 0.0
+    lateral_m: float = 0.0
+
+
+def worst_of(drives: Sequence[JudgedDrive]) -> JudgedDrive | None:
+    """The drive that went furthest astray; None where there is none."""
+    return max(drives, key=lambda each: (each.deviation_m, bool(each.wrong)), default=None)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Case:
+    """One scenario in one weather over one kind of paint.
+
+    Args:
+        scenario: its name.
+        weather: of the drives.
+        kind: of the paint.
+        name: of the pattern or patterns, in words.
+        conditions: a hash of all that the drives depend on, apart from the controller.
+        measures: with their intervals.
+        status: whether it passes.
+        reasons: why not.
+        command: drives the worst of its drives again, and films it.
+        drives: all that were judged.
+    """
+
+    scenario: str
+    weather: Weather
+    kind: Kind
+    name: str
+    conditions: str
+    measures: dict[str, Estimate]
+    status: Status
+    reasons: tuple[str, ...]
+    command: str
+    drives: tuple[JudgedDrive, ...]
+
+    @property
+    def key(self) -> Key:
+        """What tells it from the other cases of a check."""
+        return self.scenario, self.weather, self.kind, self.name
+
+    def __str__(self) -> str:
+        return f"{self.scenario}, {self.weather}, {self.name}"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CheckResult:
+    """A whole check.
+
+    Args:
+        roadproof: version that made it.
+        controller: its spec.
+        architecture: of the controller (`architecture_of`).
+        budget: "smoke" or "full".
+        compared: whether there was a reference.
+        cases: in the order of the plan.
+    """
+
+    roadproof: str
+    controller: str
+    architecture: str
+    budget: BudgetName
+    compared: bool
+    cases: tuple[Case, ...]
+
+    @property
+    def status(self) -> Status:
+        """Failed where a case did; passed where all did."""
+        found = {case.status for case in self.cases}
+        return next((each for each in (Status.FAILED, Status.TOO_FEW) if each in found), Status.PASSED)
+
+    @property
+    def predicted(self) -> bool:
+        """Whether it drove in recordings, and nothing was driven for real."""
+        return self.budget == "smoke"
+
+    @property
+    def not_passed(self) -> tuple[Case, ...]:
+        """The cases that failed, or had too few drives."""
+        return tuple(case for case in self.cases if case.status is not Status.PASSED)
+
+    def save(self, path: Path) -> None:
+        """Write check.json; the same bytes for the same result.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        kind = "predicted" if self.predicted else "closed loop"
+        content: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, "verdict": self.status}
+        text = json.dumps(content | asdict(self), indent=1, ensure_ascii=False)
+        write_atomically(path, lambda part: part.write_text(text + "\n", encoding="utf-8"))
+
+
+def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, Case]:
+    """The cases of a stored check.json, which those of a check are compared with.
+
+    Args:
+        path: of the file.
+        architecture: of the controller that is checked.
+        plan: of the check.
+
+    Raises:
+        CheckError: there is none, it is damaged, made by another version, architecture or budget, or has a case that
+            the plan leaves out.
+    """
+    again = "make it again with --accept, from a controller that you trust"
+    if not path.is_file():
+        raise CheckError(f"the reference {path} is not there; make it with --accept, from a controller that you trust")
+    content = read_json(path, FORMAT, FORMAT_VERSION, CheckError)
+    stored = record(content, CheckResult, path, CheckError, again)
+    told = (
+        ("roadproof", stored.roadproof, roadproof.__version__),
+        ("a controller of architecture", stored.architecture, architecture),
+        ("budget", stored.budget, plan.budget),
+    )
+    for what, before, now in told:
+        if before != now:
+            raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {again}")
+    if left_out := [case for case in stored.cases if case.key not in plan.keys]:
+        raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {again}")
+    return {case.key: case for case in stored.cases}

@@ -1,0 +1,218 @@
+"""One scenario of a check: what is painted there, the drives over it, and what they come to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from roadproof.datatypes import Ending, Weather
+from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m
+from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluate import Opening, make_together
+from roadproof.driving.evaluation import path_of
+from roadproof.driving.infractions import counted
+from roadproof.gate.plan import RANDOM, CheckPlan, Key
+from roadproof.gate.result import JudgedDrive
+from roadproof.gate.verdict import Kind, Measures, median_95, share_95
+from roadproof.patterns import Pattern, save_pattern
+from roadproof.recorded.simulator import RecordedSimulator
+from roadproof.report.words import in_words
+from roadproof.scenarios import Scenario, identity
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import Identified, Simulator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paint:
+    """A pattern and the drives over it.
+
+    Args:
+        name: tells it from the others of its scenario.
+        kind: where it comes from.
+        case: name of the case that its drives belong to.
+        pattern: what is painted.
+        path: its file.
+        drives: seed and number of the start of each drive.
+    """
+
+    name: str
+    kind: Kind
+    case: str
+    pattern: Pattern
+    path: Path
+    drives: tuple[tuple[int, int], ...]
+
+
+def known_paints(plan: CheckPlan, scenario: Scenario, folder: Path) -> tuple[Paint, ...]:
+    """The stored and the random patterns of a scenario; random ones are written to a folder.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    every = tuple((seed, k) for seed in plan.seeds for k in range(plan.starts.count))
+    found = [
+        Paint(f"stored-{each.name}", Kind.STORED, each.name, each.pattern, each.path, every)
+        for each in plan.stored.get(scenario.name, ())
+    ]
+    space = SearchSpace(figures=plan.figures)
+    for seed in plan.seeds if plan.random else ():
+        drawn = space.pattern(space.random((plan.random,), torch.Generator().manual_seed(seed)))
+        for k in range(plan.random):
+            path = folder / f"random-{seed}-{k + 1}.json"
+            save_pattern(drawn[k], path)
+            start = ((seed, k % plan.starts.count),)
+            found.append(Paint(path.stem, Kind.RANDOM, RANDOM, drawn[k], path, start))
+    return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Stretch:
+    """A scenario in an open simulator, or in the recorded world, with all that is painted there.
+
+    Args:
+        plan: of the check.
+        world: open.
+        weathers: that it is driven in here.
+        paints: on it.
+        episodes: keeps the drives.
+    """
+
+    plan: CheckPlan
+    world: Simulator
+    weathers: tuple[Weather, ...]
+    paints: tuple[Paint, ...]
+    episodes: Episodes
+
+    def drive(self, opening: Opening, processes: int, on_drive: Callable[[int, int], object]) -> None:
+        """Make the drives that are missing: past the bare road, then over paint where those went well.
+
+        Args:
+            opening: opens one more world, for each of several processes.
+            processes: drives made at once.
+            on_drive: told how many are there, of how many.
+
+        Raises:
+            SimulatorError, ControllerError: as `driving.rollout.rollout` does.
+            OutputError: they cannot be written.
+        """
+        alone = [each for weather in self.weathers for each in self._alone(weather).values()]
+        total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
+        self._make(alone, opening, processes, lambda done: on_drive(done, total))
+        pairs = [pair for weather in self.weathers for paint in self.paints for pair in self._pairs(weather, paint)]
+        total = len(alone) + len(pairs)
+        painted = [painted for _, painted in pairs]
+        self._make(painted, opening, processes, lambda done: on_drive(len(alone) + done, total))
+
+    def _make(
+        self, drives: Sequence[Conditions], opening: Opening, processes: int, on_done: Callable[[int], object]
+    ) -> None:
+        missing = [each for each in drives if not self.episodes.has(each)]
+        made = len(drives) - len(missing)
+        on_done(made)
+        if processes > 1 and len(missing) > 1:
+            make_together(opening, self.episodes, missing, processes, lambda done: on_done(made + done))
+            return
+        for k, each in enumerate(missing):
+            self.episodes.make(self.world, each)
+            on_done(made + k + 1)
+
+    def _pairs(self, weather: Weather, paint: Paint) -> list[tuple[Conditions, Conditions]]:
+        """The drives over a pattern, each after the one that it is compared with, where that went well."""
+        alone = self._alone(weather)
+        good = {each.clean for each in self.bare(weather) if not each.wrong}
+        pairs = [(alone[k], replace(alone[k], paint=paint.name)) for k in paint.drives]
+        return [(clean, painted) for clean, painted in pairs if self.episodes.file(clean) in good]
+
+    def bare(self, weather: Weather) -> tuple[JudgedDrive, ...]:
+        """The drives on the bare road, and what went wrong in them."""
+        found: list[JudgedDrive] = []
+        for each in self._alone(weather).values():
+            file = self.episodes.file(each)
+            (episode,) = load_episodes(self.episodes.folder, [file])
+            wrong = _fault(episode, self._aside_m(episode))
+            found.append(JudgedDrive(seed=each.seed, start=each.start, wrong=wrong, clean=file))
+        return tuple(found)
+
+    def painted(self, weather: Weather, paints: Iterable[Paint]) -> tuple[JudgedDrive, ...]:
+        """The drives over paint, each compared with the same drive on the bare road."""
+        found: list[JudgedDrive] = []
+        for paint in paints:
+            for clean, painted in self._pairs(weather, paint):
+                trial = self.episodes.trial(clean, painted)
+                side = "left" if trial.lateral_m > 0 else "right"
+                found.append(
+                    JudgedDrive(
+                        seed=clean.seed,
+                        start=clean.start,
+                        wrong=f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}"
+                        if trial.leaves_lane
+                        else "",
+                        clean=trial.clean,
+                        painted=trial.painted,
+                        paint=str(paint.path),
+                        deviation_m=trial.deviation_m,
+                        lateral_m=trial.lateral_m,
+                    )
+                )
+        return tuple(found)
+
+    def conditions(self, key: Key, paints: Sequence[Paint]) -> str:
+        """A hash of all that the drives of a case depend on, apart from the controller.
+
+        A fresh attack finds another pattern for every controller, so only how it searches counts.
+        """
+        plan, (_, weather, kind, _) = self.plan, key
+        images = [] if kind is Kind.FRESH else [self.episodes.digests[paint.name] for paint in paints]
+        world = self.world.identity if isinstance(self.world, Identified) else type(self.world).__qualname__
+        told = [
+            identity(self.episodes.scenario),
+            weather,
+            kind,
+            images,
+            plan.figures,
+            plan.seeds,
+            asdict(plan.starts),
+            world,
+        ]
+        return hashlib.sha256(json.dumps(told, default=str).encode()).hexdigest()[:16]
+
+    def _alone(self, weather: Weather) -> dict[tuple[int, int], Conditions]:
+        plan = self.plan
+        return {
+            (seed, k): Conditions(paint=CLEAN, weather=weather, seed=seed, start=start)
+            for seed in plan.seeds
+            for k, start in enumerate(plan.start_range.draw(plan.starts.count, seed))
+        }
+
+    def _aside_m(self, episode: Episode) -> float | None:
+        """How far a drive on the bare road gets from the recorded one, left positive; None in a simulator."""
+        if not isinstance(self.world, RecordedSimulator):
+            return None
+        beside = lateral_m(self.world.way, path_of(episode))
+        return float(beside[np.abs(beside).argmax()])
+
+
+def _fault(episode: Episode, aside_m: float | None) -> str:
+    """Why a drive on the bare road counts as failed; empty where it does not."""
+    told = [] if episode.ending is Ending.GOAL_REACHED else [str(episode.ending)]
+    told += [in_words(kind) for kind in dict.fromkeys(event.kind for event in counted(episode.events))]
+    if aside_m is not None and abs(aside_m) >= LEAVES_LANE_M:
+        told.append(f"{abs(aside_m):.2f} m to the {'left' if aside_m > 0 else 'right'} of the recorded drive")
+    return ", ".join(told)
+
+
+def measures_of(kind: Kind, drives: Sequence[JudgedDrive]) -> Measures:
+    """The measures of a case; none where no drive was judged."""
+    if not drives:
+        return {}
+    wrong = share_95(sum(bool(each.wrong) for each in drives), len(drives))
+    if kind is Kind.BARE:
+        return {"failed": wrong}
+    return {"deviation_m": median_95([each.deviation_m for each in drives]), "left_lane": wrong}

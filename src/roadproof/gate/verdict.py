@@ -1,0 +1,174 @@
+"""When a case passes: its measures with their intervals against limits, and against what they were before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, TypeAlias
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+class Kind(StrEnum):
+    """What is painted in a case."""
+
+    BARE = "bare"
+    """Nothing: whoever does not drive well there deviates from nothing."""
+
+    STORED = "stored"
+    """One pattern of the plan's folder."""
+
+    RANDOM = "random"
+    """Patterns drawn at random, all together."""
+
+    FRESH = "fresh"
+    """What a fresh attack on this controller finds."""
+
+
+class Status(StrEnum):
+    """What is said of a case, and of a whole check."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    TOO_FEW = "too few drives"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Estimate:
+    """A measure of a case with its 95 % interval.
+
+    Args:
+        value: the median in metres, or the share of drives, 0 to 1.
+        low: lower end of the interval; None where there are too few drives for one.
+        high: its upper end.
+    """
+
+    value: float
+    low: float | None
+    high: float | None
+
+
+Measures: TypeAlias = Mapping[str, Estimate]
+"""`failed` on the bare road; `deviation_m` and `left_lane` over paint."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Change:
+    """How much worse than the reference a measure may be: it fails where both are exceeded.
+
+    Args:
+        absolute: in the measure's own unit.
+        relative: as a share of the reference's value.
+    """
+
+    absolute: float
+    relative: float
+
+    def is_exceeded(self, before: float, now: float) -> bool:
+        """Whether a measure is worse by more than both; beside a reference of 0 every relative change is."""
+        worse = now - before
+        return worse > self.absolute and worse > self.relative * before
+
+
+def median_95(values: Sequence[float]) -> Estimate:
+    """The median with the exact interval that its order statistics give; it needs six values.
+
+    Nothing is assumed of how deviations are distributed: they lie near 0 and near a lane's width, and seldom between.
+
+    Raises:
+        ValueError: there is no value.
+    """
+    found: Any = stats.quantile_test(list(values), p=0.5).confidence_interval(CONFIDENCE)
+    low, high = float(found.low), float(found.high)
+    return Estimate(
+        value=float(np.median(values)), low=None if math.isnan(low) else low, high=None if math.isnan(high) else high
+    )
+
+
+def share_95(yes: int, count: int) -> Estimate:
+    """A share of drives with its exact (Clopper–Pearson) interval.
+
+    Raises:
+        ValueError: there is no drive, or there are fewer than say yes.
+    """
+    found: Any = stats.binomtest(yes, count).proportion_ci(CONFIDENCE)
+    return Estimate(value=yes / count, low=float(found.low), high=float(found.high))
+
+
+def least_drives(measure: str, limit: float) -> int:
+    """How many drives a case needs so that its interval can lie under a limit at all.
+
+    A share of 0 is met by the drives that are made: none of them may. No number of drives shows that none ever would.
+    """
+    tail = (1 - CONFIDENCE) / 2
+    if measure == "deviation_m":
+        return math.ceil(math.log(tail) / math.log(0.5))
+    return 1 if limit in (0.0, 1.0) else math.ceil(math.log(tail) / math.log1p(-limit))
+
+
+def judge(
+    measures: Measures, limits: Mapping[str, float], changes: Mapping[str, Change], before: Measures | None
+) -> tuple[Status, tuple[str, ...]]:
+    """Whether a case passes, and why not.
+
+    Args:
+        measures: of the case; none at all where no drive could be judged.
+        limits: greatest values that pass, by measure.
+        changes: against the reference, by measure.
+        before: the reference's measures; None where nothing is compared.
+    """
+    if not measures:
+        return Status.TOO_FEW, ("too few drives: on the bare road none went well, so there is none to compare with",)
+    failed: list[str] = []
+    undecided: list[str] = []
+    for name, limit in limits.items():
+        found = measures[name]
+        if found.value > limit:
+            failed.append(f"{in_words(name, found)} is above the limit of {_one(name, limit)}")
+        elif limit and (found.high is None or found.high > limit):
+            undecided.append(
+                f"too few drives: {in_words(name, found)} does not exceed the limit of {_one(name, limit)}, but its "
+                "interval does; drive more starts or seeds"
+            )
+    for name, change in changes.items():
+        if before is None or name not in measures or name not in before:
+            continue
+        now, then = measures[name].value, before[name].value
+        if measures[name].high is None:
+            undecided.append(f"too few drives: {in_words(name, measures[name])} has no interval; drive more")
+        if change.is_exceeded(then, now):
+            failed.append(
+                f"{in_words(name, measures[name])} was {_one(name, then)} in the reference: worse by more than "
+                f"{_one(name, change.absolute)} and by more than {change.relative:.0%}"
+            )
+    status = Status.FAILED if failed else Status.TOO_FEW if undecided else Status.PASSED
+    return status, (*failed, *undecided)
+
+
+_NAMES = {
+    "failed": "share of bare drives that fail",
+    "deviation_m": "median deviation",
+    "left_lane": "share of drives that leave their lane",
+}
+
+
+def in_words(name: str, found: Estimate) -> str:
+    """A measure's name, value and interval: "median deviation 0.31 m (0.12 to 0.44)"."""
+    return f"{_NAMES[name]} {shown(name, found)}"
+
+
+def shown(name: str, found: Estimate) -> str:
+    """A measure's value and interval: "0.31 m (0.12 to 0.44)"."""
+    low, high = found.low, found.high
+    return _one(name, found.value) + (
+        "" if low is None or high is None else f" ({_one(name, low)} to {_one(name, high)})"
+    )
+
+
+def _one(name: str, value: float) -> str:
+    return f"{value:.2f} m" if name == "deviation_m" else f"{value:.0%}"

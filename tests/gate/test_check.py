@@ -1,0 +1,261 @@
+"""Whole checks in the recorded world, with a controller that reacts to magenta paint alone."""
+
+import json
+import shutil
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import roadproof
+from roadproof.controllers import load_controller
+from roadproof.datatypes import Control
+from roadproof.driving.drive_store import Episodes
+from roadproof.driving.evaluation import Evaluation
+from roadproof.errors import CheckError
+from roadproof.gate.check import architecture_of, run_check
+from roadproof.gate.plan import load_check
+from roadproof.gate.result import FORMAT, FORMAT_VERSION
+from roadproof.gate.verdict import Kind, Status
+from roadproof.io.files import read_json
+from team_folder import PLAN, MagentaShy, magenta_shy, write_team
+
+CHANGE = '[change]\nreference = "reference"\ndeviation_m = { absolute = 0.1, relative = 0.2 }\n'
+
+
+@pytest.fixture(scope="module")
+def team(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("team")
+    write_team(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def failed(team):
+    """A check of the team's plan, which magenta paint fails."""
+    out = team / "out"
+    return out, run_check(load_check(team / "check.toml", trust=True), magenta_shy(), out)
+
+
+def by_name(result):
+    return {case.name: case for case in result.cases}
+
+
+def test_the_pattern_that_moves_the_car_fails_and_no_other(failed):
+    _, result = failed
+    found = by_name(result)
+    assert result.status is Status.FAILED
+    assert {name: case.status for name, case in found.items()} == {
+        "bare road": Status.PASSED,
+        "green": Status.PASSED,
+        "magenta": Status.FAILED,
+    }
+    assert found["green"].measures["deviation_m"].value == pytest.approx(0.0, abs=0.01)
+    assert found["magenta"].measures["deviation_m"].low > 0.2
+    assert [len(case.drives) for case in result.cases] == [6, 6, 6]
+    assert len({each.start for each in found["magenta"].drives}) == 6
+
+
+def test_measures_are_those_of_an_evaluation(failed, team, tmp_path, invoke, monkeypatch):
+    """The command that is told gives the numbers that were told."""
+    out, result = failed
+    case = by_name(result)["magenta"]
+    monkeypatch.chdir(team)
+    words = case.command.replace(str(out / "show"), str(tmp_path)).split()[1:]
+    code, said = invoke(*words, "--no-film")
+    assert code == 0, said.err
+    seed = int(words[words.index("--seed") + 1])
+    shown = {trial.start: trial.deviation_m for trial in Evaluation.load(tmp_path).trials}
+    assert shown == {each.start: each.deviation_m for each in case.drives if each.seed == seed}
+
+
+def test_a_ci_reads_the_verdict_and_its_reason(failed):
+    out, result = failed
+    suite = ET.parse(out / "junit.xml").getroot().find("testsuite")
+    assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("3", "1", "0")
+    failures = {test.get("name"): test.find("failure") for test in suite.iter("testcase")}
+    assert [name for name, failure in failures.items() if failure is not None] == ["clear-noon, magenta"]
+    failure = failures["clear-noon, magenta"]
+    assert "is above the limit of 0.20 m" in failure.get("message")
+    assert by_name(result)["magenta"].command in failure.text
+
+
+def test_people_read_a_table_and_see_the_worst_passage(failed):
+    out, _ = failed
+    text = (out / "summary.md").read_text()
+    assert text.startswith("## roadproof check: failed: 2 of 3 cases passed")
+    assert "### failed: test-road, clear-noon, magenta" in text
+    assert "![Furthest astray, test-road, clear-noon, magenta" in text
+    with Image.open(out / "worst.jpg") as picture:
+        red, green, blue = np.moveaxis(np.asarray(picture.convert("RGB"), int), 2, 0)
+    magenta = np.minimum(red, blue) - green > 100
+    middle = len(magenta) // 2
+    assert magenta.shape[1] == 1500
+    assert not magenta[:middle].any()
+    assert magenta[middle:].sum() > 1000
+
+
+def test_the_same_seed_gives_the_same_bytes_and_drives_nothing_twice(failed, team, monkeypatch):
+    out, _ = failed
+    before = (out / "check.json").read_bytes()
+
+    def forbidden(*_):
+        raise AssertionError("driven again")
+
+    monkeypatch.setattr("roadproof.driving.drive_store.rollout", forbidden)
+    run_check(load_check(team / "check.toml", trust=True), magenta_shy(), out)
+    assert (out / "check.json").read_bytes() == before
+
+
+def test_an_interrupted_check_keeps_its_drives_and_leaves_no_verdict(failed, team, tmp_path, monkeypatch):
+    out, result = failed
+    shutil.copy(out / "check.json", tmp_path / "check.json")
+    shutil.copytree(out / "drives", tmp_path / "drives")
+    kept = sorted((tmp_path / "drives/test-road/episodes").iterdir())
+    for path in kept[4:]:
+        path.unlink()
+    plan = load_check(team / "check.toml", trust=True)
+    make, made = Episodes.make, []
+
+    def until_the_third(episodes, simulator, drive):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(drive)
+        make(episodes, simulator, drive)
+
+    monkeypatch.setattr(Episodes, "make", until_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        run_check(plan, magenta_shy(), tmp_path)
+    assert not any((tmp_path / name).exists() for name in ("check.json", "junit.xml", "summary.md", "worst.jpg"))
+    assert len(list((tmp_path / "drives/test-road/episodes").iterdir())) == 7
+    monkeypatch.setattr(Episodes, "make", make)
+    again = run_check(plan, magenta_shy(), tmp_path)
+    assert [(c.measures, c.status) for c in again.cases] == [(c.measures, c.status) for c in result.cases]
+
+
+class Blind(MagentaShy):
+    """Sees nothing, so no paint moves it; and drives into the verge."""
+
+    def steer(self, frames, speed_mps, command):
+        return 0.0 * frames.mean((1, 2, 3)) + 0.3
+
+
+class Parked(MagentaShy):
+    """Never drives off."""
+
+    def act(self, frame, speed_mps, command):
+        return Control(0.0, brake=1.0)
+
+
+@pytest.mark.parametrize("controller", [Blind(), Parked()])
+def test_who_does_not_drive_well_without_paint_does_not_pass(team, tmp_path, controller):
+    result = run_check(load_check(team / "check.toml", trust=True), controller, tmp_path)
+    assert result.status is Status.FAILED
+    found = by_name(result)
+    assert found["bare road"].status is Status.FAILED
+    assert {found[name].status for name in ("green", "magenta")} == {Status.TOO_FEW}
+    assert not (tmp_path / "worst.jpg").exists()
+    assert "worst.jpg" not in (tmp_path / "summary.md").read_text()
+
+
+def test_random_patterns_are_one_case(team, tmp_path):
+    text = PLAN.replace("random = 0", "random = 3").replace('patterns = "patterns"', "")
+    (team / "random.toml").write_text(text + "random = { left_lane = 1.0 }\n")
+    result = run_check(load_check(team / "random.toml", trust=True), MagentaShy(gain=0.0), tmp_path)
+    assert [case.kind for case in result.cases] == [Kind.BARE, Kind.RANDOM]
+    drives = result.cases[1].drives
+    assert len({each.paint for each in drives}) == len(drives) == 6
+    assert result.status is Status.PASSED
+
+
+@pytest.fixture(scope="module")
+def accepted(team):
+    """A plan with a reference, made from a controller that hardly minds."""
+    (team / "change.toml").write_text(
+        PLAN.replace("left_lane = 0.0 }", "left_lane = 1.0 }").replace("0.2, ", "9.0, ") + CHANGE
+    )
+    plan = load_check(team / "change.toml", trust=True)
+    out = team / "accepted"
+    assert run_check(plan, MagentaShy(gain=0.5), out, compare=False).status is Status.PASSED
+    plan.reference.parent.mkdir(parents=True)
+    shutil.copy(out / "check.json", plan.reference)
+    return plan
+
+
+def test_a_controller_worse_than_the_reference_fails(accepted, failed, tmp_path):
+    # Drives that were made before are not made again.
+    shutil.copytree(accepted.reference.parents[2] / "accepted/drives", tmp_path / "same/drives")
+    same = run_check(accepted, MagentaShy(gain=0.5), tmp_path / "same")
+    assert (same.status, same.compared) == (Status.PASSED, True)
+    shutil.copytree(failed[0] / "drives", tmp_path / "worse/drives")
+    worse = run_check(accepted, magenta_shy(), tmp_path / "worse")
+    assert [case.name for case in worse.not_passed] == ["magenta"]
+    assert "in the reference: worse by more than 0.10 m and by more than 20%" in worse.not_passed[0].reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("what", "other", "message"),
+    [
+        ("roadproof", "0.0.9", f"roadproof 0.0.9, this check has {roadproof.__version__}"),
+        ("architecture", "CIL-1234", "a controller of architecture CIL-1234, this check has MagentaShy"),
+        ("budget", "full", "budget full, this check has smoke"),
+    ],
+)
+def test_a_reference_of_something_else_is_refused(accepted, tmp_path, what, other, message):
+    stored = read_json(accepted.reference, FORMAT, FORMAT_VERSION, CheckError)
+    path = tmp_path / "check.json"
+    path.write_text(json.dumps(stored | {what: other}))
+    with pytest.raises(CheckError, match=message):
+        run_check(replace(accepted, reference=path), magenta_shy(), tmp_path / "out")
+    assert not (tmp_path / "out" / "drives").exists()
+
+
+def test_a_reference_of_other_conditions_is_refused(accepted, tmp_path):
+    with pytest.raises(CheckError, match="magenta, which the plan leaves out"):
+        kept = {name: stored[:1] for name, stored in accepted.stored.items()}
+        run_check(replace(accepted, stored=kept), magenta_shy(), tmp_path)
+    with pytest.raises(CheckError, match="other patterns, starts, seeds or recordings"):
+        run_check(replace(accepted, seeds=(0, 2)), magenta_shy(), tmp_path)
+    with pytest.raises(CheckError, match="is not there; make it with --accept"):
+        run_check(replace(accepted, reference=tmp_path / "check.json"), magenta_shy(), tmp_path)
+    accepted.reference.with_name("bad.json").write_text('{"format": "roadproof-check-result", "version": 1}')
+    with pytest.raises(CheckError, match="incomplete or damaged"):
+        run_check(replace(accepted, reference=accepted.reference.with_name("bad.json")), magenta_shy(), tmp_path)
+
+
+def test_an_architecture_is_known_by_its_shapes_not_its_weights():
+    one, other = load_controller("pilotnet"), load_controller("pilotnet-b")
+    assert architecture_of(one) == architecture_of(other) != architecture_of(load_controller("cil-small"))
+    assert architecture_of(load_controller("cil-small")) != architecture_of(load_controller("cil"))
+
+
+def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypatch):
+    monkeypatch.chdir(team)
+    shutil.copytree(failed[0] / "drives", tmp_path / "drives")
+    left = [tmp_path / name for name in ("check.json", "junit.xml", "summary.md", "worst.jpg")]
+    command = ("check", "check.toml", "--trust", "--out", tmp_path)
+    code, said = invoke(*command)
+    assert (code, said.err) == (1, "")
+    assert "failed: test-road, clear-noon, magenta" in said.out
+    assert "see it: roadproof evaluate patterns/test-road/magenta.json --controller team_folder:magenta_shy" in said.out
+    assert all(path.exists() for path in left)
+    # Nobody takes what a check before left for the result of one that could not be run.
+    code, said = invoke(*command[:2], "--out", tmp_path)
+    assert (code, said.out) == (2, "")
+    assert "runs what its author wrote" in said.err
+    assert not any(path.exists() for path in left)
+    code, said = invoke(*command, "--accept")
+    assert code == 2
+    assert "names none; add [change]" in said.err
+    loose = PLAN.replace("deviation_m = 0.2, left_lane = 0.0", "deviation_m = 9.0") + CHANGE.replace(
+        '"reference"', '"kept"'
+    )
+    (team / "loose.toml").write_text(loose)
+    code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path, "--accept")
+    assert code == 0, said.err
+    assert (team / "kept/smoke/check.json").read_bytes() == (tmp_path / "check.json").read_bytes()
+    code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path)
+    assert code == 0
+    assert "compared with the reference" in said.out

@@ -1,0 +1,155 @@
+"""A check's plan: every mistake is told before work begins."""
+
+from pathlib import Path
+
+import pytest
+
+from roadproof.datatypes import Weather
+from roadproof.errors import CheckError
+from roadproof.gate.plan import load_check
+from roadproof.gate.verdict import Kind
+from roadproof.patterns import save_pattern
+from team_folder import BAR, PLAN, write_team
+
+
+@pytest.fixture(scope="module")
+def team(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("team")
+    write_team(folder)
+    return folder
+
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "check" / "check.toml"
+
+
+def test_the_plan_of_the_docs_is_the_example_and_can_be_followed(tmp_path):
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assert f"```toml\n{text}```" in (EXAMPLE.parents[2] / "docs" / "check.md").read_text(encoding="utf-8")
+    (tmp_path / "check.toml").write_text(text, encoding="utf-8")
+    save_pattern(BAR, tmp_path / "patterns" / "bar.json")
+    found = load_check(tmp_path / "check.toml", budget="full")
+    assert len(found.keys) == 5 * 2 * 4
+    assert found.reference == tmp_path / "reference" / "full" / "check.json"
+    with pytest.raises(CheckError, match="no recording of left-03 at clear-noon"):
+        load_check(tmp_path / "check.toml")
+
+
+def plan(team, text):
+    path = team / "other.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_plan_is_read_with_all_that_it_names(team):
+    found = load_check(team / "check.toml", trust=True)
+    assert [each.name for each in found.stored["test-road"]] == ["green", "magenta"]
+    assert found.recordings == {("test-road", Weather.CLEAR_NOON): team / "recordings" / "test-road"}
+    assert found.limits[Kind.STORED] == {"deviation_m": 0.2, "left_lane": 0.0}
+    assert found.limits[Kind.BARE] == {"failed": 0.0}
+    assert [key[2:] for key in found.keys] == [
+        (Kind.BARE, "bare road"),
+        (Kind.STORED, "green"),
+        (Kind.STORED, "magenta"),
+    ]
+
+
+def test_a_full_check_needs_no_recordings_and_adds_an_attack(team):
+    text = PLAN.replace("[smoke]\nrecordings", "[full]\n# ") + "fresh = { deviation_m = 1.0 }\n"
+    found = load_check(plan(team, text), budget="full", trust=True)
+    assert found.keys[-1] == ("test-road", Weather.CLEAR_NOON, Kind.FRESH, "fresh attack")
+    assert not found.recordings
+
+
+LIMITS = "stored = { deviation_m = 0.2, left_lane = 0.0 }"
+CHANGE = '\n[change]\nreference = "reference"\n'
+MISTAKES = {
+    "no header": (('format = "roadproof-check"', ""), 'expected format = "roadproof-check"'),
+    "version": (("version = 1", "version = 3"), "version is 3, expected 1"),
+    "not TOML": (("version = 1", "version ="), "not valid TOML"),
+    "unknown key": (("random = 0", "randon = 0"), "unknown key 'randon'; did you mean 'random'"),
+    "unknown start": (("right_m = 0.05", "right = 0.05"), "unknown key 'right'; did you mean 'right_m'"),
+    "unknown kind": ((LIMITS, "storred = { left_lane = 0.0 }"), "a key of limits is 'storred', expected one of bare"),
+    "unknown measure": ((LIMITS, "stored = { left = 0.0 }"), "a key of limits.stored is 'left', expected one of"),
+    "a measure of paint": ((LIMITS, "bare = { left_lane = 0.0 }"), "expected one of failed"),
+    "a limit's type": ((LIMITS, 'stored = { left_lane = "0" }'), "expected float"),
+    "a limit's range": (
+        (LIMITS, "stored = { left_lane = 20.0 }"),
+        "limits.stored.left_lane is 20.0, expected 0.0 to 1",
+    ),
+    "no number": ((LIMITS, "stored = { deviation_m = nan }"), "limits.stored.deviation_m is nan, expected"),
+    "no limit": ((LIMITS, ""), "limits has nothing for stored patterns"),
+    "too few for a median": (("count = 3", "count = 2"), "too few drives: 4 a case (starts × seeds) can never show"),
+    "too few for a share": ((LIMITS, "stored = { left_lane = 0.05 }"), "left_lane at most 0.05 for stored"),
+    "equal starts": (
+        ("right_m = 0.05\nturned_rad = 0.004\nfaster_mps = 0.5", "right_m = 0.0\nturned_rad = 0.0\nfaster_mps = 0.0"),
+        "starts are all the same",
+    ),
+    "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m is 3.0, expected 0.0 to 1.0"),
+    "seed": (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds is -1, expected 0 to"),
+    "seed twice": (("seeds = [0, 1]", "seeds = [1, 1]"), "seeds has 1 twice"),
+    "no seed": (("seeds = [0, 1]", "seeds = []"), "seeds is empty"),
+    "budget": (("version = 1", 'version = 1\nbudget = "huge"'), "budget is 'huge', expected one of smoke, full"),
+    "simulator": ((LIMITS, LIMITS + '\n[full]\nsimulator = "moon"'), "simulator is 'moon', expected town or carla://"),
+    "scenario": (('scenarios = ["test-road"]', 'scenarios = ["test-raod"]'), "did you mean 'test-road'"),
+    "outside": (('scenario_file = "', 'scenario_file = "../'), "leaves the plan's folder"),
+    "patterns": (('patterns = "patterns"', 'patterns = "nowhere"'), "patterns 'nowhere' is no folder"),
+    "nothing painted": (('patterns = "patterns"', ""), "nothing would be painted there"),
+    "no smoke": (('[smoke]\nrecordings = ["recordings"]', ""), "add [smoke] with recordings"),
+    "no recordings": (('recordings = ["recordings"]', 'recordings = ["nowhere"]'), "roadproof record test-road"),
+    "weather": (
+        ('recordings = ["recordings"]', 'recordings = ["recordings"]\nweathers = ["rainy-noon"]'),
+        "no recording of test-road at rainy-noon; make one with: roadproof record test-road --weather rainy-noon",
+    ),
+    "change without a measure": ((LIMITS, LIMITS + CHANGE), "change needs reference"),
+    "a change's key": (
+        (LIMITS, LIMITS + CHANGE + "deviation_m = { absolut = 0.1, relative = 0.2 }"),
+        "change.deviation_m has an unknown key 'absolut'; did you mean 'absolute'",
+    ),
+    "a change's range": (
+        (LIMITS, LIMITS + CHANGE + "deviation_m = { absolute = -0.1, relative = 0.2 }"),
+        "change.deviation_m.absolute is -0.1, expected",
+    ),
+    "half a change": ((LIMITS, LIMITS + CHANGE + "left_lane = { absolute = 0.1 }"), "change.left_lane lacks relative"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_named(team, name):
+    (old, new), message = MISTAKES[name]
+    assert old in PLAN
+    path = plan(team, PLAN.replace(old, new))
+    with pytest.raises(CheckError) as told:
+        load_check(path, trust=True)
+    assert str(told.value).startswith(str(path))
+    assert message in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_code_and_other_machines_need_trust(team):
+    with pytest.raises(CheckError, match="runs what its author wrote"):
+        load_check(team / "check.toml")
+    text = (
+        PLAN.replace("team_folder:magenta_shy", "pilotnet")
+        + 'fresh = { left_lane = 0.0 }\n[full]\nsimulator = "carla://far:2000"'
+    )
+    with pytest.raises(CheckError, match="another machine"):
+        load_check(plan(team, text), budget="full")
+
+
+def test_a_folder_of_patterns_is_named_after_a_scenario(team):
+    (team / "patterns" / "tset-road").mkdir()
+    try:
+        with pytest.raises(CheckError, match="did you mean 'test-road'"):
+            load_check(team / "check.toml", trust=True)
+    finally:
+        (team / "patterns" / "tset-road").rmdir()
+
+
+def test_a_damaged_pattern_is_named(team):
+    bad = team / "patterns" / "test-road" / "bad.json"
+    bad.write_text("{}")
+    try:
+        with pytest.raises(CheckError, match=r"bad\.json"):
+            load_check(team / "check.toml", trust=True)
+    finally:
+        bad.unlink()
