@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from roadproof.geometry import CropResize as CropResize
     from roadproof.geometry import homography_from_points as homography_from_points
     from roadproof.geometry import homography_from_pose as homography_from_pose
+    from roadproof.hardening.harden import harden as harden
     from roadproof.patterns import Pattern as Pattern
     from roadproof.patterns import load_pattern as load_pattern
     from roadproof.patterns import raster as raster
@@ -91,6 +92,7 @@ _ROOMS = {
     "driving.evaluation": ("Evaluation",),
     "errors": ("RoadproofError",),
     "geometry": ("CameraModel", "CanvasPlacement", "CropResize", "homography_from_points", "homography_from_pose"),
+    "hardening.harden": ("harden",),
     "patterns": ("Pattern", "load_pattern", "raster", "save_pattern"),
     "photometry": ("AffineResponse", "ColourTransform", "fit_colour"),
     "pipeline.budget": ("Budget", "PUBLISHED", "QUICK", "STEERING"),
