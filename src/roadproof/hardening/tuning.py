@@ -79,10 +79,10 @@ class Tuning:
 
     steps: int = 600
     batch: int = 48
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-3
     bare: float = 0.25
     found: float = 0.5
-    climbs: int = 1
+    climbs: int = 2
     climb: float = 0.1
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ def answers(
 def training_step(model: nn.Module, batch: TuningBatch) -> Float[Tensor, ""]:
     """Huber's loss of steering, and of the pedals where the controller answers with them."""
     answer = answers(cast("Controller", model), batch.frames, batch.speed_mps, batch.command)
-    each = functional.smooth_l1_loss(answer, batch.target, beta=0.05, reduction="none").mean(0)
+    each = functional.smooth_l1_loss(answer, batch.target, beta=0.01, reduction="none").mean(0)
     return each[0] + PEDALS * each[1:].sum()
 
 
