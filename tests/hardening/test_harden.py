@@ -55,7 +55,7 @@ def run(town, folder, **options):
     return harden(town, "pilotnet", [near], folder, **given)
 
 
-class Stopped(Exception):
+class StoppedError(Exception):
     """The plug is pulled."""
 
 
@@ -68,16 +68,18 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
 
         def stop(title, *_, stage=stage):
             if title.startswith(stage):
-                raise Stopped
+                raise StoppedError
 
-        with pytest.raises(Stopped):
+        with pytest.raises(StoppedError):
             run(town, out, on_progress=stop)
     found = run(town, out)
     # The judged controller is none but the saved one.
     learnt, before = load_controller(found.hardened), load_controller("pilotnet")
     assert isinstance(learnt, ConditionalPilotNet)
     assert not torch.equal(learnt.image.weight, before.image.weight)
-    assert torch.equal(load_controller(run(town, whole).hardened).image.weight, learnt.image.weight)
+    again = run(town, whole, judge_on=(), clean_on=[street(whole.parent, "near", 15.0)])
+    assert again.judgement is None
+    assert torch.equal(load_controller(again.hardened).image.weight, learnt.image.weight)
     check_result(found, out)
     told = []
     assert run(town, out, on_progress=lambda title, *_: told.append(title)) == found

@@ -47,8 +47,8 @@ def harden(
     from rich.console import Console
 
     from roadproof.cli.progress import stages
-    from roadproof.controllers.loading import imported
-    from roadproof.hardening.budget import HARDENING_BUDGETS
+    from roadproof.controllers.loading import imported, load_trainable
+    from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
     from roadproof.hardening.harden import harden as run
     from roadproof.hardening.page import write_hardening
     from roadproof.hardening.tuning import training_step as usual_step
@@ -69,8 +69,10 @@ def harden(
         if training_step is None
         else cast("TrainingStep", imported(training_step, "a function of model and batch that gives the loss"))
     )
-    hold(out)
+    check_streets(training, judging)
+    load_trainable(controller)
     with open_simulator(simulator) as world, stages() as show:
+        hold(out)
         found = run(
             world,
             controller,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from roadproof.attacks import TPE, GradOpt, Method
+from roadproof.attacks.blackbox import BlackBox
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluate import PAPER_WEATHERS
@@ -56,6 +57,15 @@ class HardeningBudget:
                 f"{self.town_drives} drives through the town, {len(self.clean_weathers)} weathers of clean drives; "
                 "expected 0 or more, and at least one"
             )
+
+    def require_libraries(self, space: SearchSpace) -> None:
+        """See that what judging needs is installed.
+
+        Raises:
+            RoadproofError: the library of the black-box method is not.
+        """
+        if isinstance(self.unseen, BlackBox):
+            self.unseen.proposer(space, 0, 0)
 
     def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
         """What judging searches besides `judge`, by name."""

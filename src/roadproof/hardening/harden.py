@@ -132,14 +132,17 @@ def harden(
         on_progress: told of every step of every stage.
 
     Raises:
-        TrainingError: streets for training and judging are not disjoint, the folder holds another hardening, or the
-            training step gives no finite loss.
+        TrainingError: there are no rounds, streets for training and judging are not disjoint, the folder holds another
+            hardening, or the training step gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: a stage refuses.
     """
     check_streets(scenarios, judge_on)
     if rounds < 1:
         raise TrainingError(f"rounds is {rounds}, expected 1 or more")
+    budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
+    if judge_on:
+        budget.require_libraries(space)
     load_trainable(controller)
     run = _Run(
         simulator=simulator,
@@ -147,8 +150,8 @@ def harden(
         teacher=load_controller(controller, device=device),
         scenarios=tuple(scenarios),
         folder=folder,
-        budget=budget or HardeningBudget(),
-        space=space or SearchSpace(figures=5),
+        budget=budget,
+        space=space,
         step=training_step,
         seed=seed,
         device=device,
