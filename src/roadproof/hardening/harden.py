@@ -36,7 +36,7 @@ from roadproof.controllers.loading import load_trainable, runs_code, save_contro
 from roadproof.driving.evaluation import ATTACK
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
-from roadproof.hardening.judgement import Clean, Judged, Judgement, clean_drives, judge
+from roadproof.hardening.judgement import Clean, Judge, Judged, Judgement, clean_drives
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
@@ -168,19 +168,18 @@ def harden(
         best = min(done[1:], key=lambda each: each.mean_m).number
         weights = folder / WEIGHTS
         write_atomically(weights, lambda part: shutil.copyfile(run.weights(best), part))
-        clean = _clean(run, best, clean_on or (*scenarios, *judge_on))
+        judgement = None
+        if judge_on:
+            clean = _clean(run, best, clean_on or (*scenarios, *judge_on))
+            judgement = Judgement(_judged(run, best, judge_on), clean)
         found = Hardened(
             controller=controller,
             hardened=_spec(controller, weights),
             rounds=tuple(done),
             best=best,
-            judgement=Judgement(_judged(run, best, judge_on), clean) if judge_on else None,
+            judgement=judgement,
         )
-        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(found)
-        if found.judgement is not None:
-            content["verdict"] = asdict(found.judgement.verdict())
-        text = json.dumps(content, indent=1) + "\n"
-        write_atomically(folder / "hardening.json", lambda part: part.write_text(text, encoding="utf-8"))
+        _write(found, folder)
     return found
 
 
@@ -303,11 +302,11 @@ def _judged(run: _Run, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged,
     for scenario in judge_on:
         for number in (0, best):
             title = f"Judging {'after' if number else 'before'}, {scenario.name}"
-            judged += judge(
-                run.simulator,
-                run.controller(number),
-                scenario,
-                run.folder / f"round-{number}" / "judged" / scenario.name,
+            judged += Judge(
+                simulator=run.simulator,
+                controller=run.controller(number),
+                scenario=scenario,
+                folder=run.folder / f"round-{number}" / "judged" / scenario.name,
                 budget=run.budget,
                 space=run.space,
                 seed=run.seed + _FRESH,
@@ -317,7 +316,7 @@ def _judged(run: _Run, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged,
                 on_progress=lambda stage, done, total, word, title=title: run.on_progress(
                     f"{title}: {stage.lower()}", done, total, word
                 ),
-            )
+            ).judge()
     return tuple(judged)
 
 
@@ -334,6 +333,14 @@ def _clean(run: _Run, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, 
         )
 
     return of(0), of(best)
+
+
+def _write(found: Hardened, folder: Path) -> None:
+    content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(found)
+    if found.judgement is not None:
+        content["verdict"] = asdict(found.judgement.verdict())
+    text = json.dumps(content, indent=1) + "\n"
+    write_atomically(folder / "hardening.json", lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def _claim(run: _Run) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from roadproof.attacks import attack, kept_attack
+from roadproof.attacks import AttackResult, Method, attack, kept_attack
 from roadproof.controllers import Controller
 from roadproof.datatypes import Ending, Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
@@ -27,7 +27,7 @@ from roadproof.driving.intervals import Mean, mean_95
 from roadproof.hardening.budget import HardeningBudget
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.stress_test import OnProgress, stress_test
-from roadproof.recordings import load_recordings
+from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
@@ -155,21 +155,9 @@ class Judgement:
         return max(tried, key=lambda each: each.mean_m)
 
 
-def judge(
-    simulator: Simulator,
-    controller: Controller,
-    scenario: Scenario,
-    folder: Path,
-    *,
-    budget: HardeningBudget,
-    space: SearchSpace,
-    seed: int,
-    name: str,
-    device: str,
-    before: Path | None,
-    on_progress: OnProgress,
-) -> list[Judged]:
-    """Attack a controller on one street by every kind of search, and drive over what each found.
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Judge:
+    """Attacks one controller on one street by every kind of search, and drives over what each found.
 
     Args:
         simulator: an open simulator.
@@ -183,63 +171,95 @@ def judge(
         device: where to search.
         before: folder of the same judgement of the controller before; None for that one itself.
         on_progress: told of every step.
-
-    Raises:
-        RoadproofError: a stage refuses.
     """
-    judging = budget.judge
-    tested = stress_test(
-        simulator,
-        controller,
-        scenario,
-        folder,
-        budget=judging,
-        space=space,
-        seed=seed,
-        controller_name=name,
-        device=device,
-        on_progress=on_progress,
-    )
-    judged = [_judged(tested.evaluation, SEARCHED, after=before is not None)]
-    recordings = load_recordings(folder / "recordings")
 
-    def driven(pattern: Pattern, place: Path, kind: str) -> None:
-        evaluation = evaluate(
-            simulator,
-            controller,
-            scenario,
-            pattern,
-            folder=place,
-            driver_name=name,
-            weathers=judging.weathers,
-            starts=judging.starts,
-            start_range=judging.start_range,
-            runs=judging.runs,
-            seed=seed,
-            on_drive=lambda done, total: on_progress(f"driving over what {kind} found", done, total, ""),
+    simulator: Simulator
+    controller: Controller
+    scenario: Scenario
+    folder: Path
+    budget: HardeningBudget
+    space: SearchSpace
+    seed: int
+    name: str
+    device: str
+    before: Path | None
+    on_progress: OnProgress
+
+    def judge(self) -> list[Judged]:
+        """Every kind, and what was found before.
+
+        Raises:
+            RoadproofError: a stage refuses.
+        """
+        tested = stress_test(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            self.folder,
+            budget=self.budget.judge,
+            space=self.space,
+            seed=self.seed,
+            controller_name=self.name,
+            device=self.device,
+            on_progress=self.on_progress,
         )
-        judged.append(_judged(evaluation, kind, after=before is not None))
+        judged = [self._judged(tested.evaluation, SEARCHED)]
+        recordings = load_recordings(self.folder / "recordings")
+        for number, (kind, (method, space)) in enumerate(self.budget.kinds(self.space).items(), 1):
+            place = self.folder / f"kind-{number}"
+            found = self._searched(recordings, kind, method, space, place / "attack")
+            judged.append(self._driven(found.pattern, place / "evaluation", kind))
+        if self.before is not None:
+            judged.append(self._driven(load_pattern(self.before / "pattern.json"), self.folder / "old", OLD))
+        return judged
 
-    for number, (kind, (method, allowed)) in enumerate(budget.kinds(space).items(), 1):
-        place, steps = folder / f"kind-{number}", method.steps(judging.objective)
-        found = kept_attack(
-            place / "attack",
-            lambda checkpoint, method=method, allowed=allowed, kind=kind, steps=steps: attack(
+    def _searched(
+        self, recordings: RecordingSet, kind: str, method: Method, space: SearchSpace, place: Path
+    ) -> AttackResult:
+        objective = self.budget.judge.objective
+        steps = method.steps(objective)
+        return kept_attack(
+            place,
+            lambda checkpoint: attack(
                 recordings,
-                controller,
-                allowed,
-                objective=judging.objective,
+                self.controller,
+                space,
+                objective=objective,
                 method=method,
-                seed=seed,
-                device=device,
+                seed=self.seed,
+                device=self.device,
                 checkpoint=checkpoint,
-                on_step=lambda step, best: on_progress(f"searching {kind}", step, steps, f"{best:.2f}"),
+                on_step=lambda step, best: self.on_progress(f"Searching, {kind}", step, steps, f"{best:.2f}"),
             ),
         )
-        driven(found.pattern, place / "evaluation", kind)
-    if before is not None:
-        driven(load_pattern(before / "pattern.json"), folder / "old", OLD)
-    return judged
+
+    def _driven(self, pattern: Pattern, place: Path, kind: str) -> Judged:
+        asked = self.budget.judge
+        evaluation = evaluate(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            pattern,
+            folder=place,
+            driver_name=self.name,
+            weathers=asked.weathers,
+            starts=asked.starts,
+            start_range=asked.start_range,
+            runs=asked.runs,
+            seed=self.seed,
+            on_drive=lambda done, total: self.on_progress(f"Driving, {kind}", done, total, ""),
+        )
+        return self._judged(evaluation, kind)
+
+    def _judged(self, evaluation: Evaluation, kind: str) -> Judged:
+        trials = evaluation.of(ATTACK, traffic=False)
+        return Judged(
+            scenario=self.scenario.name,
+            kind=kind,
+            after=self.before is not None,
+            deviation_m=tuple(trial.deviation_m for trial in trials),
+            left_lane=tuple(trial.leaves_lane for trial in trials),
+        )
 
 
 def clean_drives(
@@ -268,17 +288,6 @@ def clean_drives(
             failed.append(f"{scenario.name}, {weather}")
         on_drive(done, len(asked))
     return Clean(len(asked), len(asked) - len(failed), tuple(failed))
-
-
-def _judged(evaluation: Evaluation, kind: str, *, after: bool) -> Judged:
-    trials = evaluation.of(ATTACK, traffic=False)
-    return Judged(
-        scenario=evaluation.scenario.name,
-        kind=kind,
-        after=after,
-        deviation_m=tuple(trial.deviation_m for trial in trials),
-        left_lane=tuple(trial.leaves_lane for trial in trials),
-    )
 
 
 def _share(judged: Sequence[Judged]) -> float:

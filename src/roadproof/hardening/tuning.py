@@ -261,6 +261,6 @@ def _checked(loss: object, number: int) -> Tensor:
         raise TrainingError(f"the training step gave {told}, expected one number with a gradient to the parameters")
     if not bool(loss.isfinite().all()):
         raise TrainingError(
-            f"the loss is {float(loss)} at step {number + 1}; lower the learning rate, or mend the step"
+            f"the loss is {loss.item()} at step {number + 1}; lower the learning rate, or mend the step"
         )
     return loss.reshape(())
