@@ -64,10 +64,10 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     out, whole = tmp_path / "a" / "out", tmp_path / "b" / "out"
     for folder in (out, whole):
         folder.parent.mkdir()
-    for stage in ("Round 0, near: calibrating", "Round 1: learning", "Judging after"):
+    for stage in ("Round 0, near: calibrating", "Round 1: learning", "Judging after, far: searching"):
 
-        def stop(title, *_, stage=stage):
-            if title.startswith(stage):
+        def stop(title, _done, _total, word, stage=stage):
+            if f"{title}: {word}".startswith(stage):
                 raise StoppedError
 
         with pytest.raises(StoppedError):
@@ -82,8 +82,9 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     assert torch.equal(load_controller(again.hardened).image.weight, learnt.image.weight)
     check_result(found, out)
     told = []
-    assert run(town, out, on_progress=lambda title, *_: told.append(title)) == found
-    assert not any(title.endswith(("recording", "searching", "learning")) for title in told)
+    assert run(town, out, on_progress=lambda title, _done, _total, word: told.append(f"{title}: {word}")) == found
+    assert told
+    assert not any("searching" in each or "learning" in each for each in told)
     with pytest.raises(TrainingError, match="holds a hardening with another seed"):
         run(town, out, seed=1)
     with pytest.raises(TrainingError, match="holds a hardening with another budget"):

@@ -85,7 +85,7 @@ HARDENING_BUDGETS = {
     "full": HardeningBudget(
         attack=replace(ALONE, method=GradOpt(restarts=6), select=3),
         tuning=Tuning(steps=4000),
-        town_drives=200,
+        town_drives=80,
         judge=replace(QUICK, select=4, starts=2),
         unseen=TPE(calls=400),
     ),

@@ -207,6 +207,14 @@ class _Run:
         """Of the controller of a round."""
         return _spec(self.spec, self.weights(number)) if number else self.spec
 
+    def name(self, number: int) -> str:
+        """Of the controller of a round, for reports; the same wherever the folder lies."""
+        return f"{self.spec}, hardened in round {number}" if number else self.spec
+
+    def under(self, title: str) -> OnProgress:
+        """Progress of the stages of one attack, told under one title."""
+        return lambda stage, done, total, word: self.on_progress(title, done, total, f"{stage.lower()} {word}".strip())
+
     def controller(self, number: int) -> Controller:
         """Of a round."""
         return load_controller(self.spec_of(number), device=self.device) if number else self.teacher
@@ -227,9 +235,9 @@ def _attacked(run: _Run, number: int, scenario: Scenario) -> StressTest:
         budget=run.budget.attack,
         space=run.space,
         seed=derived_seed(run.seed, number) % _FRESH,
-        controller_name=run.spec_of(number),
+        controller_name=run.name(number),
         device=run.device,
-        on_progress=lambda stage, done, total, word: run.on_progress(f"{title}: {stage.lower()}", done, total, word),
+        on_progress=run.under(title),
     )
 
 
@@ -310,12 +318,10 @@ def _judged(run: _Run, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged,
                 budget=run.budget,
                 space=run.space,
                 seed=run.seed + _FRESH,
-                name=run.spec_of(number),
+                name=run.name(number),
                 device=run.device,
                 before=run.folder / "round-0" / "judged" / scenario.name if number else None,
-                on_progress=lambda stage, done, total, word, title=title: run.on_progress(
-                    f"{title}: {stage.lower()}", done, total, word
-                ),
+                on_progress=run.under(title),
             ).judge()
     return tuple(judged)
 

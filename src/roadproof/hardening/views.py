@@ -70,7 +70,7 @@ class Street:
     def __init__(self, recordings: RecordingSet, teacher: Controller, *, device: torch.device | str = "cpu") -> None:
         self.world = RecordedWorld(recordings, device=device)
         self.world.fit(teacher)
-        self._ways: list[Float[Tensor, "n 4"]] = []
+        self._poses = torch.empty(0, 4, dtype=torch.float64, device=self.world.device)
 
     def add_ways(self, driver: Controller, patterns: Pattern) -> None:
         """Drive over the bare road and over each pattern of a batch; the poses are drawn from from then on.
@@ -83,21 +83,25 @@ class Street:
             for pattern in (None, patterns):
                 rolled = self.world.roll(driver, pattern)
                 way = (rolled.x_m - canvas.x_m, rolled.y_m - canvas.y_m, rolled.yaw_rad, rolled.speed_mps)
-                self._ways.append(torch.stack([column.flatten() for column in way], 1))
+                self._poses = torch.cat([self._poses, torch.stack([column.flatten() for column in way], 1)])
 
     def draw(self, count: int, generator: torch.Generator) -> Views:
-        """So many pictures, or a few less: poses far from every recorded one are left out."""
-        # Every way counts alike; the last third of those of one round are no better than the first.
-        poses = torch.cat(self._ways)
-        chosen = poses[torch.randint(len(poses), (count,), generator=generator).to(poses.device)]
+        """So many pictures, or a few less: poses far from every recorded one are left out.
+
+        Args:
+            count: at least 1.
+            generator: where the randomness comes from, on the CPU.
+        """
+        chosen = self._poses[torch.randint(len(self._poses), (count,), generator=generator).to(self._poses.device)]
         spread = torch.tensor([MOVED_M, TURNED_RAD, FASTER_MPS], dtype=torch.float64)
         noise = torch.randn(count, 3, generator=generator, dtype=torch.float64) * spread
         right, turned, faster = noise.to(chosen).unbind(1)
         x, y, yaw, speed = chosen.unbind(1)
         moved = Poses(x + torch.sin(yaw) * right, y - torch.cos(yaw) * right, yaw + turned)
         gap = self.world.bank.nearest(moved)
-        near = (gap.ahead_m.abs() < AHEAD_M) & (gap.left_m.abs() < LEFT_M) & (gap.turned_rad.abs() < TURN_RAD)
-        kept = near.nonzero()[:, 0]
+        parts = [gap.ahead_m / AHEAD_M, gap.left_m / LEFT_M, gap.turned_rad / TURN_RAD]
+        far = torch.stack(parts).abs().amax(0)
+        kept = (far <= far.min().clamp_min(1.0)).nonzero()[:, 0]
         moved, gap = moved.picked(kept), type(gap)(*(column[kept] for column in gap))
         with torch.no_grad():
             shown = self.world.bank.show(moved, gap)
