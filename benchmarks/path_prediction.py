@@ -40,7 +40,7 @@ from roadproof.patterns import Pattern
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.recordings import RecordingSet
-from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from roadproof.scenarios import Scenario, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 
@@ -131,7 +131,7 @@ def main() -> None:
     stored = json.loads(args.json.read_text()) if args.json.exists() else {"records": []}
     cells = {one["cell"]: one for one in stored["records"] if "each" in one}
     for name in args.controllers:
-        for scenario in (find_scenario(each, builtin_scenarios()) for each in args.scenarios):
+        for scenario in (find_scenario(each) for each in args.scenarios):
             if f"{name} {scenario.name}" in cells:
                 continue
             found = cell(name, scenario, args.seed, args.simulator)

@@ -38,14 +38,14 @@ with TownSimulator() as simulator:
 
 def speeds(agents: int) -> tuple[list[float], float]:
     """Frames per second of a drive of each scenario in this process, and its peak memory in MB."""
-    from roadproof.scenarios import builtin_scenarios, find_scenario
+    from roadproof.scenarios import find_scenario
     from roadproof.simulators.town.simulator import TownSimulator
     from roadproof.training.expert import Expert
 
     found: list[float] = []
     with TownSimulator() as simulator:
         for name in ("straight-01", *SCENARIOS):  # the first only warms up
-            scenario = find_scenario(name, builtin_scenarios())
+            scenario = find_scenario(name)
             seen = simulator.reset(scenario, cars=agents, pedestrians=agents, seed=0)
             expert, frames, began = Expert(simulator.route), 0, time.perf_counter()
             while not seen.done:

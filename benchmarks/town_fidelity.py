@@ -40,7 +40,7 @@ from roadproof.photometry import (
     fit_affine,
     pixel_maps_from_two_paints,
 )
-from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from roadproof.scenarios import Scenario, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage
 from roadproof.simulators.town.simulator import TownSimulator
@@ -168,7 +168,7 @@ def main() -> None:
     records: list[dict[str, object]] = []
     with TownSimulator() as town:
         for name in arguments.scenarios.split(","):
-            scenario = find_scenario(name, builtin_scenarios())
+            scenario = find_scenario(name)
             for weather in map(Weather, arguments.weathers.split(",")):
                 found = judge(town, scenario, weather, patterns, arguments.every)
                 records += found

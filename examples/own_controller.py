@@ -37,7 +37,7 @@ class LineFollower(torch.nn.Module):
 def main() -> None:
     """Record, calibrate, attack, drive, report."""
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own-controller")
-    scenario = roadproof.find_scenario("straight-04", roadproof.builtin_scenarios())
+    scenario = roadproof.find_scenario("straight-04")
     with roadproof.TownSimulator() as town:
         result = roadproof.stress_test(town, LineFollower(), scenario, out)
     for trial in result.evaluation.trials:

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from roadproof import SearchSpace, TownSimulator, builtin_scenarios, calibrate, composite, find_scenario, record
+from roadproof import SearchSpace, TownSimulator, calibrate, composite, find_scenario, record
 from roadproof.compositing import view_canvas
 from roadproof.drives import Drive, Trajectories, Window
 from roadproof.pipeline.fidelity import rendered_frames
 from roadproof.training.expert import expert
 
-SCENARIO = find_scenario("right-04", builtin_scenarios())
+SCENARIO = find_scenario("right-04")
 AHEAD_M = (12.0, 9.0, 6.5)
 GAP_PX, LINE_PX = 6, 28
 

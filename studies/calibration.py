@@ -41,7 +41,7 @@ from roadproof.io.files import write_atomically
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
@@ -210,7 +210,7 @@ def main() -> None:
                 drives = record(
                     town,
                     expert,
-                    find_scenario(name, builtin_scenarios()),
+                    find_scenario(name),
                     weather=weather,
                     trajectories=Trajectories(count=arguments.trajectories),
                     window=Window(frames=arguments.frames),

@@ -49,7 +49,7 @@ from roadproof.pipeline.budget import STEERING, Budget
 from roadproof.pipeline.stage_costs import StageCost
 from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.processes import processes_beside
-from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from roadproof.scenarios import Scenario, find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
 
@@ -136,7 +136,7 @@ def rows_of(cell: Cell) -> list[Row]:
         return json.loads(path.read_text(encoding="utf-8"))
     controller = load_controller(cell.controller)
     with TownSimulator() as town:
-        rows = _rows(cell, town, controller, find_scenario(cell.scenario, builtin_scenarios()))
+        rows = _rows(cell, town, controller, find_scenario(cell.scenario))
     write_atomically(path, lambda part: part.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8"))
     return rows
 

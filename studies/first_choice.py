@@ -39,7 +39,7 @@ from roadproof.memory import keep_freed_memory
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.selection import select_by_driving
 from roadproof.processes import processes_beside
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
 
@@ -77,7 +77,7 @@ def rows_of(cell: Cell) -> list[Row]:
     if all(path.exists() for path in kept.values()):
         return [json.loads(path.read_text(encoding="utf-8")) for path in kept.values()]
     controller = roadproof.load_controller(cell.controller)
-    scenario, space = find_scenario(cell.scenario, builtin_scenarios()), SearchSpace(figures=5)
+    scenario, space = find_scenario(cell.scenario), SearchSpace(figures=5)
     rows: list[Row] = []
     with TownSimulator() as town:
         drives = record(

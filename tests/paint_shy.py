@@ -7,7 +7,7 @@ import torch
 from carla_serving import straight_map
 from roadproof.datatypes import Control, VehicleState
 from roadproof.geometry import CanvasPlacement
-from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from roadproof.scenarios import Scenario, find_scenario
 
 
 class PaintShy:
@@ -35,7 +35,7 @@ def paint_shy():
 def just_before_the_canvas(time_limit_s):
     """The scenario left-03 from 17 m before its canvas on, at 22 km/h."""
     start = VehicleState(x_m=291.75, y_m=222.0, z_m=0.0, yaw_rad=1.571, speed_mps=6.0)
-    left = find_scenario("left-03", builtin_scenarios())
+    left = find_scenario("left-03")
     return dataclasses.replace(left, name="short", start=start, time_limit_s=time_limit_s)
 
 

@@ -23,7 +23,7 @@ from roadproof.pipeline.film import Strip
 from roadproof.pipeline.selection import Driven, Selection
 from roadproof.recordings import Push, save_recordings
 from roadproof.roads.maps import load_map, scenario_route
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from scenes import recording_set
 
@@ -71,7 +71,7 @@ def driven(scenario, aside_m=0.0, *, weather=WEATHERS[0], traffic=False, seed=0,
 
 def write_evaluation(folder, *, aside_m=1.5, clean_events=(), events=(), scenario=None, controller="cil", runs=2):
     """An evaluation of drives that go so far aside, in two weathers."""
-    scenario = scenario or find_scenario("left-03", builtin_scenarios())
+    scenario = scenario or find_scenario("left-03")
     trials = []
     for weather in WEATHERS:
         for run, traffic in [(0, False), *((run, True) for run in range(runs))]:
@@ -122,7 +122,7 @@ def write_attack(folder):
 
 def write_selection(folder, *aside_m, chosen):
     """Candidates that go so far aside when driven."""
-    scenario = find_scenario("left-03", builtin_scenarios())
+    scenario = find_scenario("left-03")
     clean = driven(scenario)
     trials = [
         judge(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
+from roadproof.scenarios import find_scenario, save_scenarios
 
-_WHOLE = find_scenario("straight-01", builtin_scenarios())
+_WHOLE = find_scenario("straight-01")
 SHORT = dataclasses.replace(
     _WHOLE, name="short", start=dataclasses.replace(_WHOLE.start, x_m=40.0, speed_mps=8.0), time_limit_s=4.0
 )

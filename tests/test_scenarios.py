@@ -102,9 +102,9 @@ def test_names_are_used_once(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_is_answered_with_the_nearest() -> None:
-    assert find_scenario("left-03", builtin_scenarios()).kind == "left"
+    assert find_scenario("left-03").kind == "left"
     with pytest.raises(ScenarioError, match="no scenario is called 'left3'; did you mean 'left-0"):
-        find_scenario("left3", builtin_scenarios())
+        find_scenario("left3")
 
 
 def test_lists_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from roadproof.datatypes import Weather
-from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from roadproof.scenarios import Scenario, find_scenario
 from roadproof.simulators.town.simulator import TownSimulator
 
 # Scenario, and how far before the canvas the picture is taken.
@@ -48,7 +48,7 @@ def main() -> None:
         for column, weather in enumerate(weathers):
             pen.text((column * TILE[0] + 8, 3), weather.value, (30, 30, 30), font)
             for row, (name, distance) in enumerate(PLACES):
-                scenario = find_scenario(name, builtin_scenarios())
+                scenario = find_scenario(name)
                 near = started_before_canvas(simulator, scenario, distance)
                 seen = simulator.reset(
                     near, weather=weather, pattern=pattern(), cars=30, pedestrians=40, seed=SEED, full_pictures=True

@@ -11,6 +11,7 @@ from roadproof.drives import record as record
 from roadproof.driving.evaluate import evaluate as evaluate
 from roadproof.driving.rollout import rollout as rollout
 from roadproof.errors import RoadproofError as RoadproofError
+from roadproof.hardening import harden as harden
 from roadproof.patterns import Pattern as Pattern
 from roadproof.patterns import load_pattern as load_pattern
 from roadproof.patterns import save_pattern as save_pattern
@@ -24,7 +25,6 @@ from roadproof.recordings import load_recordings as load_recordings
 from roadproof.recordings import save_recordings as save_recordings
 from roadproof.report.page import write_report as write_report
 from roadproof.scenarios import Scenario as Scenario
-from roadproof.scenarios import builtin_scenarios as builtin_scenarios
 from roadproof.scenarios import find_scenario as find_scenario
 from roadproof.search_space import SearchSpace as SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator as TownSimulator

@@ -84,12 +84,17 @@ def builtin_scenarios() -> tuple[Scenario, ...]:
     return load_scenarios(BUILTIN_FILE)
 
 
-def find_scenario(name: str, scenarios: Sequence[Scenario]) -> Scenario:
-    """The scenario of this name.
+def find_scenario(name: str, scenarios: Sequence[Scenario] | None = None) -> Scenario:
+    """The scenario of a name.
+
+    Args:
+        name: such as "left-03".
+        scenarios: among which it is looked for; the built-in ones by default.
 
     Raises:
         ScenarioError: there is none; the message names the nearest.
     """
+    scenarios = builtin_scenarios() if scenarios is None else scenarios
     for scenario in scenarios:
         if scenario.name == name:
             return scenario

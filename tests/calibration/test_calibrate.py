@@ -16,13 +16,13 @@ from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import load_recordings, save_recordings
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.training.expert import expert
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
-SCENE = find_scenario("straight-04", builtin_scenarios())
+SCENE = find_scenario("straight-04")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import needs
 from roadproof.coverage import Shape
 from roadproof.driving.episode import Episode
 from roadproof.patterns import Pattern, save_pattern
-from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
+from roadproof.scenarios import find_scenario, save_scenarios
 
 needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
@@ -47,7 +47,7 @@ CONTROLLERS = textwrap.dedent(
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("workplace")
     (folder / "own_drivers.py").write_text(CONTROLLERS)
-    left = find_scenario("left-03", builtin_scenarios())
+    left = find_scenario("left-03")
     # As far as the canvas, so that the paint is in view at once.
     short = dataclasses.replace(left, name="short", time_limit_s=0.4)
     save_scenarios([short, dataclasses.replace(left, name="longer", time_limit_s=2.0)], folder / "own.toml")

@@ -11,14 +11,14 @@ import bad_drivers
 import needs
 from recorded_drives import drivable_set
 from roadproof.recordings import save_recordings
-from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
+from roadproof.scenarios import find_scenario, save_scenarios
 
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("workplace")
     save_recordings(drivable_set(), folder / "set")
-    left = find_scenario("left-03", builtin_scenarios())
+    left = find_scenario("left-03")
     save_scenarios([dataclasses.replace(left, name="short", time_limit_s=0.4)], folder / "own.toml")
     return folder
 

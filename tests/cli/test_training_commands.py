@@ -6,13 +6,13 @@ import pytest
 
 import needs
 from roadproof.controllers import CIL, load_controller, model_card, shipped_names
-from roadproof.scenarios import builtin_scenarios, find_scenario, save_scenarios
+from roadproof.scenarios import find_scenario, save_scenarios
 
 
 @pytest.fixture
 def short(tmp_path):
     """Two scenarios in whose time nobody arrives."""
-    easy, bend = (find_scenario(name, builtin_scenarios()) for name in ("straight-02", "left-11"))
+    easy, bend = (find_scenario(name) for name in ("straight-02", "left-11"))
     save_scenarios([dataclasses.replace(one, time_limit_s=0.5) for one in (easy, bend)], tmp_path / "short.toml")
     return tmp_path / "short.toml"
 

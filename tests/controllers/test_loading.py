@@ -19,6 +19,7 @@ from roadproof.controllers import (
     pilotnet_controller,
     save_controller,
 )
+from roadproof.controllers.loading import load_trainable
 from roadproof.errors import ControllerError, DeviceError, OutputError
 
 
@@ -117,6 +118,43 @@ def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
         with pytest.raises(ControllerError, match=message):
             load_controller(spec)
     assert sys.path == before
+
+
+def test_a_factory_is_given_other_weights_and_learns_unmerged(tmp_path, monkeypatch):
+    (tmp_path / "small_driver.py").write_text(
+        "from roadproof.controllers import CIL\none = CIL(width=0.1, seed=9)\ndef make():\n    return one\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    other = CIL(width=0.1, seed=3).eval()
+    save_file(other.state_dict(), tmp_path / "other.safetensors")
+    spec = f"small_driver:make@{tmp_path / 'other.safetensors'}"
+    torch.testing.assert_close(load_controller(spec).steer(*drive()), other.steer(*drive()).detach())
+    learner = load_trainable(spec)
+    assert not learner.is_folded
+    assert not learner.training
+    assert all(each.requires_grad for each in learner.parameters())
+    # The factory gives the same object every time: who learns has a copy.
+    assert learner is not load_trainable(spec)
+    save_file({"image.0.bias": torch.zeros(3)}, tmp_path / "few.safetensors")
+    with pytest.raises(ControllerError, match=r"few\.safetensors (lacks|has an unexpected) tensor"):
+        load_controller(f"small_driver:make@{tmp_path / 'few.safetensors'}")
+    with pytest.raises(ControllerError, match=r"none\.safetensors does not exist"):
+        load_controller("small_driver:make@none.safetensors")
+
+
+def test_frozen_parameters_of_a_factory_stay_frozen_and_weights_files_learn_whole(tmp_path, monkeypatch, cil):
+    (tmp_path / "frozen_driver.py").write_text(
+        "from roadproof.controllers import CIL\n"
+        "def make():\n    net = CIL(width=0.1)\n    net.convolutions.requires_grad_(False)\n    return net\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    learner = load_trainable("frozen_driver:make")
+    assert not any(each.requires_grad for each in learner.convolutions.parameters())
+    assert all(each.requires_grad for each in learner.image.parameters())
+    save_controller(cil, tmp_path / "cil.safetensors")
+    learner = load_trainable(str(tmp_path / "cil.safetensors"))
+    assert not learner.is_folded
+    assert all(each.requires_grad for each in learner.parameters())
 
 
 def test_an_error_inside_a_factory_is_not_hidden(tmp_path, monkeypatch):

@@ -13,12 +13,12 @@ from roadproof.drives.folder import write_settings
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
 from roadproof.recordings import Push
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.training.expert import expert
 
 needs.town()
 
-LEFT = find_scenario("left-03", builtin_scenarios())
+LEFT = find_scenario("left-03")
 WANTED = Trajectories(count=3, perturbation=Swerve((1.2,)))
 ASKED = {"trajectories": WANTED, "window": Window(frames=5), "weather": Weather.CLOUDY_NOON, "seed": 4}
 

@@ -15,12 +15,12 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import ControllerError, EpisodeError, OutputError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 
 needs.town()
 from roadproof.training.expert import expert
 
-LEFT = find_scenario("left-03", builtin_scenarios())
+LEFT = find_scenario("left-03")
 SHORT = dataclasses.replace(LEFT, time_limit_s=2.0)
 PATTERN = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.ones(1, 3))
 

@@ -13,7 +13,7 @@ from roadproof.driving.evaluation import judge
 from roadproof.driving.rollout import rollout
 from roadproof.errors import RoadproofError
 from roadproof.pipeline.driven_objective import DrivenObjective, effect_of
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from runs import driven
 from short_drive import SHORT
@@ -22,7 +22,7 @@ SPACE = SearchSpace(figures=2)
 
 
 def test_steering_is_summed_over_the_first_four_fifths_as_published():
-    scenario = find_scenario("left-03", builtin_scenarios())
+    scenario = find_scenario("left-03")
     clean = driven(scenario)
     frames = int(0.8 * clean.steer.size)
     shift = np.zeros(clean.steer.size)
@@ -40,7 +40,7 @@ def test_steering_is_summed_over_the_first_four_fifths_as_published():
 
 
 def test_deviation_is_the_one_that_evaluations_report():
-    scenario = find_scenario("left-03", builtin_scenarios())
+    scenario = find_scenario("left-03")
     clean, painted = driven(scenario), driven(scenario, 1.3, painted=True)
     trial = judge(clean, painted, scenario.canvas, pattern="attack", clean_file="a.npz", painted_file="b.npz")
     assert effect_of(clean, painted, scenario.canvas).deviation == trial.deviation_m > 0.1

@@ -10,14 +10,14 @@ from roadproof.drives import Swerve, Trajectories, Window, record
 from roadproof.driving.rollout import rollout
 from roadproof.errors import EpisodeError
 from roadproof.pipeline.prediction import Prediction, predict
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 
 
 @pytest.fixture(scope="module")
 def run(town):
     """Drives of the town past a bare canvas, calibrated."""
-    scenario, controller = find_scenario("straight-04", builtin_scenarios()), load_controller("pilotnet")
+    scenario, controller = find_scenario("straight-04"), load_controller("pilotnet")
     drives = record(
         town,
         controller,

@@ -16,7 +16,7 @@ from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stress_test import STAGES, stress_test
 from roadproof.recordings import load_recordings
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 
 TINY = Budget(
@@ -32,7 +32,7 @@ TINY = Budget(
 
 
 def run(town, folder, **options):
-    scenario = find_scenario("left-03", builtin_scenarios())
+    scenario = find_scenario("left-03")
     options = {"budget": TINY, "space": SearchSpace(figures=1), "controller_name": "pilotnet"} | options
     return stress_test(town, load_controller("pilotnet"), scenario, folder, **options)
 

@@ -20,7 +20,7 @@ from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.page import write_report
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.simulators.protocol import PaintKind
 from runs import driven
 
@@ -68,7 +68,7 @@ def test_an_evaluation_in_recordings_is_called_predicted_and_knows_nothing_of_in
 
 def test_predicted_deviation_is_over_the_stretch_that_driven_ones_are_over():
     """Drives that begin nearer to the canvas count as if they had come straight from where it comes into view."""
-    scenario = find_scenario("left-03", builtin_scenarios())
+    scenario = find_scenario("left-03")
     whole = [driven(scenario, aside_m) for aside_m in (0.0, 1.5)]
     first = passage(path_of(whole[0]), scenario.canvas, horizon_m=15.0).start
 

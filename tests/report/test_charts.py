@@ -11,10 +11,10 @@ from roadproof.patterns import raster
 from roadproof.report import charts
 from roadproof.report.formatting import mean_in_words
 from roadproof.report.top_view import top_view
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from runs import CRASH, PATTERN, driven
 
-SCENARIO = find_scenario("straight-01", builtin_scenarios())
+SCENARIO = find_scenario("straight-01")
 
 
 @pytest.fixture(scope="module")

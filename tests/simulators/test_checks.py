@@ -5,12 +5,12 @@ import pytest
 
 import needs
 from roadproof.datatypes import Control, VehicleState
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 
 needs.town()
 from roadproof.simulators.checks import check_simulator
 
-SCENARIO = find_scenario("straight-01", builtin_scenarios())
+SCENARIO = find_scenario("straight-01")
 
 
 class Altered:

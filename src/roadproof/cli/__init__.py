@@ -24,6 +24,7 @@ from roadproof.cli.convert_cil import convert_cil
 from roadproof.cli.demo import demo
 from roadproof.cli.drive import drive
 from roadproof.cli.evaluate import evaluate
+from roadproof.cli.harden import harden
 from roadproof.cli.record import record
 from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
@@ -55,6 +56,7 @@ VERBS = (
     check_controller,
     convert_cil,
     train,
+    harden,
 )
 for verb in VERBS:
     app.command()(verb)

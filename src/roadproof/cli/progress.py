@@ -53,7 +53,7 @@ def stages() -> Generator[Callable[[str, int, int, str], None]]:
         def show(title: str, done: int, total: int, value: str) -> None:
             if title not in tasks:
                 tasks[title] = bar.add_task(title, total=total, value=value)
-            bar.update(tasks[title], completed=done, value=value)
+            bar.update(tasks[title], completed=done, total=total, value=value)
 
         yield show
 

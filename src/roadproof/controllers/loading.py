@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import re
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,8 @@ ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
     "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, "
-    "pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx or module:factory (a function in your Python)"
+    "pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx, module:factory (a function in your Python) or "
+    "module:factory@FILE.safetensors (with other weights)"
 )
 
 _METADATA_KEY = "roadproof"
@@ -68,7 +70,8 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
             the frames of CARLA's agent;
             `FILE.pt2`, `FILE.onnx`: a network exported by `torch.export` or to ONNX (extra `onnx`), see `exported`;
             `module:factory`: a function without arguments that returns a `Controller`; the current directory is
-            importable.
+            importable;
+            `module:factory@FILE.safetensors`: the same, a `torch.nn.Module`, with weights that `harden` tuned.
         device: "cpu", "cuda" or "cuda:N".
         dtype: "float32", "bfloat16" or "float64"; what the network computes in. Frames may stay in float32.
 
@@ -82,24 +85,61 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
     """
     place, precision = _device(device), _dtype(dtype)
     text = str(spec)
+    controller = _found(text, place, precision)
+    return call(f"moving the controller to {place} in {dtype}", _placed, controller, place, precision)
+
+
+def load_trainable(spec: str) -> nn.Module:
+    """A controller as it can be trained on: nothing merged, in float32, on the CPU, in eval mode, with gradients.
+
+    Args:
+        spec: as `load_controller` takes it; of a Python factory's module, the parameters that want gradients are those
+            its author left so, or all where none does.
+
+    Raises:
+        ControllerError: as `load_controller`; or it is no `torch.nn.Module` with parameters, or an exported network.
+    """
+    if spec.endswith((".pt2", ".onnx")):
+        raise ControllerError(
+            f"{spec} is an exported network; to train on, give the Python it came from: module:factory"
+        )
+    network = _found(spec, torch.device("cpu"), torch.float32)
+    if not isinstance(network, nn.Module) or not any(True for _ in network.parameters()):
+        raise ControllerError(
+            f"{spec} gives a {type(network).__name__}, expected a torch.nn.Module with parameters, so that it can learn"
+        )
+    if not any(each.requires_grad for each in network.parameters()):
+        network.requires_grad_(True)
+    # A factory may give the same object each time.
+    return copy.deepcopy(network).eval()
+
+
+def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | nn.Module:
+    """The controller of a spec as it was made."""
     head, _, tail = text.partition(":")
+    factory, at, weights = tail.partition("@")
     if head in ARCHITECTURES and tail:
-        controller = _from_weights(Path(tail), ControllerCard(architecture=head))
-    elif re.fullmatch(r"[a-z][a-z0-9-]*", text):
-        controller = _from_weights(shipped_weights(text), None)
-    elif text.endswith(".safetensors"):
-        controller = _from_weights(Path(text), None)
-    elif text.endswith((".pt2", ".onnx")):
+        return _from_weights(Path(tail), ControllerCard(architecture=head))
+    if re.fullmatch(r"[a-z][a-z0-9-]*", text):
+        return _from_weights(shipped_weights(text), None)
+    if factory and all(part.isidentifier() for part in (*head.split("."), *factory.split("."))):
+        made = _from_python(head, factory)
+        if at:
+            if not isinstance(made, nn.Module):
+                raise ControllerError(
+                    f"{head}:{factory} gives a {type(made).__name__}, which has no weights to replace"
+                )
+            _fill(made, _read_weights(_existing(Path(weights)))[0], Path(weights))
+        return made
+    if text.endswith(".safetensors"):
+        return _from_weights(Path(text), None)
+    if text.endswith((".pt2", ".onnx")):
         path = _existing(Path(text))
         # Exported networks are met in their own room: ONNX is an extra.
         from roadproof.controllers.exported import exported_controller
 
-        controller = exported_controller(path, _card_beside(path) or ControllerCard(), device=place, dtype=precision)
-    elif tail and all(part.isidentifier() for part in (*head.split("."), *tail.split("."))):
-        controller = _from_python(head, tail)
-    else:
-        raise ControllerError(f"unknown controller {text!r}, expected {SPECS}")
-    return call(f"moving the controller to {place} in {dtype}", _placed, controller, place, precision)
+        return exported_controller(path, _card_beside(path) or ControllerCard(), device=device, dtype=dtype)
+    raise ControllerError(f"unknown controller {text!r}, expected {SPECS}")
 
 
 def save_controller(
@@ -195,22 +235,38 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
     network.load_state_dict(state)
 
 
-def _from_python(module_name: str, factory_name: str) -> Controller:
-    spec = f"{module_name}:{factory_name}"
+def imported(spec: str, expected: str) -> Callable[..., object]:
+    """A function of the user's own Python, "module:function"; the current directory is importable.
+
+    Args:
+        spec: which.
+        expected: what it should be, in words.
+
+    Raises:
+        ControllerError: its module cannot be imported, lacks it, or holds something else there.
+    """
+    module_name, _, name = spec.partition(":")
     with _current_directory_importable():
         try:
-            factory: object = call(f"the import of {module_name}", importlib.import_module, module_name)
-            for part in factory_name.split("."):
-                factory = getattr(factory, part)
+            found: object = call(f"the import of {module_name}", importlib.import_module, module_name)
+            for part in name.split("."):
+                found = getattr(found, part)
         except (ControllerError, AttributeError) as error:
             reason = error.__cause__ or error
             # What a module of the user's lacks itself is told with its line.
             absent = isinstance(reason, ModuleNotFoundError) and f"{module_name}.".startswith(f"{reason.name}.")
             if not absent and isinstance(error, ControllerError):
                 raise
-            raise ControllerError(f"cannot import {spec}: {reason}; or give {SPECS}") from reason
-        if not callable(factory):
-            raise ControllerError(f"{spec} is {factory!r:.100}, expected a function without arguments")
+            raise ControllerError(f"cannot import {spec}: {reason}; expected {expected}") from reason
+    if not callable(found):
+        raise ControllerError(f"{spec} is {found!r:.100}, expected {expected}")
+    return found
+
+
+def _from_python(module_name: str, factory_name: str) -> Controller:
+    spec = f"{module_name}:{factory_name}"
+    factory = imported(spec, f"a function without arguments; or give {SPECS}")
+    with _current_directory_importable():
         controller: object = call(spec, factory)
         missing = call(spec, missing_members, controller)
     if missing:

@@ -268,7 +268,7 @@ from town_driving import drive, fingerprint
 from roadproof.datatypes import Weather
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.simulators.town.simulator import TownSimulator
-scenario = find_scenario("left-05", builtin_scenarios())
+scenario = find_scenario("left-05")
 with TownSimulator() as simulator:
     for weather in sys.argv[2:]:
         print(fingerprint(drive(simulator, scenario, 150, weather=Weather(weather), cars=5, pedestrians=5, seed=1)))

@@ -8,11 +8,11 @@ import pytest
 from roadproof.datatypes import Command, Ending, EventKind, VehicleState, Weather
 from roadproof.errors import SimulatorError
 from roadproof.roads.maps import load_map
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.simulators.tracker.drive import DriveTracker, Request, RouteTracker
 from roadproof.simulators.tracker.judge import Contact
 
-SCENARIO = find_scenario("straight-16", builtin_scenarios())
+SCENARIO = find_scenario("straight-16")
 ROADS = load_map(SCENARIO.map_name)
 FRAME = np.zeros((2, 3, 3), np.uint8)
 DT_S = 0.1

@@ -9,10 +9,10 @@ from roadproof.datatypes import Control, Ending, Event, EventKind, VehicleState
 from roadproof.driving.infractions import counted, infraction_points
 from roadproof.driving.rollout import rollout
 from roadproof.roads.maps import load_map, scenario_route
-from roadproof.scenarios import builtin_scenarios, find_scenario
+from roadproof.scenarios import find_scenario
 from roadproof.simulators.tracker.judge import BLOCKED_S, STANDS_S, Endings
 
-SCENARIO = find_scenario("left-03", builtin_scenarios())
+SCENARIO = find_scenario("left-03")
 ROUTE = scenario_route(SCENARIO, load_map(SCENARIO.map_name))
 HIT = (Event(EventKind.COLLISION_STATIC, 1.0, "guard rail 0"),)
 
@@ -56,7 +56,7 @@ def straight_on(_simulator):
     return lambda _seen: Control(0.0, throttle=0.45)
 
 
-BEND = find_scenario("right-02", builtin_scenarios())
+BEND = find_scenario("right-02")
 
 
 @pytest.fixture(scope="module")

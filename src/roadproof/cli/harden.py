@@ -1,0 +1,98 @@
+"""`roadproof harden`: a controller made robust against paint, and judged on other streets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, choice, number
+from roadproof.limits import MAX_SEED
+
+if TYPE_CHECKING:
+    from roadproof.hardening.tuning import TrainingStep
+    from roadproof.scenarios import Scenario
+
+
+def harden(
+    controller: Annotated[str, typer.Argument(help=f"A torch.nn.Module: {CONTROLLERS}", show_default=False)],
+    scenarios: Annotated[str, typer.Option(help="Scenarios to train on, with commas between.", show_default=False)],
+    judge_on: Annotated[
+        str, typer.Option(help="Scenarios on other streets to judge on, with commas between.", show_default=False)
+    ] = "",
+    clean_on: Annotated[
+        str,
+        typer.Option(
+            help="Scenarios driven over the bare road before and after: all, or names; those above by default.",
+            show_default=False,
+        ),
+    ] = "",
+    scenario_file: ScenarioFile = None,
+    rounds: Annotated[int, number("Rounds of attack, tuning and re-test.", 1, 100)] = 2,
+    budget: Annotated[str, typer.Option(help="quick or full.")] = "quick",
+    training_step: Annotated[
+        str | None,
+        typer.Option(help="module:function(model, batch) that gives the loss, where the usual does not fit."),
+    ] = None,
+    figures: Figures = 5,
+    seed: Annotated[int, number("Of everything; judging has fresh ones.", 0, MAX_SEED)] = 0,
+    simulator: SimulatorSpec = "town",
+    device: Annotated[str, typer.Option(help="cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
+    out: Annotated[Path, typer.Option(help="Folder; the same folder goes on where it was.")] = Path("out/harden"),
+) -> None:
+    """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on streets not trained on."""
+    # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    import torch
+    from rich.console import Console
+
+    from roadproof.cli.progress import stages
+    from roadproof.controllers.loading import imported, load_trainable
+    from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
+    from roadproof.hardening.harden import harden as run
+    from roadproof.hardening.page import write_hardening
+    from roadproof.hardening.tuning import training_step as usual_step
+    from roadproof.io.locks import hold
+    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.search_space import SearchSpace
+    from roadproof.simulators.loading import open_simulator
+
+    known = load_scenarios(scenario_file or BUILTIN_FILE)
+
+    def named(names: str) -> list[Scenario]:
+        return [find_scenario(name.strip(), known) for name in names.split(",") if name.strip()]
+
+    spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))]
+    training, judging = named(scenarios), named(judge_on)
+    step = (
+        usual_step
+        if training_step is None
+        else cast("TrainingStep", imported(training_step, "a function of model and batch that gives the loss"))
+    )
+    check_streets(training, judging)
+    load_trainable(controller)
+    with open_simulator(simulator) as world, stages() as show:
+        hold(out)
+        found = run(
+            world,
+            controller,
+            training,
+            out,
+            judge_on=judging,
+            clean_on=known if clean_on == "all" else named(clean_on),
+            rounds=rounds,
+            budget=spent,
+            space=SearchSpace(figures=figures),
+            training_step=step,
+            seed=seed,
+            device=("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device,
+            on_progress=show,
+        )
+    page = write_hardening(found, out)
+    say = Console(soft_wrap=True, highlight=False, markup=False).print
+    for each in found.rounds:
+        kept = "  <- kept" if each.number == found.best else ""
+        say(f"  round {each.number}: {each.mean_m:.2f} m on the streets trained on, attacked afresh{kept}")
+    if found.judgement is not None:
+        say(found.judgement.verdict().sentence)
+    say(f"The hardened controller is {found.hardened}, the page {page}")

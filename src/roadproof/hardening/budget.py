@@ -1,0 +1,115 @@
+"""What a hardening spends, and the streets it may not mix up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from roadproof.attacks import TPE, GradOpt, Method
+from roadproof.attacks.blackbox import BlackBox
+from roadproof.coverage import Shape
+from roadproof.datatypes import Weather
+from roadproof.driving.evaluate import PAPER_WEATHERS
+from roadproof.errors import TrainingError
+from roadproof.hardening.tuning import Tuning
+from roadproof.pipeline.budget import QUICK, Budget
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+
+APART_M = 40.0
+"""Canvases nearer than this lie on one street: a driver sees the one from 25 m on, and it is up to 10 m long."""
+
+ALONE = replace(QUICK, weathers=(Weather.CLEAR_NOON,))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HardeningBudget:
+    """How much is spent.
+
+    Args:
+        attack: on each street for training, in each round; its evaluation is the round's re-test.
+        tuning: after each attack.
+        town_drives: drives of the controller through the built-in town, whose frames keep clean driving as it was;
+            none are made in another simulator.
+        judge: the attack afresh on each street for judging.
+        unseen: a method that training did not use, for judging; its patterns are tried in the recorded world.
+        unseen_shape: a shape that training did not use, for judging.
+        clean_weathers: in which drives over the bare road are counted.
+
+    Raises:
+        TrainingError: the judging attack does not drive in the recorded world, or drives nothing.
+    """
+
+    attack: Budget = field(default_factory=lambda: ALONE)
+    tuning: Tuning = field(default_factory=Tuning)
+    town_drives: int = 40
+    judge: Budget = field(default_factory=lambda: replace(ALONE, starts=4))
+    unseen: Method = field(default_factory=lambda: TPE(calls=100))
+    unseen_shape: Shape = Shape.ELLIPSE
+    clean_weathers: tuple[Weather, ...] = PAPER_WEATHERS
+
+    def __post_init__(self) -> None:
+        if not (self.attack.is_predicted and self.judge.is_predicted):
+            raise TrainingError("hardening searches in the recorded world; give attack and judge a path deviation")
+        if self.town_drives < 0 or not self.clean_weathers:
+            raise TrainingError(
+                f"{self.town_drives} drives through the town, {len(self.clean_weathers)} weathers of clean drives; "
+                "expected 0 or more, and at least one"
+            )
+
+    def require_libraries(self, space: SearchSpace) -> None:
+        """See that what judging needs is installed.
+
+        Raises:
+            RoadproofError: the library of the black-box method is not.
+        """
+        if isinstance(self.unseen, BlackBox):
+            self.unseen.proposer(space, 0, 0)
+
+    def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
+        """What judging searches besides `judge`, by name."""
+        shapes = SearchSpace(figures=space.figures, family="free", shape=self.unseen_shape)
+        return {
+            f"{self.unseen.word}, {self._calls} patterns tried": (self.unseen, space),
+            f"{self.unseen_shape}s by gradient": (self.judge.method, shapes),
+        }
+
+    @property
+    def _calls(self) -> int:
+        return self.unseen.steps(self.judge.objective)
+
+
+HARDENING_BUDGETS = {
+    "quick": HardeningBudget(),
+    "full": HardeningBudget(
+        attack=replace(ALONE, method=GradOpt(restarts=6), select=3),
+        tuning=Tuning(steps=4000),
+        town_drives=80,
+        judge=replace(QUICK, select=4, starts=2),
+        unseen=TPE(calls=400),
+    ),
+}
+"""Named budgets: quick takes about an hour a round on a laptop, full a night."""
+
+
+def check_streets(training: Sequence[Scenario], judging: Sequence[Scenario]) -> None:
+    """See that there is something to train on, and that no street is trained on and judged on.
+
+    Raises:
+        TrainingError: there is none, one is given twice, or two canvases lie on one street.
+    """
+    if not training:
+        raise TrainingError("there is no scenario to train on; give at least one")
+    for given in (training, judging):
+        names = [each.name for each in given]
+        if len(set(names)) < len(names):
+            raise TrainingError(f"scenarios {', '.join(names)} name one twice; give each once")
+    for one in training:
+        for other in judging:
+            apart_m = math.dist((one.canvas.x_m, one.canvas.y_m), (other.canvas.x_m, other.canvas.y_m))
+            if one.map_name == other.map_name and apart_m < APART_M:
+                raise TrainingError(
+                    f"{one.name} is trained on and {other.name} judged on, but their canvases lie {apart_m:.0f} m "
+                    f"apart, on one street; expected at least {APART_M:.0f} m: choose another street for judging"
+                )

@@ -1,0 +1,294 @@
+"""Did it help? Both controllers are attacked afresh, by several kinds of search, on streets that were not trained on.
+
+    judged/SCENARIO/               the attack of the kind that training used, with fresh seeds (`pipeline.stress_test`)
+    judged/SCENARIO/kind-1/ …      attacks of kinds that training did not use: a black box, another shape
+    judged/SCENARIO/old/           what was found against the controller before, driven over by the one after
+    clean/SCENARIO/episodes/*.npz  drives over the bare road
+
+All numbers are driven. Each kind's pattern is driven over from the same starts before and after; none of them chose it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from roadproof.attacks import AttackResult, Method, attack, kept_attack
+from roadproof.controllers import Controller
+from roadproof.datatypes import Ending, Weather
+from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
+from roadproof.driving.evaluate import evaluate
+from roadproof.driving.evaluation import ATTACK, Evaluation
+from roadproof.driving.infractions import counted
+from roadproof.driving.intervals import Mean, mean_95
+from roadproof.hardening.budget import HardeningBudget
+from roadproof.patterns import Pattern, load_pattern
+from roadproof.pipeline.stress_test import OnProgress, stress_test
+from roadproof.recordings import RecordingSet, load_recordings
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import Simulator
+
+SEARCHED = "by gradient, as in training"
+OLD = "found against the controller before"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Judged:
+    """One kind of attack on one street against one controller.
+
+    Args:
+        scenario: the street.
+        kind: of attack, in words.
+        after: against the hardened controller.
+        deviation_m: of each drive over the pattern.
+        left_lane: whether each of them left its lane.
+    """
+
+    scenario: str
+    kind: str
+    after: bool
+    deviation_m: tuple[float, ...]
+    left_lane: tuple[bool, ...]
+
+    @property
+    def mean_m(self) -> float:
+        """Mean deviation."""
+        return float(np.mean(self.deviation_m))
+
+
+@dataclass(frozen=True, slots=True)
+class Clean:
+    """Drives over the bare road.
+
+    Args:
+        drives: how many.
+        clean: those that arrived in time with nothing having happened.
+        failed: scenario and weather of the others.
+    """
+
+    drives: int
+    clean: int
+    failed: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Verdict:
+    """Whether hardening helped.
+
+    Args:
+        outcome: "helped", "did not help" or "not shown".
+        change_m: deviation after less before, of the strongest attack on each street: mean with 95 % interval.
+        over: what the interval is over: "streets", or with one street alone its "drives".
+        before_m: median over streets of the strongest attack's deviation, as after_m.
+        left_lane_before: share of the strongest attacks' drives that leave the lane, as left_lane_after.
+        clean_worse: whether fewer drives over the bare road are clean.
+    """
+
+    outcome: str
+    change_m: Mean
+    over: str
+    before_m: float
+    after_m: float
+    left_lane_before: float
+    left_lane_after: float
+    clean_worse: bool
+
+    @property
+    def sentence(self) -> str:
+        """In words."""
+        c = self.change_m
+        between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
+        outcome = {"helped": "It helped", "did not help": "It did not help", "not shown": "That it helped is not shown"}
+        worse = "; fewer drives over the bare road are clean" if self.clean_worse else ""
+        return (
+            f"{outcome[self.outcome]}: over the strongest attack on streets not trained on it deviates by "
+            f"{self.after_m:.2f} m instead of {self.before_m:.2f} m, {c.value:+.2f} m on average{between}; it leaves "
+            f"its lane in {self.left_lane_after:.0%} of the drives instead of {self.left_lane_before:.0%}{worse}."
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Before and after.
+
+    Args:
+        judged: every kind of attack on every street, before and after.
+        clean: drives over the bare road, before and after.
+    """
+
+    judged: tuple[Judged, ...]
+    clean: tuple[Clean, Clean]
+
+    def verdict(self) -> Verdict:
+        """Of the strongest attack on each street: attackers choose the kind; a mean over kinds would flatter."""
+        names = list(dict.fromkeys(each.scenario for each in self.judged))
+        before, after = ([self._strongest(name, after=after) for name in names] for after in (False, True))
+        if len(names) > 1:
+            changes, over = [b.mean_m - a.mean_m for a, b in zip(before, after, strict=True)], "streets"
+        else:
+            pairs = zip(before[0].deviation_m, after[0].deviation_m, strict=True)
+            changes, over = [b - a for a, b in pairs], "drives"
+        change = mean_95(changes)
+        worse = self.clean[1].clean < self.clean[0].clean
+        low, high = change.low, change.high
+        if worse or (low is not None and low > 0):
+            outcome = "did not help"
+        else:
+            outcome = "helped" if high is not None and high < 0 else "not shown"
+        return Verdict(
+            outcome=outcome,
+            change_m=change,
+            over=over,
+            before_m=float(np.median([each.mean_m for each in before])),
+            after_m=float(np.median([each.mean_m for each in after])),
+            left_lane_before=_share(before),
+            left_lane_after=_share(after),
+            clean_worse=worse,
+        )
+
+    def _strongest(self, scenario: str, *, after: bool) -> Judged:
+        tried = [each for each in self.judged if (each.scenario, each.after) == (scenario, after)]
+        return max(tried, key=lambda each: each.mean_m)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Judge:
+    """Attacks one controller on one street by every kind of search, and drives over what each found.
+
+    Args:
+        simulator: an open simulator.
+        controller: on `device`.
+        scenario: the street.
+        folder: keeps everything.
+        budget: gives the attack and the kinds.
+        space: patterns of the attack that training used.
+        seed: of everything; not one of training.
+        name: of the controller, for reports.
+        device: where to search.
+        before: folder of the same judgement of the controller before; None for that one itself.
+        on_progress: told of every step.
+    """
+
+    simulator: Simulator
+    controller: Controller
+    scenario: Scenario
+    folder: Path
+    budget: HardeningBudget
+    space: SearchSpace
+    seed: int
+    name: str
+    device: str
+    before: Path | None
+    on_progress: OnProgress
+
+    def judge(self) -> list[Judged]:
+        """Every kind, and what was found before.
+
+        Raises:
+            RoadproofError: a stage refuses.
+        """
+        tested = stress_test(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            self.folder,
+            budget=self.budget.judge,
+            space=self.space,
+            seed=self.seed,
+            controller_name=self.name,
+            device=self.device,
+            on_progress=self.on_progress,
+        )
+        judged = [self._judged(tested.evaluation, SEARCHED)]
+        recordings = load_recordings(self.folder / "recordings")
+        for number, (kind, (method, space)) in enumerate(self.budget.kinds(self.space).items(), 1):
+            place = self.folder / f"kind-{number}"
+            found = self._searched(recordings, kind, method, space, place / "attack")
+            judged.append(self._driven(found.pattern, place / "evaluation", kind))
+        if self.before is not None:
+            judged.append(self._driven(load_pattern(self.before / "pattern.json"), self.folder / "old", OLD))
+        return judged
+
+    def _searched(
+        self, recordings: RecordingSet, kind: str, method: Method, space: SearchSpace, place: Path
+    ) -> AttackResult:
+        objective = self.budget.judge.objective
+        steps = method.steps(objective)
+        return kept_attack(
+            place,
+            lambda checkpoint: attack(
+                recordings,
+                self.controller,
+                space,
+                objective=objective,
+                method=method,
+                seed=self.seed,
+                device=self.device,
+                checkpoint=checkpoint,
+                on_step=lambda step, best: self.on_progress(f"Searching, {kind}", step, steps, f"{best:.2f}"),
+            ),
+        )
+
+    def _driven(self, pattern: Pattern, place: Path, kind: str) -> Judged:
+        asked = self.budget.judge
+        evaluation = evaluate(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            pattern,
+            folder=place,
+            driver_name=self.name,
+            weathers=asked.weathers,
+            starts=asked.starts,
+            start_range=asked.start_range,
+            runs=asked.runs,
+            seed=self.seed,
+            on_drive=lambda done, total: self.on_progress(f"Driving, {kind}", done, total, ""),
+        )
+        return self._judged(evaluation, kind)
+
+    def _judged(self, evaluation: Evaluation, kind: str) -> Judged:
+        trials = evaluation.of(ATTACK, traffic=False)
+        return Judged(
+            scenario=self.scenario.name,
+            kind=kind,
+            after=self.before is not None,
+            deviation_m=tuple(trial.deviation_m for trial in trials),
+            left_lane=tuple(trial.leaves_lane for trial in trials),
+        )
+
+
+def clean_drives(
+    simulator: Simulator,
+    controller: Controller,
+    scenarios: Sequence[Scenario],
+    weathers: Sequence[Weather],
+    folder: Path,
+    *,
+    on_drive: Callable[[int, int], object] = lambda _done, _total: None,
+) -> Clean:
+    """Drive scenarios over the bare road in several weathers, and count those in which nothing happened.
+
+    Raises:
+        ControllerError, SimulatorError: as `rollout` does.
+        OutputError: the folder cannot be written.
+    """
+    failed: list[str] = []
+    asked = [(scenario, weather) for scenario in scenarios for weather in weathers]
+    for done, (scenario, weather) in enumerate(asked, 1):
+        episodes = Episodes.of(simulator, controller, scenario, {}, folder / scenario.name)
+        drive = Conditions(paint=CLEAN, weather=weather)
+        episodes.make(simulator, drive)
+        (episode,) = load_episodes(episodes.folder, [episodes.file(drive)])
+        if episode.ending is not Ending.GOAL_REACHED or counted(episode.events):
+            failed.append(f"{scenario.name}, {weather}")
+        on_drive(done, len(asked))
+    return Clean(len(asked), len(asked) - len(failed), tuple(failed))
+
+
+def _share(judged: Sequence[Judged]) -> float:
+    return float(np.mean([left for each in judged for left in each.left_lane]))

@@ -1,0 +1,59 @@
+"""The page of a hardening: verdict, every kind of attack before and after, the bare road, round by round."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PIL import Image
+
+import roadproof
+from roadproof.hardening.harden import Hardened
+from roadproof.hardening.judgement import Judged
+from roadproof.io.files import write_atomically
+from roadproof.patterns import load_pattern, raster
+from roadproof.report.html import encoded, environment
+
+_BADGES = {"helped": "holds", "not shown": "swayed", "did not help": "fails"}
+
+
+def write_hardening(found: Hardened, folder: Path) -> Path:
+    """Write hardening.html beside what `harden` left; it needs no other file.
+
+    Returns:
+        The page.
+
+    Raises:
+        PatternError: a pattern of the judgement is missing or damaged.
+        OutputError: the page cannot be written.
+    """
+    judged = () if found.judgement is None else found.judgement.judged
+    verdict = None if found.judgement is None else found.judgement.verdict()
+    text = environment().get_template("hardening.html.jinja").render(
+        version=roadproof.__version__,
+        found=found,
+        verdict=verdict,
+        badge="" if verdict is None else _BADGES[verdict.outcome],
+        pairs=_pairs(judged),
+        patterns=[
+            {
+                "name": name,
+                "before": _picture(folder / "round-0" / "judged" / name),
+                "after": _picture(folder / f"round-{found.best}" / "judged" / name),
+            }
+            for name in dict.fromkeys(each.scenario for each in judged)
+        ],
+    )  # fmt: skip
+    page = folder / "hardening.html"
+    write_atomically(page, lambda part: part.write_text(text, encoding="utf-8"))
+    return page
+
+
+def _pairs(judged: tuple[Judged, ...]) -> list[tuple[str, str, Judged | None, Judged | None]]:
+    """Street by street, kind by kind: before and after, where there are both."""
+    by = {(each.scenario, each.kind, each.after): each for each in judged}
+    rows = dict.fromkeys((each.scenario, each.kind) for each in judged)
+    return [(*row, by.get((*row, False)), by.get((*row, True))) for row in sorted(rows, key=lambda row: row[0])]
+
+
+def _picture(folder: Path) -> str:
+    return encoded(Image.fromarray(raster(load_pattern(folder / "pattern.json"))), "PNG")

@@ -1,0 +1,119 @@
+"""What a controller is tuned on: pictures from around the ways it takes past the canvas, bare and painted.
+
+A street is the recorded world of one scenario. Its poses are those of drives predicted in it, over the bare road and
+over every pattern that was found there, each moved aside, turned and made faster or slower by a drawn amount. Any
+pattern can be painted there, whichever street it was found on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from roadproof.compositing.composite import composite_own
+from roadproof.compositing.view import OwnViews
+from roadproof.controllers import Controller
+from roadproof.patterns import Pattern
+from roadproof.recorded import RecordedWorld
+from roadproof.recorded.course import Place
+from roadproof.recorded.pictures import Poses
+from roadproof.recordings import RecordingSet
+
+MOVED_M, TURNED_RAD, FASTER_MPS = 0.4, 0.06, 0.7
+"""Standard deviations of what poses are moved by."""
+
+AHEAD_M, LEFT_M, TURN_RAD = 1.5, 1.5, 0.4
+"""A pose further from every recorded one is left out: its picture says little."""
+
+RECORDED_M = 1.5
+"""As far aside as drives are recorded; the law of steering is not believed beyond."""
+
+
+class Views(NamedTuple):
+    """Pictures of the bare road from B poses of one street.
+
+    Args:
+        frames: RGB in [0, 1].
+        speed_mps: speed of the car.
+        command: CARLA's codes.
+        place: where the car is beside the clean path.
+        canvas: the canvas' pixels; None where no picture shows it.
+    """
+
+    frames: Float[Tensor, "b 3 h w"]
+    speed_mps: Float[Tensor, " b"]
+    command: Int[Tensor, " b"]
+    place: Place
+    canvas: OwnViews | None
+
+    def painted(self, pattern: Pattern) -> Float[Tensor, "b 3 h w"]:
+        """The pictures with a pattern of its own in each, differentiable in the patterns."""
+        return self.frames if self.canvas is None else composite_own(pattern, self.frames, self.canvas)
+
+
+class Street:
+    """A recorded world, and the poses that matter there.
+
+    Args:
+        recordings: calibrated, with a canvas and tracks.
+        teacher: whose law of steering on the bare road leads back to the clean path; on `device`.
+        device: where pictures are made.
+
+    Raises:
+        RecordingError: nobody can drive in these recordings.
+        ControllerError: the teacher raises, or answers wrongly.
+    """
+
+    def __init__(self, recordings: RecordingSet, teacher: Controller, *, device: torch.device | str = "cpu") -> None:
+        self.world = RecordedWorld(recordings, device=device)
+        self.world.fit(teacher)
+        self._poses = torch.empty(0, 4, dtype=torch.float64, device=self.world.device)
+
+    def add_ways(self, driver: Controller, patterns: Pattern) -> None:
+        """Drive over the bare road and over each pattern of a batch; the poses are drawn from from then on.
+
+        Raises:
+            ControllerError: the driver raises, or answers wrongly.
+        """
+        canvas = self.world.bank.canvas
+        with torch.no_grad():
+            for pattern in (None, patterns):
+                rolled = self.world.roll(driver, pattern)
+                way = (rolled.x_m - canvas.x_m, rolled.y_m - canvas.y_m, rolled.yaw_rad, rolled.speed_mps)
+                self._poses = torch.cat([self._poses, torch.stack([column.flatten() for column in way], 1)])
+
+    def draw(self, count: int, generator: torch.Generator) -> Views:
+        """So many pictures, or a few less: poses far from every recorded one are left out.
+
+        Args:
+            count: at least 1.
+            generator: where the randomness comes from, on the CPU.
+        """
+        chosen = self._poses[torch.randint(len(self._poses), (count,), generator=generator).to(self._poses.device)]
+        spread = torch.tensor([MOVED_M, TURNED_RAD, FASTER_MPS], dtype=torch.float64)
+        noise = torch.randn(count, 3, generator=generator, dtype=torch.float64) * spread
+        right, turned, faster = noise.to(chosen).unbind(1)
+        x, y, yaw, speed = chosen.unbind(1)
+        moved = Poses(x + torch.sin(yaw) * right, y - torch.cos(yaw) * right, yaw + turned)
+        gap = self.world.bank.nearest(moved)
+        parts = [gap.ahead_m / AHEAD_M, gap.left_m / LEFT_M, gap.turned_rad / TURN_RAD]
+        far = torch.stack(parts).abs().amax(0)
+        kept = (far <= far.min().clamp_min(1.0)).nonzero()[:, 0]
+        moved, gap = moved.picked(kept), type(gap)(*(column[kept] for column in gap))
+        with torch.no_grad():
+            shown = self.world.bank.show(moved, gap)
+        speed_mps = (speed + faster).clamp_min(0.0)[kept].float()
+        command = self.world.bank.command[gap.frame]
+        return Views(shown.frames, speed_mps, command, self.world.course.locate(moved), shown.canvas)
+
+    def returning(self, place: Place, answer: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+        """The teacher's steering, and where a car is far aside more and more of its law on the bare road.
+
+        Up to 1 m aside the teacher's answer to the picture stands; from 2 m on its law, fitted to its answers to
+        recorded pictures and taken no further aside than those go.
+        """
+        law = self.world.course.law(place._replace(right_m=place.right_m.clamp(-RECORDED_M, RECORDED_M)))
+        return torch.lerp(answer, law.to(answer), (place.right_m.abs() - 1.0).clamp(0.0, 1.0).to(answer))

@@ -1,0 +1,54 @@
+"""Streets for training and judging are disjoint; budgets search where hardening can."""
+
+import dataclasses
+
+import pytest
+
+from roadproof.attacks import SteeringShift
+from roadproof.coverage import Shape
+from roadproof.errors import TrainingError
+from roadproof.hardening.budget import HARDENING_BUDGETS, HardeningBudget, check_streets
+from roadproof.pipeline.budget import QUICK
+from roadproof.scenarios import find_scenario
+from roadproof.search_space import SearchSpace
+
+
+def named(*names):
+    return [find_scenario(name) for name in names]
+
+
+def test_streets_that_share_no_canvas_and_no_approach_are_accepted():
+    check_streets(named("left-07", "right-05"), named("straight-04"))
+    # The same place of another map is another street.
+    elsewhere = [dataclasses.replace(each, map_name="second") for each in named("left-07")]
+    check_streets(named("left-07"), elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("training", "judging", "message"),
+    [
+        (["left-07"], ["straight-04", "left-07"], "left-07 is trained on and left-07 judged on, .* 0 m apart"),
+        (["left-08"], ["right-07"], "left-08 is trained on and right-07 judged on, .* 6 m apart"),
+        ([], ["left-07"], "no scenario to train on"),
+        (["left-07", "left-07"], [], "name one twice"),
+    ],
+)
+def test_streets_that_overlap_are_refused(training, judging, message):
+    with pytest.raises(TrainingError, match=message):
+        check_streets(named(*training), named(*judging))
+
+
+def test_budgets_judge_by_kinds_that_training_did_not_use():
+    for budget in HARDENING_BUDGETS.values():
+        (unseen, same), (method, shapes) = budget.kinds(SearchSpace(figures=3)).values()
+        assert type(unseen) is not type(budget.attack.method)
+        assert same == SearchSpace(figures=3)
+        assert method == budget.judge.method
+        assert (shapes.figures, shapes.shape) == (3, Shape.ELLIPSE)
+
+
+def test_budgets_that_make_no_sense_are_refused():
+    with pytest.raises(TrainingError, match="give attack and judge a path deviation"):
+        HardeningBudget(attack=dataclasses.replace(QUICK, objective=SteeringShift()))
+    with pytest.raises(TrainingError, match="-1 drives through the town"):
+        HardeningBudget(town_drives=-1)

@@ -1,0 +1,120 @@
+"""The whole of it, tiny: every round leaves its files, a stopped one goes on to the same, another is refused."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+import needs
+from carla_serving import straight_map
+from roadproof.attacks import GradOpt, RandomSearch
+from roadproof.controllers import ConditionalPilotNet, load_controller
+from roadproof.datatypes import VehicleState, Weather
+from roadproof.drives import Window
+from roadproof.errors import TrainingError
+from roadproof.geometry import CanvasPlacement
+from roadproof.hardening.budget import ALONE, HardeningBudget
+from roadproof.hardening.harden import harden
+from roadproof.hardening.page import write_hardening
+from roadproof.hardening.tuning import Tuning
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+
+needs.town()
+
+SEARCH = dataclasses.replace(
+    ALONE, method=GradOpt(iterations=1, restarts=1, halving=False), starts=0, window=Window(frames=8, least_px=8)
+)
+TINY = HardeningBudget(
+    attack=SEARCH,
+    judge=dataclasses.replace(SEARCH, starts=2),
+    tuning=Tuning(steps=2, batch=8),
+    town_drives=0,
+    unseen=RandomSearch(calls=2),
+    clean_weathers=(Weather.CLEAR_NOON,),
+)
+
+
+def street(folder, name, begin_m):
+    """A stretch of one long, straight road, from 17 m before its canvas."""
+    return Scenario(
+        name=name,
+        kind="straight",
+        map_name=str(straight_map(folder, length_m=220.0)),
+        start=VehicleState(x_m=begin_m, y_m=-1.75, z_m=0.0, yaw_rad=0.0, speed_mps=6.0),
+        goal_m=(begin_m + 30.0, -1.75),
+        canvas=CanvasPlacement(x_m=begin_m + 17.0, y_m=0.0, width_m=6.6),
+        time_limit_s=8.0,
+    )
+
+
+def run(town, folder, **options):
+    near, far = street(folder.parent, "near", 15.0), street(folder.parent, "far", 115.0)
+    given = {"judge_on": [far], "rounds": 1, "budget": TINY, "space": SearchSpace(figures=1)} | options
+    return harden(town, "pilotnet", [near], folder, **given)
+
+
+class StoppedError(Exception):
+    """The plug is pulled."""
+
+
+@pytest.mark.slow
+def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(town, tmp_path):
+    out, whole = tmp_path / "a" / "out", tmp_path / "b" / "out"
+    for folder in (out, whole):
+        folder.parent.mkdir()
+    for stage in ("Round 0, near: calibrating", "Round 1: learning", "Judging after, far: searching"):
+
+        def stop(title, _done, _total, word, stage=stage):
+            if f"{title}: {word}".startswith(stage):
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            run(town, out, on_progress=stop)
+    found = run(town, out)
+    # The judged controller is none but the saved one.
+    learnt, before = load_controller(found.hardened), load_controller("pilotnet")
+    assert isinstance(learnt, ConditionalPilotNet)
+    assert not torch.equal(learnt.image.weight, before.image.weight)
+    again = run(town, whole, judge_on=())
+    assert again.judgement is None
+    assert torch.equal(load_controller(again.hardened).image.weight, learnt.image.weight)
+    check_result(found, out)
+    told = []
+    assert run(town, out, on_progress=lambda title, _done, _total, word: told.append(f"{title}: {word}")) == found
+    assert told
+    assert not any("searching" in each or "learning" in each for each in told)
+    with pytest.raises(TrainingError, match="holds a hardening with another seed"):
+        run(town, out, seed=1)
+    with pytest.raises(TrainingError, match="holds a hardening with another budget"):
+        run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, batch=8)))
+
+
+def check_result(found, out):
+    assert [each.number for each in found.rounds] == [0, 1]
+    assert found.best == 1
+    kinds = ["by gradient, as in training", "random, 2 patterns tried", "ellipses by gradient"]
+    judged = found.judgement.judged
+    assert [each.kind for each in judged if not each.after] == kinds
+    assert [each.kind for each in judged if each.after] == [*kinds, "found against the controller before"]
+    assert all(len(each.deviation_m) == 2 for each in judged)
+    assert [each.drives for each in found.judgement.clean] == [2, 2]
+    stored = json.loads((out / "hardening.json").read_text())
+    assert stored["hardened"] == found.hardened
+    assert stored["verdict"]["outcome"] == found.judgement.verdict().outcome
+    page = write_hardening(found, out).read_text()
+    assert found.judgement.verdict().sentence in page
+    for word in (*kinds, "far", "near, m", "data:image/png"):
+        assert word in page
+
+
+def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
+    folder = tmp_path / "out"
+    for options, message in (
+        ({"judge_on": [street(tmp_path, "next", 40.0)]}, "lie 25 m apart, on one street; expected at least 40 m"),
+        ({"rounds": 0}, "rounds is 0"),
+    ):
+        with pytest.raises(TrainingError, match=message):
+            run(town, folder, **options)
+    assert not folder.exists()

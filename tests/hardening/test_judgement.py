@@ -1,0 +1,65 @@
+"""The verdict is of the strongest attack on each street, with an interval over streets, and minds clean driving."""
+
+import pytest
+
+from roadproof.hardening.judgement import Clean, Judged, Judgement
+
+
+def judged(scenario, kind, before, after):
+    return [
+        Judged(
+            scenario=scenario,
+            kind=kind,
+            after=bool(number),
+            deviation_m=tuple(values),
+            left_lane=tuple(value > 1.0 for value in values),
+        )
+        for number, values in enumerate((before, after))
+        if values
+    ]
+
+
+def verdict(*rows, clean=(4, 4)):
+    drives = tuple(Clean(4, count, ("left-03, rainy-noon",) * (4 - count)) for count in clean)
+    return Judgement(tuple(each for row in rows for each in judged(*row)), drives).verdict()
+
+
+HELPED = (
+    ("a", "gradient", [1.8, 2.2], [0.1, 0.1]),
+    ("a", "black box", [0.5, 0.5], [0.2, 0.4]),
+    ("b", "gradient", [1.4, 1.6], [0.2, 0.2]),
+    ("c", "gradient", [1.2, 1.4], [0.1, 0.1]),
+    ("c", "old", [], [0.3, 0.3]),
+)
+
+
+def test_the_strongest_attack_on_each_street_is_compared():
+    told = verdict(*HELPED)
+    # a: 2.0 to 0.3, b: 1.5 to 0.2, c: 1.3 to 0.3, where the old pattern is the strongest.
+    assert (told.before_m, told.after_m) == pytest.approx((1.5, 0.3))
+    assert told.change_m.value == pytest.approx(-(1.7 + 1.3 + 1.0) / 3)
+    assert told.change_m.count == 3
+    assert told.change_m.high < 0
+    assert (told.outcome, told.over) == ("helped", "streets")
+    assert (told.left_lane_before, told.left_lane_after) == (1.0, 0.0)
+    assert told.sentence.startswith("It helped: over the strongest attack")
+    assert "0.30 m instead of 1.50 m" in told.sentence
+
+
+def test_hardening_that_spoils_clean_driving_did_not_help():
+    told = verdict(*HELPED, clean=(4, 3))
+    assert (told.outcome, told.clean_worse) == ("did not help", True)
+    assert told.sentence.endswith("fewer drives over the bare road are clean.")
+
+
+def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():
+    assert verdict(("a", "k", [1.0], [0.1]), ("b", "k", [1.0], [1.2])).outcome == "not shown"
+    assert verdict(("a", "k", [1.0], [1.9]), ("b", "k", [1.0], [2.0])).outcome == "did not help"
+
+
+def test_one_street_has_an_interval_over_its_drives_and_one_drive_has_none():
+    told = verdict(("a", "k", [1.0, 1.2, 1.1], [0.1, 0.2, 0.2]))
+    assert (told.outcome, told.over, told.change_m.count) == ("helped", "drives", 3)
+    alone = verdict(("a", "k", [1.0], [0.1]))
+    assert (alone.outcome, alone.change_m.low) == ("not shown", None)
+    assert "95 %" not in alone.sentence

@@ -1,0 +1,100 @@
+"""Fine-tuning: paint moves the controller less, the bare road is answered as before, the rest stays as it was."""
+
+import pytest
+import torch
+
+from hardening_road import SPACE, RampNet
+from painted_ground import RampFollower
+from roadproof.errors import ControllerError, TrainingError
+from roadproof.hardening.tuning import Tuning, TuningBatch, training_step, tune
+
+TUNING = Tuning(steps=60, batch=16, learning_rate=0.3)
+
+
+def tuned(street, *, tuning=TUNING, seed=0, **options):
+    network, found = RampNet(), SPACE.random((4,), torch.Generator().manual_seed(5))
+    tune(network, RampFollower(), [street], SPACE, found, None, tuning, seed=seed, **options)
+    return network
+
+
+def errors(network, street):
+    """Mean distance from the teacher's answer to the bare road, on bare and on painted pictures."""
+    views = street.draw(64, torch.Generator().manual_seed(99))
+    patterns = SPACE.pattern(SPACE.random((len(views.frames),), torch.Generator().manual_seed(98)))
+    teacher = RampFollower().steer(views.frames, None, None)
+    with torch.no_grad():
+        shown = (views.frames, views.painted(patterns))
+        return [float((network.eval().steer(frames, None, None) - teacher).abs().mean()) for frames in shown]
+
+
+def test_paint_moves_a_tuned_controller_less_and_the_bare_road_as_before(street):
+    bare, painted = errors(RampNet(), street)
+    network = tuned(street)
+    bare_after, painted_after = errors(network, street)
+    assert bare < 1e-4
+    assert painted_after < 0.3 * painted
+    assert bare_after < 0.2 * painted
+    assert network.weight[1].item() == pytest.approx(4.0 * 0.43 / 0.2, rel=0.3)
+
+
+def test_the_same_seed_learns_the_same_and_buffers_stay(street):
+    one, same, other = (tuned(street, tuning=Tuning(steps=5, batch=8), seed=seed) for seed in (0, 0, 1))
+    assert torch.equal(one.weight, same.weight)
+    assert not torch.equal(one.weight, other.weight)
+    assert not one.training
+    for name, buffer in RampNet().named_buffers():
+        assert torch.equal(buffer, one.get_buffer(name))
+
+
+def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_small(street):
+    seen = []
+
+    def step(model, batch):
+        seen.append(batch)
+        return (model.bias - 3.0).square()
+
+    network = tuned(street, tuning=Tuning(steps=20, batch=4, learning_rate=0.5), step=step)
+    assert network.bias.item() == pytest.approx(3.0, abs=0.5)
+    assert torch.equal(network.weight, RampNet().weight)
+    assert len(seen) == 20
+    assert isinstance(seen[0], TuningBatch)
+    # This controller only steers.
+    assert seen[0].target.shape == (len(seen[0].frames), 1)
+    assert max(training_step(RampNet().eval(), batch).item() for batch in seen) > 0
+
+
+@pytest.mark.parametrize(
+    ("step", "error", "message"),
+    [
+        (lambda model, batch: model.bias * float("nan"), TrainingError, "the loss is nan at step 1"),
+        (lambda model, batch: 0.5, TrainingError, "gave a float, expected one number with a gradient"),
+        (lambda model, batch: model.weight, TrainingError, r"a tensor of shape \(2,\)"),
+        (lambda model, batch: torch.tensor(1.0), TrainingError, "with a gradient to the parameters"),
+        (lambda model, batch: 1 / 0, ControllerError, "the training step raised ZeroDivisionError at .*test_tuning.py"),
+    ],
+)
+def test_training_steps_that_give_no_loss_are_one_line(street, step, error, message):
+    with pytest.raises(error, match=message):
+        tuned(street, step=step)
+
+
+def test_climbing_patterns_move_the_controller_more(street):
+    from roadproof.hardening.tuning import _Paint
+
+    views, network = street.draw(16, torch.Generator().manual_seed(3)), RampFollower()
+    target = network.steer(views.frames, None, None)
+    paint = _Paint(SPACE, torch.empty(0, 1, 4), Tuning(climbs=3))
+    unit = paint.draw(len(views.frames), torch.Generator().manual_seed(4))
+    shift = [
+        float((network.steer(paint.on(points, views), None, None) - target).abs().mean())
+        for points in (unit, paint.climbed(unit, views, network, target))
+    ]
+    assert shift[1] > 1.1 * shift[0]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"steps": 0}, {"batch": 2}, {"learning_rate": 0.0}, {"climbs": -1}, {"bare": 1.5}, {"found": -0.1}]
+)
+def test_tunings_that_make_no_sense_are_refused(changes):
+    with pytest.raises(TrainingError, match="expected"):
+        Tuning(**changes)
