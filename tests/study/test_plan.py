@@ -8,7 +8,8 @@ import pytest
 from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.scenarios import builtin_scenarios
-from roadproof.study.plan import load_study
+from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan
+from roadproof.study.plan import StartPlan, TrafficPlan, load_study
 
 TEXT = """
 format = "roadproof-study"
@@ -154,6 +155,7 @@ def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, mon
         ),
         ("seeds =", 'reference = "TPE"\nseeds =', "reference is 'TPE', expected one of GradOpt, BO"),
         ("trajectories = 1", 'calibration = "by eye"', "calibration is 'by eye'"),
+        ("trajectories = 1", "restarts = 5000", "method GradOpt: restarts is 5000, expected int <= 1000"),
         ("trajectories = 1", "frames = 0", "0 frames; expected all above 0"),
         ("calls = 100", 'objective = "fame"', "objective is 'fame'"),
         ("calls = 100", 'start = "luck"', "start is 'luck', expected int, got str"),
@@ -199,3 +201,24 @@ def test_the_paper_s_study_is_the_paper_s():
     assert len(study.weathers) == 4
     last = study.methods[-1]
     assert (last.search, last.calls, last.random_calls) == ("published-bo", 1000, 400)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (GradOptPlan, {"restarts": 0}, "restarts is 0"),
+        (GradOptPlan, {"restarts": 7}, "restarts is 7, expected 1 to 6 places to compete for"),
+        (GradOptPlan, {"swerves_m": (99.0,)}, "expected one or more between 0.1 and 5"),
+        (GradOptPlan, {"rounds": 1, "select": 0}, "select 1 or more"),
+        (PublishedPlan, {"masks": "none"}, "masks is 'none'"),
+        (PublishedPlan, {"noise_deg": (99, 3)}, "steering noise is 99…3°"),
+        (BlackBoxPlan, {"search": "luck"}, "method is 'luck'"),
+        (TrafficPlan, {"cars": 0, "pedestrians": 0}, "leave .traffic. out"),
+        (StartPlan, {"right_m": 2.0}, "right_m of the starts is 2.0, expected 0 to 1"),
+        (StartPlan, {"count": 0}, "count is 0, expected 1 to 1000"),
+    ],
+)
+def test_a_plan_made_in_python_is_checked_by_the_objects_it_is_for(kind, values, message):
+    name = {} if kind in (TrafficPlan, StartPlan) else {"name": "a"}
+    with pytest.raises(RoadproofError, match=message):
+        kind(**name, **values)

@@ -121,8 +121,9 @@ def gallery(results: Results, jobs: Jobs) -> Picture | None:
     spread = np.linspace(len(results.figures) - 1, 0, max(1, min(len(results.figures), COLUMNS // len(names))))
     kept: list[int] = np.unique(spread.round().astype(int)).tolist()
     shown = [results.figures[k] for k in kept]
-    columns = {f"K = {figures}\n{plain(name)}": (figures, name) for figures in shown for name in names}
-    rows = [[JobId(scenario, *column, seed) for column in columns.values()] for scenario in scenarios]
+    columns = [(figures, name) for figures in shown for name in names]
+    titles = [f"K = {figures}\n{plain(name)}" for figures, name in columns]
+    rows = [[JobId(scenario, *column, seed) for column in columns] for scenario in scenarios]
 
     def picture(job: JobId, _column: int) -> UInt8[np.ndarray, "h w 3"] | None:
         kept = jobs.get(job)
@@ -133,7 +134,7 @@ def gallery(results: Results, jobs: Jobs) -> Picture | None:
         return np.asarray(on_asphalt(raster(pattern, PICTURE_PX), PICTURE_PX, (canvas.width_m, canvas.length_m)))
 
     size_in = (1.25 * len(columns) + 0.9, 1.95 * len(rows) + 0.6)
-    figure = _grid(results, rows, list(columns), [results.home] * len(columns), picture, size_in)
+    figure = _grid(results, rows, titles, [results.home] * len(columns), picture, size_in)
     return figure and Picture(
         "patterns",
         f"The patterns found, as they lie on the road, seed {seed}; the far edge is above. Under each the deviation it "
