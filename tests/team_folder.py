@@ -60,7 +60,7 @@ def scenario():
     start = VehicleState(begin.x_m, begin.y_m, 0.0, begin.yaw_rad, 6.0)
     goal_m = (CANVAS.x_m + 20.0 * np.cos(CANVAS.yaw_rad), CANVAS.y_m + 20.0 * np.sin(CANVAS.yaw_rad))
     return Scenario(name="test-road", kind="straight", map_name="town", start=start, goal_m=goal_m, canvas=CANVAS,
-                    time_limit_s=30.0)  # fmt: skip
+                    time_limit_s=6.0)  # fmt: skip
 
 
 def write_team(folder, *, plan=PLAN, patterns=(("magenta", BAR), ("green", GREEN))):
