@@ -11,7 +11,7 @@ from roadproof.drives import record as record
 from roadproof.driving.evaluate import evaluate as evaluate
 from roadproof.driving.rollout import rollout as rollout
 from roadproof.errors import RoadproofError as RoadproofError
-from roadproof.hardening import harden as harden
+from roadproof.hardening.harden import harden as harden
 from roadproof.patterns import Pattern as Pattern
 from roadproof.patterns import load_pattern as load_pattern
 from roadproof.patterns import save_pattern as save_pattern

@@ -39,9 +39,9 @@ from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
+from roadproof.pipeline.film import FILM, STRIP, film_trial
 from roadproof.pipeline.stress_test import OnProgress, stress_test
 from roadproof.processes import require_picklable
-from roadproof.report.film import FILM, STRIP, film_trial
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator

@@ -14,7 +14,7 @@ from roadproof.gate.result import Case, CheckResult
 from roadproof.gate.verdict import Status
 from roadproof.io.arrays import read_archive
 from roadproof.io.files import write_atomically
-from roadproof.report.words import MISSING, in_words
+from roadproof.report.formatting import MISSING, in_words
 
 WORST = "worst.jpg"
 SHOWN_PX, BLACK = 1500, 12
@@ -124,7 +124,7 @@ def write_worst(strip: Path, path: Path) -> None:
     """Write the picture of a passage: above without paint, below with it.
 
     Args:
-        strip: what `report.film.film_trial` left.
+        strip: what `pipeline.film.film_trial` left.
         path: of the JPEG.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
@@ -19,7 +19,7 @@ from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
 from roadproof.study.plan import StartPlan
-from roadproof.study.reading import build, one_of, within
+from roadproof.study.reading import build
 
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
@@ -155,13 +155,13 @@ def load_check(path: Path, *, budget: str | None = None, trust: bool = False) ->
 
 
 def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
-    one_of(stated.budget, "budget", BUDGETS)
-    within(stated.random, "random", 0, 1000)
-    within(stated.figures, "figures", 1, MAX_FIGURES)
+    _one_of(stated.budget, "budget", BUDGETS)
+    _within(stated.random, "random", 0, 1000)
+    _within(stated.figures, "figures", 1, MAX_FIGURES)
     each_once(stated.scenarios, "scenarios")
     each_once(stated.seeds, "seeds")
     for seed in stated.seeds:
-        within(seed, "seeds", 0, MAX_SEED)
+        _within(seed, "seeds", 0, MAX_SEED)
     chosen: BudgetName = "full" if (budget or stated.budget) == "full" else "smoke"
     listed = stated.scenario_file
     own = None if listed is None else _beside(folder, listed, "scenario_file")
@@ -203,10 +203,10 @@ def _limits(stated: dict[str, dict[str, float]]) -> dict[Kind, dict[str, float]]
     found: dict[Kind, dict[str, float]] = {kind: {} for kind in Kind}
     found[Kind.BARE] = {"failed": 0.0}
     for kind, limits in stated.items():
-        one_of(kind, "a key of limits", tuple(Kind))
+        _one_of(kind, "a key of limits", tuple(Kind))
         for name, limit in limits.items():
-            one_of(name, f"a key of limits.{kind}", MEASURES[Kind(kind)])
-            within(limit, f"limits.{kind}.{name}", *RANGES[name])
+            _one_of(name, f"a key of limits.{kind}", MEASURES[Kind(kind)])
+            _within(limit, f"limits.{kind}.{name}", *RANGES[name])
             found[Kind(kind)][name] = limit
     return found
 
@@ -220,12 +220,12 @@ def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict
         raise CheckError(f"change needs reference, a folder beside the plan, and one of {', '.join(RANGES)}")
     found: dict[str, Change] = {}
     for name, table in stated.items():
-        one_of(name, "a key of change", tuple(RANGES))
+        _one_of(name, "a key of change", tuple(RANGES))
         if isinstance(table, str):
             raise CheckError(f"change.{name} is {table!r}, expected {{ absolute = ..., relative = ... }}")
         found[name] = build(Change, table, f"change.{name}")
-        within(found[name].absolute, f"change.{name}.absolute", 0.0, 100.0)
-        within(found[name].relative, f"change.{name}.relative", 0.0, 100.0)
+        _within(found[name].absolute, f"change.{name}.absolute", 0.0, 100.0)
+        _within(found[name].relative, f"change.{name}.relative", 0.0, 100.0)
     return found, _beside(folder, reference, "reference")
 
 
@@ -283,3 +283,13 @@ def _chosen(names: tuple[str, ...], known: tuple[Scenario, ...]) -> tuple[Scenar
         found = [each for each in known if fnmatch.fnmatchcase(each.name, name)] or [find_scenario(name, known)]
         chosen |= {each.name: each for each in found}
     return tuple(chosen.values())
+
+
+def _one_of(value: str, name: str, choices: Iterable[str]) -> None:
+    if value not in choices:
+        raise CheckError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
+
+
+def _within(value: float, name: str, least: float, most: float) -> None:
+    if not least <= value <= most:
+        raise CheckError(f"{name} is {value}, expected {least} to {most}")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import roadproof
 from roadproof.datatypes import Weather
@@ -14,12 +12,10 @@ from roadproof.driving.starts import StartOffset
 from roadproof.errors import CheckError
 from roadproof.gate.plan import BudgetName, CheckPlan, Key
 from roadproof.gate.verdict import Estimate, Kind, Status
-from roadproof.io.files import read_json, write_atomically
-from roadproof.io.records import record
+from roadproof.io.records import RecordFile
 
 FILE = "check.json"
-FORMAT = "roadproof-check-result"
-FORMAT_VERSION = 1
+_AGAIN = "make it again with --accept, from a controller that you trust"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -131,10 +127,10 @@ class CheckResult:
         Raises:
             OutputError: it cannot be written.
         """
-        kind = "predicted" if self.predicted else "closed loop"
-        content: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, "verdict": self.status}
-        text = json.dumps(content | asdict(self), indent=1, ensure_ascii=False)
-        write_atomically(path, lambda part: part.write_text(text + "\n", encoding="utf-8"))
+        _CHECK_FILE.write(path, self, kind="predicted" if self.predicted else "closed loop", verdict=self.status)
+
+
+_CHECK_FILE = RecordFile(kind=CheckResult, name="roadproof-check-result", error=CheckError, remedy=_AGAIN)
 
 
 def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, Case]:
@@ -149,11 +145,9 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
         CheckError: there is none, it is damaged, made by another version, architecture or budget, or has a case that
             the plan leaves out.
     """
-    again = "make it again with --accept, from a controller that you trust"
     if not path.is_file():
         raise CheckError(f"the reference {path} is not there; make it with --accept, from a controller that you trust")
-    content = read_json(path, FORMAT, FORMAT_VERSION, CheckError)
-    stored = record(content, CheckResult, path, CheckError, again)
+    stored = _CHECK_FILE.read(path)
     told = (
         ("roadproof", stored.roadproof, roadproof.__version__),
         ("a controller of architecture", stored.architecture, architecture),
@@ -161,7 +155,7 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
     )
     for what, before, now in told:
         if before != now:
-            raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {again}")
+            raise CheckError(f"the reference {path} was made with {what} {before}, this check has {now}; {_AGAIN}")
     if left_out := [case for case in stored.cases if case.key not in plan.keys]:
-        raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {again}")
+        raise CheckError(f"the reference {path} has {left_out[0]}, which the plan leaves out; put it back, or {_AGAIN}")
     return {case.key: case for case in stored.cases}

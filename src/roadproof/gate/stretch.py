@@ -23,7 +23,7 @@ from roadproof.gate.result import JudgedDrive
 from roadproof.gate.verdict import Kind, Measures, median_95, share_95
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.simulator import RecordedSimulator
-from roadproof.report.words import in_words
+from roadproof.report.formatting import in_words
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Identified, Simulator
