@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from roadproof.attacks import AttackResult, Method, attack, kept_attack
+from roadproof.attacks import AttackResult, Method, kept_attack
 from roadproof.controllers import Controller
 from roadproof.datatypes import Ending, Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
@@ -201,6 +201,7 @@ class Judge:
             seed=self.seed,
             controller_name=self.name,
             device=self.device,
+            film=False,
             on_progress=self.on_progress,
         )
         judged = [self._judged(tested.evaluation, SEARCHED)]
@@ -220,17 +221,14 @@ class Judge:
         steps = method.steps(objective)
         return kept_attack(
             place,
-            lambda checkpoint: attack(
-                recordings,
-                self.controller,
-                space,
-                objective=objective,
-                method=method,
-                seed=self.seed,
-                device=self.device,
-                checkpoint=checkpoint,
-                on_step=lambda step, best: self.on_progress(f"Searching, {kind}", step, steps, f"{best:.2f}"),
-            ),
+            recordings,
+            self.controller,
+            space,
+            objective=objective,
+            method=method,
+            seed=self.seed,
+            device=self.device,
+            on_step=lambda step, best: self.on_progress(f"Searching, {kind}", step, steps, f"{best:.2f}"),
         )
 
     def _driven(self, pattern: Pattern, place: Path, kind: str) -> Judged:
