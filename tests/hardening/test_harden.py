@@ -85,9 +85,9 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     assert run(town, out, on_progress=lambda title, _done, _total, word: told.append(f"{title}: {word}")) == found
     assert told
     assert not any("searching" in each or "learning" in each for each in told)
-    with pytest.raises(TrainingError, match="holds a hardening with another seed"):
+    with pytest.raises(TrainingError, match="holds a hardening with seed 0, now it is 1"):
         run(town, out, seed=1)
-    with pytest.raises(TrainingError, match="holds a hardening with another budget"):
+    with pytest.raises(TrainingError, match="holds a hardening with budget"):
         run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, batch=8)))
 
 

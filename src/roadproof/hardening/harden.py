@@ -24,7 +24,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
@@ -40,7 +39,8 @@ from roadproof.hardening.judgement import Clean, Judge, Judged, Judgement, clean
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
-from roadproof.io.files import read_json, write_atomically, write_tensors
+from roadproof.io.files import read_json, write_atomically, write_json, write_tensors
+from roadproof.io.identity import ANSWERS, require_same, stated
 from roadproof.io.locks import working_in
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.recordings import load_recordings
@@ -237,6 +237,7 @@ def _attacked(run: _Run, number: int, scenario: Scenario) -> StressTest:
         seed=derived_seed(run.seed, number) % _FRESH,
         controller_name=run.name(number),
         device=run.device,
+        film=False,
         on_progress=run.under(title),
     )
 
@@ -345,8 +346,7 @@ def _write(found: Hardened, folder: Path) -> None:
     content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(found)
     if found.judgement is not None:
         content["verdict"] = asdict(found.judgement.verdict())
-    text = json.dumps(content, indent=1) + "\n"
-    write_atomically(folder / "hardening.json", lambda part: part.write_text(text, encoding="utf-8"))
+    write_json(folder / "hardening.json", content)
 
 
 def _claim(run: _Run) -> None:
@@ -354,22 +354,16 @@ def _claim(run: _Run) -> None:
     view = run.simulator.input
     asked = {
         "controller": run.spec,
-        "answers": identity_of(run.teacher, (view.height_px, view.width_px)),
+        ANSWERS: identity_of(run.teacher, (view.height_px, view.width_px)),
         "scenarios": [identity(each) for each in run.scenarios],
         "budget": repr(replace(run.budget, judge=run.budget.attack)),
         "space": repr(run.space),
         "seed": run.seed,
         "training step": f"{run.step.__module__}:{run.step.__qualname__}",
     }
-    asked = cast("dict[str, object]", json.loads(json.dumps(asked, default=str)))
     path = run.folder / "plan.json"
     if path.exists():
-        kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("asked", {})
-        for name, value in asked.items():
-            if kept.get(name) != value:
-                raise TrainingError(
-                    f"{run.folder} holds a hardening with another {name}; give the same again, or choose another folder"
-                )
-        return
-    content = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "asked": asked}, indent=1)
-    write_atomically(path, lambda part: part.write_text(content + "\n", encoding="utf-8"))
+        kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("asked")
+        require_same(run.folder, "a hardening", kept, asked, TrainingError)
+    else:
+        write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "asked": json.loads(stated(asked))})

@@ -201,6 +201,7 @@ class Judge:
             seed=self.seed,
             controller_name=self.name,
             device=self.device,
+            film=False,
             on_progress=self.on_progress,
         )
         judged = [self._judged(tested.evaluation, SEARCHED)]
