@@ -33,7 +33,7 @@ OTHERS: dict[str, dict[str, Any]] = {
         "scenario": NOW["scenario"] | {"goal_m": [1.0, 9.0]}
     },
     r"with scenario\.note None, now it is None": {"scenario": {"name": "left-03", "goal_m": [1.0, 2.0]}},
-    r"with scenario 'left-03', now it is …\{'name'": {"scenario": "left-03"},
+    r"with scenario 'left-03', now it is \{'name'": {"scenario": "left-03"},
     r"with budget …a+select=1, starts=5\)'…, now it is …a+select=2, starts=5\)'…; choose": {
         "budget": "Budget(" + "a" * 200 + "select=1, starts=5)"
     },
