@@ -2,13 +2,13 @@
 
 import numpy as np
 import torch
-from roadproof.drives.drives import Settings, write_drive, write_settings
 
 from paint_shy import PaintShy
 from recorded_drives import CANVAS, drivable_set, track
 from roadproof.coverage import Shape
 from roadproof.datatypes import Ending, VehicleState, Weather
 from roadproof.drives import Drive, Swerve, Trajectories, Window
+from roadproof.drives.folder import Settings, write_drive, write_settings
 from roadproof.driving.episode import Episode
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, save_pattern

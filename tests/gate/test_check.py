@@ -17,9 +17,8 @@ from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import CheckError
 from roadproof.gate.check import architecture_of, run_check
 from roadproof.gate.plan import load_check
-from roadproof.gate.result import FORMAT, FORMAT_VERSION
+from roadproof.gate.result import CHECK_FILE
 from roadproof.gate.verdict import Kind, Status
-from roadproof.io.files import read_json
 from team_folder import PLAN, MagentaShy, magenta_shy, write_team
 
 CHANGE = '[change]\nreference = "reference"\ndeviation_m = { absolute = 0.1, relative = 0.2 }\n'
@@ -204,7 +203,7 @@ def test_a_controller_worse_than_the_reference_fails(accepted, failed, tmp_path)
     ],
 )
 def test_a_reference_of_something_else_is_refused(accepted, tmp_path, what, other, message):
-    stored = read_json(accepted.reference, FORMAT, FORMAT_VERSION, CheckError)
+    stored = CHECK_FILE.content(accepted.reference)
     path = tmp_path / "check.json"
     path.write_text(json.dumps(stored | {what: other}))
     with pytest.raises(CheckError, match=message):

@@ -33,8 +33,10 @@ OTHERS: dict[str, dict[str, Any]] = {
         "scenario": NOW["scenario"] | {"goal_m": [1.0, 9.0]}
     },
     r"with scenario\.note None, now it is None": {"scenario": {"name": "left-03", "goal_m": [1.0, 2.0]}},
-    r"with scenario 'left-03', now it is \{'name'": {"scenario": "left-03"},
-    r"with budget …a+select=1, starts=5\)'…, now it is …a+select=2, starts=5\)'…; choose": {
+    r"with scenario 'left-03', now it is \{'name': 'left-03', 'goal_m': \[1\.0, 2\.0\], 'note': None\}": {
+        "scenario": "left-03"
+    },
+    r"with budget …a+select=1, starts=5\)', now it is …a+select=2, starts=5\)'; choose": {
         "budget": "Budget(" + "a" * 200 + "select=1, starts=5)"
     },
     "out holds a run of another controller, which answers otherwise, as before a training": {ANSWERS: "4567"},

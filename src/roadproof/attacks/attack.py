@@ -147,7 +147,7 @@ def kept_attack(
         "method": stored(method),
         "groups": groups and list(map(str, groups)),
         "seed": seed,
-        "recordings": frames.hexdigest(),
+        "recordings": frames.hexdigest()[:16],
     }
     checkpoint, path = folder / "search.safetensors", folder / "result.json"
     if path.exists():

@@ -89,7 +89,7 @@ class Calibrated:
 
 
 def _parts(drives: Drives, method: Method) -> dict[str, object]:
-    return {"method": str(method), "drives": {drive.name: drive_digest(drive) for drive in drives.drives}}
+    return {"method": str(method), "drives": {drive.name: drive_digest(drive)[:16] for drive in drives.drives}}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

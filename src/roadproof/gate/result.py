@@ -127,10 +127,10 @@ class CheckResult:
         Raises:
             OutputError: it cannot be written.
         """
-        _CHECK_FILE.write(path, self, kind="predicted" if self.predicted else "closed loop", verdict=self.status)
+        CHECK_FILE.write(path, self, kind="predicted" if self.predicted else "closed loop", verdict=self.status)
 
 
-_CHECK_FILE = RecordFile(kind=CheckResult, name="roadproof-check-result", error=CheckError, remedy=_AGAIN)
+CHECK_FILE = RecordFile(kind=CheckResult, name="roadproof-check-result", error=CheckError, remedy=_AGAIN)
 
 
 def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, Case]:
@@ -147,7 +147,7 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
     """
     if not path.is_file():
         raise CheckError(f"the reference {path} is not there; make it with --accept, from a controller that you trust")
-    stored = _CHECK_FILE.read(path)
+    stored = CHECK_FILE.read(path)
     told = (
         ("roadproof", stored.roadproof, roadproof.__version__),
         ("a controller of architecture", stored.architecture, architecture),

@@ -62,8 +62,8 @@ def _first_difference(name: str, before: object, now: object) -> tuple[str, str,
         key = next(key for key in one | other if (key in one, one.get(key)) != (key in other, other.get(key)))
         return _first_difference(f"{name}.{key}", one.get(key), other.get(key))
     texts = [repr(each) for each in cast("list[object]", [before, now])]
-    if max(map(len, texts)) > _MOST_CHARACTERS:
-        same = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
-        first = max(same - _MOST_CHARACTERS // 3, 0)
-        texts = [f"…{text[first : first + _MOST_CHARACTERS]}…" for text in texts]
-    return name, texts[0], texts[1]
+    same = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
+    first = max(same - _MOST_CHARACTERS // 3, 0) if max(map(len, texts)) > _MOST_CHARACTERS else 0
+    last = first + _MOST_CHARACTERS
+    was, is_now = ("…" * (first > 0) + text[first:last] + "…" * (last < len(text)) for text in texts)
+    return name, was, is_now

@@ -148,7 +148,7 @@ def select_by_driving(
         **episodes.made_of,
         "weather": weather,
         "candidates": len(over),
-        "patterns": [episodes.digests[name] for name in paints],
+        "patterns": [episodes.digests[name][:16] for name in paints],
         "drives": [episodes.file(drive) for drive in over],
     }
     if (folder / "selection.json").exists():
