@@ -95,7 +95,7 @@ def sides(tmp_path_factory):
         direct, pattern = run(town, folder / "direct")
     with serving() as (_, port), CarlaSimulator(port=port, camera=CAMERA, input=INPUT) as server:
         served, _ = run(server, folder / "served", pattern)
-        with pytest.raises(RoadproofError, match="whose paint is rendered, here it is inject"):
+        with pytest.raises(RoadproofError, match="with paint 'rendered', now it is 'inject'"):
             run(server, folder / "direct")
     print(json.dumps(figures(direct, served), indent=1))
     return direct, served
