@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from roadproof.attacks import GradOpt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Direction, divergence, parse_groups
 from roadproof.errors import RecordingError
 from roadproof.recordings import Push
@@ -59,3 +60,12 @@ def test_a_group_without_its_drive_is_named():
     only_clean = dataclasses.replace(recording_set(), recordings=recording_set().recordings[:1])
     with pytest.raises(RecordingError, match="needs a right drive, the set has clean"):
         RIGHT_GROUP.select(only_clean)
+
+
+def test_a_method_takes_the_two_sides_where_drives_were_pushed_to_both_and_else_all_drives():
+    import dataclasses
+
+    whole = recording_set()
+    only_clean = dataclasses.replace(whole, recordings=whole.recordings[:1])
+    assert GradOpt().groups(whole) == (RIGHT_GROUP, LEFT_GROUP)
+    assert GradOpt().groups(only_clean) == parse_groups("all", only_clean)

@@ -84,7 +84,7 @@ MISTAKES = {
         ("right_m = 0.05\nturned_rad = 0.004\nfaster_mps = 0.5", "right_m = 0.0\nturned_rad = 0.0\nfaster_mps = 0.0"),
         "starts are all the same",
     ),
-    "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m is 3.0, expected 0.0 to 1.0"),
+    "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m of the starts is 3.0, expected 0 to 1"),
     "seed": (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds is -1, expected 0 to"),
     "seed twice": (("seeds = [0, 1]", "seeds = [1, 1]"), "seeds has 1 twice"),
     "no seed": (("seeds = [0, 1]", "seeds = []"), "seeds is empty"),

@@ -11,7 +11,7 @@ from carla_serving import straight_map
 from roadproof.attacks import GradOpt, RandomSearch
 from roadproof.controllers import ConditionalPilotNet, load_controller
 from roadproof.datatypes import VehicleState, Weather
-from roadproof.drives import Window
+from roadproof.drives import Trajectories, Window
 from roadproof.errors import TrainingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
@@ -24,7 +24,11 @@ from roadproof.search_space import SearchSpace
 needs.town()
 
 SEARCH = dataclasses.replace(
-    ALONE, method=GradOpt(iterations=1, restarts=1, halving=False), starts=0, window=Window(frames=8, least_px=8)
+    ALONE,
+    method=GradOpt(iterations=1, restarts=1, halving=False),
+    starts=0,
+    trajectories=Trajectories(count=1),
+    window=Window(frames=8, least_px=8),
 )
 TINY = HardeningBudget(
     attack=SEARCH,

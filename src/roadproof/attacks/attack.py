@@ -53,8 +53,8 @@ def attack(
         objective: what is made large: `SteeringShift()` by default, as published, or `PathDeviation()`, which drives
             in the recordings and needs their tracks; or one of your own.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
-        groups: drives attacked together. By default, with gradients, the paper's two sides, of which the stronger is
-            kept; without gradients all drives, to whichever side they give way.
+        groups: drives attacked together. By default, with gradients and drives pushed to both sides, the paper's two
+            sides, of which the stronger is kept; else all drives, to whichever side they give way.
         seed: of everything random.
         device: where to search.
         random_patterns: random patterns a group that the self-check compares with; 0 for none.

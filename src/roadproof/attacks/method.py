@@ -8,10 +8,10 @@ from typing import ClassVar, Unpack
 import torch
 
 from roadproof.attacks.gradopt import Running, Search
-from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.attacks.objective import Measure, Objective
 from roadproof.controllers import Controller
-from roadproof.recordings import RecordingSet
+from roadproof.recordings import Push, RecordingSet
 from roadproof.search_space import SearchSpace
 
 
@@ -27,9 +27,12 @@ class Method:
         raise NotImplementedError
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """Drives attacked together, where nothing else is said: by gradient the paper's two sides, each apart."""
-        del recordings
-        return (RIGHT_GROUP, LEFT_GROUP)
+        """Drives attacked together, where nothing else is said.
+
+        By gradient the paper's two sides, each apart, where drives were pushed to both; else all drives.
+        """
+        sides = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in recordings.recordings}
+        return (RIGHT_GROUP, LEFT_GROUP) if sides else parse_groups("all", recordings)
 
     def measure(
         self,

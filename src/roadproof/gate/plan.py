@@ -290,6 +290,6 @@ def _one_of(value: str, name: str, choices: Iterable[str]) -> None:
         raise CheckError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
 
 
-def _within(value: float, name: str, least: float, most: float) -> None:
+def _within(value: int | float, name: str, least: int | float, most: int | float) -> None:
     if not least <= value <= most:
         raise CheckError(f"{name} is {value}, expected {least} to {most}")

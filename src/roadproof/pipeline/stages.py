@@ -25,7 +25,7 @@ from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import Selection, select_by_driving
-from roadproof.recordings import Push, RecordingSet
+from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
@@ -98,10 +98,8 @@ class Stages:
         return done.recordings
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """The method's own groups where drives were pushed to both sides, else all drives pooled."""
-        sides = {Push.LEFT, Push.RIGHT} <= {recording.push for recording in recordings.recordings}
-        whole = self.budget.pooled or not sides
-        return parse_groups("all", recordings) if whole else self.budget.method.groups(recordings)
+        """The method's own groups, or all drives pooled where the budget says so."""
+        return parse_groups("all", recordings) if self.budget.pooled else self.budget.method.groups(recordings)
 
     def attack(self, recordings: RecordingSet) -> AttackResult:
         """The search for patterns."""
