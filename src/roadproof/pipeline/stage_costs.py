@@ -16,6 +16,7 @@ from typing import Any, cast
 from roadproof.errors import RoadproofError
 from roadproof.io.identity import ANSWERS, require_same
 from roadproof.io.records import RecordFile, plain
+from roadproof.simulators.protocol import PaintKind
 
 FILE = "run.json"
 _EVERY_S = 1.0
@@ -36,13 +37,13 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """run.json; at first with an identity as text, the controller's answers and the paint instead of parts."""
+    """run.json; in files of earlier versions an identity as text and the controller's answers stand for its parts."""
 
     cost: dict[str, StageCost]
     made_of: dict[str, Any] = field(default_factory=dict[str, Any])
     identity: str = ""
     controller: str | None = None
-    paint: str = "rendered"
+    paint: str = PaintKind.RENDERED
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -110,7 +111,8 @@ class Ledger:
         self._write()
 
     def _write(self) -> None:
-        _FILE.write(self._path, _Run(self.cost, self._made_of))
+        paint = str(self._made_of.get("paint", PaintKind.RENDERED))
+        _FILE.write(self._path, _Run(self.cost, self._made_of, paint=paint))
 
 
 def read_cost(folder: Path) -> dict[str, StageCost]:
