@@ -1,6 +1,7 @@
 """What every test needs: shapes checked at run time, and the shared development data where it is at hand."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,21 @@ def town():
 
     with TownSimulator() as simulator:
         yield simulator
+
+
+@pytest.fixture
+def invoke(monkeypatch, capsys):
+    """Calls the installed command, `roadproof WORDS`, in this process; gives exit code and output, `out` and `err`."""
+
+    def call(*words):
+        from roadproof.cli import main
+
+        monkeypatch.setattr(sys, "argv", ["roadproof", *map(str, words)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        return stopped.value.code or 0, capsys.readouterr()
+
+    return call
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -11,7 +11,7 @@ from roadproof.attacks.gradopt import Running, Search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
 from roadproof.attacks.objective import Measure, Objective
 from roadproof.controllers import Controller
-from roadproof.recordings import Push, RecordingSet
+from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
 
@@ -31,8 +31,7 @@ class Method:
 
         By gradient the paper's two sides, each apart, where drives were pushed to both; else all drives.
         """
-        sides = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in recordings.recordings}
-        return (RIGHT_GROUP, LEFT_GROUP) if sides else parse_groups("all", recordings)
+        return (RIGHT_GROUP, LEFT_GROUP) if recordings.has_both_sides else parse_groups("all", recordings)
 
     def measure(
         self,

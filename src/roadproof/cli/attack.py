@@ -82,7 +82,7 @@ def attack(
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
     from roadproof.io.locks import hold
-    from roadproof.recordings import Push, load_recordings
+    from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
 
@@ -98,8 +98,7 @@ def attack(
     searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
     hold(out)
     drives = load_recordings(recordings)
-    pushed = {Push.LEFT, Push.RIGHT} <= {drive.push for drive in drives.recordings}
-    driven_in = method != "published" and drives.is_placed and pushed
+    driven_in = method != "published" and drives.is_placed and drives.has_both_sides
     word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):

@@ -239,7 +239,7 @@ def imported(spec: str, expected: str) -> Callable[..., object]:
     """A function of the user's own Python, "module:function"; the current directory is importable.
 
     Args:
-        spec: which.
+        spec: the function's module and name, with a colon between.
         expected: what it should be, in words.
 
     Raises:

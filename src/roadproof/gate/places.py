@@ -23,9 +23,9 @@ class Place:
     """A scenario in the world that it is driven in.
 
     Args:
-        scenario: which.
-        weathers: in which it is driven there.
-        opening: opens the world.
+        scenario: the scenario that is driven.
+        weathers: the weathers in which it is driven there.
+        opening: opens the world; its result is used in a with-block.
         where: the world as `--simulator` names it.
     """
 

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import fnmatch
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
-from roadproof.controllers.loading import runs_code
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, each_once, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
+from roadproof.io.files import read_toml
 from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
-from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
+from roadproof.simulators.loading import SPECS, is_server
 from roadproof.study.plan import StartPlan
-from roadproof.study.reading import build
+from roadproof.study.reading import build, refuse_untrusted
 
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
@@ -38,9 +37,9 @@ class CheckPlan:
     """What one check drives, and what it lets pass; `load_check` reads it.
 
     Args:
-        controller: its spec.
-        scenarios: where.
-        scenario_file: they are from, where that is the user's own.
+        controller: the spec of the controller that is checked.
+        scenarios: the scenarios that it is driven in.
+        scenario_file: the file of these scenarios, where it is the user's own.
         budget: "smoke" in recordings, "full" in a simulator with fresh attacks.
         weathers: of that budget; a fresh attack is found in the first.
         seeds: each has starts, random patterns and a fresh attack of its own.
@@ -135,12 +134,7 @@ def load_check(path: Path, *, budget: str | None = None, trust: bool = False) ->
         CheckError: the file or something that it names is missing, damaged or unknown, a number is out of its range,
             the drives are too few for the limits, or it is not trusted with what it asks for; the message says which.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CheckError(f"cannot read {path}: {error.strerror or error}; check the path") from None
-    except (ValueError, RecursionError) as error:
-        raise CheckError(f"{path} is not valid TOML ({error})") from None
+    content = read_toml(path, CheckError)
     try:
         if content.pop("format", None) != FORMAT:
             raise CheckError(f'expected format = "{FORMAT}"')
@@ -148,7 +142,7 @@ def load_check(path: Path, *, budget: str | None = None, trust: bool = False) ->
             raise CheckError(f"version is {version!r}, expected {FORMAT_VERSION}")
         plan = _plan(build(_Stated, content, "the check"), path.parent, budget)
         if not trust:
-            _check_harmless(plan)
+            refuse_untrusted(plan.controller, plan.simulator if plan.budget == "full" else None)
     except RoadproofError as error:
         raise CheckError(f"{path}: {error}") from None
     return plan
@@ -258,15 +252,6 @@ def _check_drives(plan: CheckPlan) -> None:
                     f"too few drives: {count} a case ({what}) can never show {name}{above} for {kind} with its 95 % "
                     f"interval, expected {least} or more"
                 )
-
-
-def _check_harmless(plan: CheckPlan) -> None:
-    if runs_code(plan.controller):
-        raise CheckError(
-            f"controller {plan.controller!r} runs what its author wrote; look at it, then give --trust (trust=True)"
-        )
-    if plan.budget == "full" and is_elsewhere(plan.simulator):
-        raise CheckError(f"simulator {plan.simulator!r} is another machine; give --trust (trust=True) to call it")
 
 
 def _beside(folder: Path, listed: str, what: str) -> Path:

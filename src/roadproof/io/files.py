@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -218,6 +219,24 @@ def check_format(
         raise error(f"{path} has version {known!r:.40}, expected a whole number from 1")
     if known > version:
         raise error(f"{path} has version {known!r:.40}, this roadproof reads up to {version}; update it")
+
+
+def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
+    """Read a plan of the user's.
+
+    Args:
+        path: the TOML file.
+        error: what is raised.
+
+    Raises:
+        error: the file cannot be read, or is not valid TOML; the message names it.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as reason:
+        raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
+    except (ValueError, RecursionError) as reason:
+        raise error(f"{path} is not valid TOML ({reason})") from None
 
 
 def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:

@@ -201,8 +201,8 @@ def check_arrays(
 
     Args:
         value: the dataclass.
-        names: of the fields.
-        shape: of each.
+        names: names of the fields that are looked at.
+        shape: the shape that each of them must have.
         of: what they belong to, for the message: "of the episode".
         error: what to raise.
 

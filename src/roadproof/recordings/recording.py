@@ -156,6 +156,11 @@ class RecordingSet:
                 )
 
     @property
+    def has_both_sides(self) -> bool:
+        """Whether drives were pushed to the left and to the right."""
+        return {Push.LEFT, Push.RIGHT} <= {recording.push for recording in self.recordings}
+
+    @property
     def is_placed(self) -> bool:
         """Whether the set can be driven in: its canvas and the poses of all drives are known."""
         return self.canvas is not None and all(recording.track is not None for recording in self.recordings)

@@ -18,8 +18,8 @@ def interpolated(
     """Values at one or many arc lengths, held at both ends.
 
     Args:
-        at_m: where.
-        stations_m: arc length of each point, rising.
+        at_m: the arc lengths asked about, in metres.
+        stations_m: arc length of each point in metres, rising.
         values: what belongs to each point, such as its coordinates.
     """
     columns: list[Float[np.ndarray, " n"]] = list(values.T)

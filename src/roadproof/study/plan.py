@@ -7,22 +7,21 @@ import hashlib
 import importlib.util
 import json
 import sys
-import tomllib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from roadproof.controllers.loading import runs_code
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
+from roadproof.io.files import read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
-from roadproof.simulators.loading import SPECS, is_elsewhere, is_server
+from roadproof.simulators.loading import SPECS, is_server
 from roadproof.study.methods import MethodPlan, method_plan
-from roadproof.study.reading import build
+from roadproof.study.reading import build, refuse_untrusted
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -209,28 +208,14 @@ def load_study(path: Path, *, trust: bool = False) -> Study:
         StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or it is not trusted with
             what it asks for; says which.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise StudyError(f"cannot read {path}: {error.strerror or error}; check the path") from None
-    except (ValueError, RecursionError) as error:
-        raise StudyError(f"{path} is not valid TOML ({error})") from None
+    content = read_toml(path, StudyError)
     try:
         study = _study(content, path.parent)
         if not trust:
-            _check_harmless(study)
+            refuse_untrusted(study.controller, study.simulator)
     except StudyError as error:
         raise StudyError(f"{path}: {error}") from None
     return study
-
-
-def _check_harmless(study: Study) -> None:
-    if runs_code(study.controller):
-        raise StudyError(
-            f"controller {study.controller!r} runs what its author wrote; look at it, then give --trust (trust=True)"
-        )
-    if is_elsewhere(study.simulator):
-        raise StudyError(f"simulator {study.simulator!r} is another machine; give --trust (trust=True) to call it")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

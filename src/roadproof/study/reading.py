@@ -10,7 +10,9 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from roadproof.controllers.loading import runs_code
 from roadproof.errors import RoadproofError, StudyError
+from roadproof.simulators.loading import is_elsewhere
 
 T = TypeVar("T")
 
@@ -41,6 +43,24 @@ def build(kind: type[T], values: Mapping[str, Any], what: str) -> T:
         if reason.startswith("Invalid enum value"):
             reason = f"expected one of {', '.join(_choices(get_type_hints(kind)[name]))}"
         raise StudyError(f"{what}: {where} is {values[name]!r:.60}, {reason[0].lower()}{reason[1:]}") from None
+
+
+def refuse_untrusted(controller: str, simulator: str | None) -> None:
+    """See that following a plan of anyone's runs none of their code and calls no other machine.
+
+    Args:
+        controller: the spec of the controller that the plan names.
+        simulator: the spec of its simulator; None where it opens none.
+
+    Raises:
+        StudyError: it would; the message names what, and how to allow it.
+    """
+    if runs_code(controller):
+        raise StudyError(
+            f"controller {controller!r} runs what its author wrote; look at it, then give --trust (trust=True)"
+        )
+    if simulator is not None and is_elsewhere(simulator):
+        raise StudyError(f"simulator {simulator!r} is another machine; give --trust (trust=True) to call it")
 
 
 def _choices(hint: Any) -> tuple[str, ...]:  # noqa: ANN401  # whatever annotates a field
