@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from roadproof.errors import EpisodeError
 
@@ -45,5 +45,5 @@ def mean_95(values: Sequence[float]) -> Mean:
     mean = float(numbers.mean())
     if numbers.size == 1:
         return Mean(mean, None, None, 1)
-    half = float(stats.t.ppf(0.975, numbers.size - 1)) * float(numbers.std(ddof=1)) / math.sqrt(numbers.size)
+    half = float(special.stdtrit(numbers.size - 1, 0.975)) * float(numbers.std(ddof=1)) / math.sqrt(numbers.size)
     return Mean(mean, mean - half, mean + half, numbers.size)
