@@ -5,16 +5,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from jaxtyping import install_import_hook
 
 import needs
+from support import type_checks
 
 # Workers side by side have a core each; torch reads this when it is first imported.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Before any test imports roadproof: every annotated shape and type is checked by beartype.
-install_import_hook("roadproof", "beartype.beartype")
+# Before any test imports roadproof.
+type_checks.install()
 
 DATA = Path(os.environ.get("ROADPROOF_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
