@@ -8,14 +8,14 @@ import pytest
 
 import needs
 from roadproof.study.folder import pandas, read_table
-from short_drive import write_plan
+from support.street_plan import write_plan
 
 PLAN = """
 format = "roadproof-study"
 version = 2
 controller = "pilotnet"
-scenario_file = "short.toml"
-scenarios = ["short"]
+scenario_file = "street.toml"
+scenarios = ["street"]
 figures = ["1-b"]
 starts = { count = 1 }
 method = [{ name = "chance", search = "random", calls = 1 }]
@@ -76,7 +76,7 @@ def test_jobs_that_fail_are_a_line_each(study, plan, tmp_path, monkeypatch):
     plan.write_text(PLAN.replace('"pilotnet"', '"blind_one:Blind"'))
     code, printed = study("run", plan, "--trust", "--out", tmp_path / "out")
     assert code == 1
-    assert "FAILED short, K = 1-b, chance, seed 0: " in printed.out
+    assert "FAILED street, K = 1-b, chance, seed 0: " in printed.out
     assert "sees nothing" in printed.out.split("FAILED")[1]
 
 

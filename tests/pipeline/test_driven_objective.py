@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-import needs
+from paint_shy import along_a_street
 from roadproof.controllers import load_controller
 from roadproof.driving.evaluation import judge
 from roadproof.driving.rollout import rollout
@@ -16,7 +16,6 @@ from roadproof.pipeline.driven_objective import DrivenObjective, effect_of
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from runs import driven
-from short_drive import SHORT
 
 SPACE = SearchSpace(figures=2)
 
@@ -47,26 +46,22 @@ def test_deviation_is_the_one_that_evaluations_report():
 
 
 @pytest.mark.slow
-def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(tmp_path, monkeypatch):
-    needs.town()
-    from roadproof.simulators.town.simulator import TownSimulator
-
-    controller = load_controller("pilotnet")
+def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, tmp_path, monkeypatch):
+    street, controller = along_a_street(tmp_path), load_controller("pilotnet")
     unit = SPACE.random((1,), torch.Generator().manual_seed(1))
     calls = []
-    with TownSimulator() as town:
-        reset = town.reset
-        monkeypatch.setattr(town, "reset", lambda *args, **options: calls.append(1) or reset(*args, **options))
-        kept = {"keep": tmp_path / "driven.json"}
-        steering = DrivenObjective(town, controller, SHORT, SPACE, **kept)(unit)
-        assert len(calls) == 2
-        deviation = DrivenObjective(town, controller, SHORT, SPACE, measure="deviation", **kept)(unit)
-        assert len(calls) == 3  # the clean one again
-        damaged = {"format": "roadproof-driven", "version": 1, "drives": [["a", "b"]]}
-        (tmp_path / "damaged.json").write_text(json.dumps(damaged))
-        with pytest.raises(RoadproofError, match="incomplete or damaged"):
-            DrivenObjective(town, controller, SHORT, SPACE, keep=tmp_path / "damaged.json")
-        clean = rollout(town, controller, SHORT)
-        whole = effect_of(clean, rollout(town, controller, SHORT, pattern=SPACE.pattern(unit[0])), SHORT.canvas)
+    reset = town.reset
+    monkeypatch.setattr(town, "reset", lambda *args, **options: calls.append(1) or reset(*args, **options))
+    kept = {"keep": tmp_path / "driven.json"}
+    steering = DrivenObjective(town, controller, street, SPACE, **kept)(unit)
+    assert len(calls) == 2
+    deviation = DrivenObjective(town, controller, street, SPACE, measure="deviation", **kept)(unit)
+    assert len(calls) == 3  # the clean one again
+    damaged = {"format": "roadproof-driven", "version": 1, "drives": [["a", "b"]]}
+    (tmp_path / "damaged.json").write_text(json.dumps(damaged))
+    with pytest.raises(RoadproofError, match="incomplete or damaged"):
+        DrivenObjective(town, controller, street, SPACE, keep=tmp_path / "damaged.json")
+    clean = rollout(town, controller, street)
+    whole = effect_of(clean, rollout(town, controller, street, pattern=SPACE.pattern(unit[0])), street.canvas)
     assert (float(steering), float(deviation)) == (whole.steering, whole.deviation)
     assert whole.steering > 0.01

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import needs
-from short_drive import SHORT
+from paint_shy import along_a_street
 
 needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
@@ -23,11 +23,12 @@ PATTERN = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0,
 
 def stops_for_good(_):
     """Drives over the canvas, and then stands until its time is up."""
-    return lambda seen: Control(steer=0.0, throttle=0.6) if seen.time_s < 2.0 else Control(steer=0.0, brake=1.0)
+    return lambda seen: Control(steer=0.0, throttle=0.6) if seen.time_s < 1.0 else Control(steer=0.0, brake=1.0)
 
 
 def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town, tmp_path):
-    scenario = dataclasses.replace(SHORT, time_limit_s=8.0)
+    street = along_a_street(tmp_path, 7.0)
+    scenario = dataclasses.replace(street, start=dataclasses.replace(street.start, x_m=24.0))
     done = evaluate(
         town, stops_for_good, scenario, PATTERN, folder=tmp_path, weathers=(Weather.CLEAR_NOON,), starts=0, runs=0
     )
@@ -39,5 +40,5 @@ def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town
     assert stood_at + EVENT_SHOWN_S / drive.dt_s <= frames <= stood_at + EVENT_SHOWN_S / drive.dt_s + 3
     assert frames < len(drive) - 20
     assert last_event(drive, frames - 2, frames) == ("", False)
-    assert last_event(drive, frames - 1, frames) == ("stands: time limit after 8 s", False)
+    assert last_event(drive, frames - 1, frames) == ("stands: time limit after 7 s", False)
     assert last_event(drive, len(drive) - 1, len(drive)) == ("time limit", False)

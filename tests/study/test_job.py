@@ -17,17 +17,18 @@ from PIL import Image
 from safetensors.torch import load_file
 
 import needs
+from paint_shy import along_a_street
 from roadproof.attacks import CMAES, AttackResult, GradOpt, PathDeviation, Published, SteeringShift, proposals
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.patterns import load_pattern
 from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING
+from roadproof.scenarios import find_scenario
 from roadproof.study.job import run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
 from roadproof.study.plan import Job, StartPlan, TrafficPlan
 from roadproof.study.rows import CostColumns, DriveColumns, JobColumns
-from short_drive import SHORT
 
 COSTS = ("search_seconds", "seconds")
 GRADOPT = GradOptPlan(
@@ -42,13 +43,14 @@ GRADOPT = GradOptPlan(
 )
 BO = BlackBoxPlan(name="BO", search="published-bo", calls=3, random_calls=2, objective="steering")
 CHANCE = BlackBoxPlan(name="chance", search="random", calls=4, objective="deviation")
+ANY = find_scenario("left-01")
 
 
-def job_of(method, figures=1, **changes):
+def job_of(method, scenario=ANY, **changes):
     job = Job(
         controller="pilotnet",
-        scenario=SHORT,
-        figures=figures,
+        scenario=scenario,
+        figures=1,
         method=method,
         seed=0,
         weathers=(Weather.CLEAR_NOON,),
@@ -62,16 +64,17 @@ def timeless(rows):
     return [{name: value for name, value in row.items() if name not in COSTS} for row in rows]
 
 
-@pytest.fixture
-def _town():
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    """A scenario that is driven in a second, on a street that is built in one."""
     needs.town()
+    return along_a_street(tmp_path_factory.mktemp("street"))
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_town")
-def test_gradopt_finds_and_is_judged_in_every_condition(tmp_path):
+def test_gradopt_finds_and_is_judged_in_every_condition(street, tmp_path):
     traffic = TrafficPlan(cars=1, pedestrians=1, runs=1, weathers="first")
-    job = job_of(GRADOPT, traffic=traffic, weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON))
+    job = job_of(GRADOPT, street, traffic=traffic, weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON))
     result = run_job(job, tmp_path)
     assert [(row["weather"], row["traffic"]) for row in result.rows] == [
         ("clear-noon", False),
@@ -111,11 +114,10 @@ def check_files(result, figures, weathers=("clear-noon",)):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_town")
-def test_the_published_baseline_is_driven_and_judged(tmp_path, monkeypatch):
+def test_the_published_baseline_is_driven_and_judged(street, tmp_path, monkeypatch):
     pytest.importorskip("bayes_opt", reason="bayesian-optimization is not installed")
     monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"n_random": 100, "n_smart": 1})
-    result = run_job(job_of(BO), tmp_path)
+    result = run_job(job_of(BO, street), tmp_path)
     (row,) = result.rows
     assert (row["search_calls"], row["evaluation_calls"]) == (4, 2)
     history = json.loads(result.files["history.json"])
@@ -126,13 +128,12 @@ def test_the_published_baseline_is_driven_and_judged(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_town")
-def test_a_black_box_search_may_begin_with_what_gradients_found(tmp_path, monkeypatch):
+def test_a_black_box_search_may_begin_with_what_gradients_found(street, tmp_path, monkeypatch):
     hybrid = BlackBoxPlan(name="hybrid", search="random", start=1, calls=2)
     little = GradOpt(iterations=2, restarts=1, halving=False)
     small = dataclasses.replace(STEERING, method=little, trajectories=Trajectories(count=1), window=Window(frames=4))
     monkeypatch.setattr("roadproof.study.job.STEERING", small)
-    result = run_job(job_of(hybrid), tmp_path)
+    result = run_job(job_of(hybrid, street), tmp_path)
     (row,) = result.rows
     # One drive recorded and two to calibrate; then a clean one and two over patterns.
     assert row["search_calls"] == 6
@@ -147,9 +148,8 @@ def test_a_black_box_search_may_begin_with_what_gradients_found(tmp_path, monkey
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_town")
-def test_black_box_search_killed_in_a_job_goes_on_with_the_next_call(tmp_path):
-    job = job_of(CHANCE, figures="1-b")
+def test_black_box_search_killed_in_a_job_goes_on_with_the_next_call(street, tmp_path):
+    job = job_of(CHANCE, street, figures="1-b")
     straight = run_job(job, tmp_path / "straight")
     done = killed_within(job, tmp_path / "killed", calls=2)
     resumed = run_job(job, tmp_path / "killed")

@@ -14,11 +14,17 @@ from roadproof.study.folder import read_table
 from roadproof.study.job import run_job
 from roadproof.study.plan import load_study
 from roadproof.study.run import run_study
-from short_drive import write_plan
 from study_work import counts, dies_for_two_figures, fails_for_bo, tells_threads
+from support.street_plan import write_plan
 
 
-def test_every_job_gives_its_rows(small_study, tmp_path):
+@pytest.fixture
+def two_jobs(small_study):
+    """One method; each job is a process, which starts slowly."""
+    return dataclasses.replace(small_study, methods=small_study.methods[:1])
+
+
+def test_every_job_gives_its_rows_and_what_is_done_is_not_done_again(small_study, tmp_path):
     told = []
     frame = run_study(small_study, tmp_path, counts, workers=2, on_job=lambda done, job, _: told.append((done, job)))
     assert [done for done, _ in told] == list(range(1, 5))
@@ -27,71 +33,56 @@ def test_every_job_gives_its_rows(small_study, tmp_path):
     assert frame["error"].isna().all()
     assert read_table(tmp_path).equals(frame)
     assert all((tmp_path / "jobs" / job.key / "pattern.json").read_bytes() == b"{}" for job in small_study.jobs)
-
-
-def test_what_is_done_is_not_done_again(small_study, tmp_path):
-    first = run_study(small_study, tmp_path, counts)
     lost = small_study.jobs[3]
     (tmp_path / "jobs" / lost.key / "rows.json").unlink()
-    assert run_study(small_study, tmp_path, counts).equals(first)
+    assert run_study(small_study, tmp_path, counts).equals(frame)
     runs = {job.key: (tmp_path / "work" / job.key / "runs").read_text().count("run") for job in small_study.jobs}
     assert runs.pop(lost.key) == 2
     assert set(runs.values()) == {1}
 
 
 def test_a_job_that_fails_is_a_row_that_says_why_and_is_tried_again(small_study, tmp_path):
-    frame = run_study(small_study, tmp_path, fails_for_bo, workers=2)
+    study = dataclasses.replace(small_study, figures=("1-b",))
+    frame = run_study(study, tmp_path, fails_for_bo, workers=2)
     bad = frame[frame["error"].notna()]
     assert set(bad["method"]) == {"BO"}
     assert set(bad["error"]) == {"ValueError: no luck"}
-    assert len(frame) == 2 + 4
-    again = run_study(small_study, tmp_path, counts, workers=2)
-    assert len(again) == 8
+    assert len(frame) == 1 + 2
+    again = run_study(study, tmp_path, counts, workers=2)
+    assert len(again) == 4
     assert again["error"].isna().all()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_job_has_one_thread_however_many_are_done_at_once(small_study, tmp_path, monkeypatch, workers):
+def test_a_job_has_one_thread_however_many_are_done_at_once(two_jobs, tmp_path, monkeypatch, workers):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    study = dataclasses.replace(small_study, figures=("1-b",), methods=small_study.methods[:1])
+    study = dataclasses.replace(two_jobs, figures=("1-b",))
     assert set(run_study(study, tmp_path, tells_threads, workers=workers)["points"]) == {1}
 
 
-def test_a_process_that_dies_takes_its_job_and_no_other(small_study, tmp_path):
-    frame = run_study(small_study, tmp_path, dies_for_two_figures, workers=2)
+def test_a_process_that_dies_takes_its_job_and_no_other(two_jobs, tmp_path):
+    frame = run_study(two_jobs, tmp_path, dies_for_two_figures, workers=2)
     bad = frame[frame["error"].notna()]
     assert set(bad["figures"]) == {"2"}
     assert "its process died" in bad["error"].iloc[0]
-    assert len(frame) == 2 + 4
-    assert len(run_study(small_study, tmp_path, dies_for_two_figures)) == 8
+    assert len(frame) == 1 + 2
+    assert len(run_study(two_jobs, tmp_path, dies_for_two_figures)) == 4
 
 
-PLAN = """
+COUNTED = """
 format = "roadproof-study"
 version = 2
 controller = "cil"
 scenarios = ["left-01"]
 figures = [1, 2]
-method = [{ name = "GradOpt", search = "gradopt" }, { name = "BO", search = "published-bo" }]
+method = [{ name = "GradOpt", search = "gradopt" }]
 """
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("work", [counts, dies_for_two_figures])
-def test_a_cluster_gives_the_same_rows_also_when_a_worker_dies(work, tmp_path):
-    pytest.importorskip("ray", reason="ray is not installed")
-    there = on_two_workers(PLAN, work, tmp_path)
-    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", counts)
-    # A worker that died costs its job one more try, and nobody else anything.
-    assert there.equals(here)
-
-
 DRIVEN = """
 format = "roadproof-study"
 version = 2
 controller = "pilotnet"
-scenario_file = "short.toml"
-scenarios = ["short"]
+scenario_file = "street.toml"
+scenarios = ["street"]
 figures = [1]
 starts = { count = 1 }
 
@@ -113,44 +104,54 @@ calls = 2
 """
 
 
-@pytest.mark.slow
-def test_a_cluster_finds_and_drives_as_this_machine_does(tmp_path):
+@pytest.fixture(scope="module")
+def on_a_cluster(tmp_path_factory):
+    """Folders of both studies, done on one Ray cluster of this machine; in the first a worker dies."""
     pytest.importorskip("ray", reason="ray is not installed")
     needs.town()
-    there = on_two_workers(DRIVEN, run_job, tmp_path)
-    here = run_study(load_study(tmp_path / "plan.toml"), tmp_path / "here", run_job)
+    folder = tmp_path_factory.mktemp("cluster")
+    done = {dies_for_two_figures: folder / "counted", run_job: folder / "driven"}
+    for place, plan in zip(done.values(), (COUNTED, DRIVEN), strict=True):
+        place.mkdir()
+        write_plan(place, plan)
+    (folder / "node").mkdir()
+    words = [f"{place}:{work.__name__}" for work, place in done.items()]
+    script = Path(__file__).parents[1] / "study_on_ray.py"
+    # By default Ray's workers let all others go first, so that beside other tests they hardly get to work.
+    fair = os.environ | {"RAY_raylet_start_wait_time_s": "240", "RAY_worker_niceness": "0"}
+    command = [sys.executable, str(script), str(folder / "node"), *words]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=600, env=fair)
+    assert ran.returncode == 0, ran.stderr
+    return done
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_rows_also_when_a_worker_dies(on_a_cluster, tmp_path):
+    place = on_a_cluster[dies_for_two_figures]
+    here = run_study(load_study(place / "plan.toml"), tmp_path, counts)
+    # A worker that died costs its job one more try, and nobody else anything.
+    assert read_table(place / "there").equals(here)
+
+
+@pytest.mark.slow
+def test_a_cluster_finds_and_drives_as_this_machine_does(on_a_cluster, tmp_path):
+    place = on_a_cluster[run_job]
+    here = run_study(load_study(place / "plan.toml"), tmp_path, run_job)
     assert here["error"].isna().all()
     assert (here["deviation_m"] > 0).all()
     # The same jobs two at once and one by one: the same rows but for the time they took.
     time = ["search_seconds", "seconds"]
-    assert there.drop(columns=time).equals(here.drop(columns=time))
+    assert read_table(place / "there").drop(columns=time).equals(here.drop(columns=time))
 
 
-def on_two_workers(plan, work, folder):
-    """The rows of a study on a Ray cluster of this machine."""
-    write_plan(folder, plan)
-    (folder / "node").mkdir()
-    script = Path(__file__).parents[1] / "study_on_ray.py"
-    arguments = [sys.executable, script, folder / "plan.toml", folder / "there", folder / "node", work.__name__]
-    # By default Ray's workers let all others go first, so that beside other tests they hardly get to work.
-    fair = os.environ | {"RAY_raylet_start_wait_time_s": "240", "RAY_worker_niceness": "0"}
-    ran = subprocess.run(list(map(str, arguments)), capture_output=True, text=True, timeout=600, env=fair)
-    assert ran.returncode == 0, ran.stderr
-    return read_table(folder / "there")
+def test_less_than_one_worker_is_refused(small_study, tmp_path):
+    with pytest.raises(StudyError, match="workers is 0"):
+        run_study(small_study, tmp_path, counts, workers=0)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"workers": 0}, "workers is 0")],
-)
-def test_arguments_that_make_no_sense_are_named(small_study, tmp_path, options, message):
-    with pytest.raises(StudyError, match=message):
-        run_study(small_study, tmp_path, counts, **options)
-
-
-@pytest.mark.parametrize("options", [{"workers": 2}, {"cluster": "local"}])
-def test_one_server_is_not_asked_for_two_jobs_at_once(small_study, tmp_path, options):
-    study = dataclasses.replace(small_study, simulator="carla://localhost")
-    with pytest.raises(StudyError, match="use one worker and no cluster"):
-        run_study(study, tmp_path, counts, **options)
+def test_one_server_is_not_asked_for_two_jobs_at_once(two_jobs, tmp_path):
+    study = dataclasses.replace(two_jobs, simulator="carla://localhost")
+    for options in ({"workers": 2}, {"cluster": "local"}):
+        with pytest.raises(StudyError, match="use one worker and no cluster"):
+            run_study(study, tmp_path, counts, **options)
     assert run_study(study, tmp_path, counts)["error"].isna().all()
