@@ -17,6 +17,9 @@ from roadproof.scenarios import Scenario
 START_S = 300.0
 CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 INPUT = CropResize(left_px=0, top_px=46, right_px=320, bottom_px=204, width_px=160, height_px=79)
+# Half of the published camera, and of what is cut from it: the controller's frame is as large as ever.
+HALF = CameraModel(width_px=400, height_px=300, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
+HALF_INPUT = CropResize(left_px=0, top_px=57, right_px=400, bottom_px=255, width_px=200, height_px=88)
 SMALL = CameraModel(width_px=80, height_px=60, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 SMALL_INPUT = CropResize(left_px=0, top_px=12, right_px=80, bottom_px=51, width_px=80, height_px=39)
 STREET = Scenario(

@@ -15,10 +15,11 @@ PLAIN = ColourTransform(AffineResponse(torch.eye(3), torch.zeros(3)))
 BEFORE_M = 36.0
 
 
-def track(right_m=0.0, steps=140):
-    """Straight towards the canvas with a little swing, so much beside its middle, at about 6 m/s."""
+def track(right_m=0.0, steps=140, speed_mps=6.0):
+    """Straight towards the canvas with a little swing, so much beside its middle, at about that speed."""
     yaw, c, s = CANVAS.yaw_rad, np.cos(CANVAS.yaw_rad), np.sin(CANVAS.yaw_rad)
-    numbers = (CANVAS.x_m - BEFORE_M * c + right_m * s, CANVAS.y_m - BEFORE_M * s - right_m * c, yaw, 6.0, 0.0, 0.0)
+    x_m, y_m = CANVAS.x_m - BEFORE_M * c + right_m * s, CANVAS.y_m - BEFORE_M * s - right_m * c
+    numbers = (x_m, y_m, yaw, speed_mps, 0.0, 0.0)
     car = Motion(*(torch.tensor([value], dtype=torch.float64) for value in numbers))
     rows = []
     for step in range(steps):
@@ -30,8 +31,8 @@ def track(right_m=0.0, steps=140):
                  throttle=throttle, brake=brake)  # fmt: skip
 
 
-def drive(push, right_m=0.0, seed=0):
-    driven = track(right_m)
+def drive(push, right_m=0.0, seed=0, speed_mps=6.0):
+    driven = track(right_m, speed_mps=speed_mps)
     ahead = (CANVAS.x_m - driven.x_m) * np.cos(CANVAS.yaw_rad) + (CANVAS.y_m - driven.y_m) * np.sin(CANVAS.yaw_rad)
     # From 29 to 6 m before the canvas' middle, every second step.
     numbers = np.flatnonzero((ahead < 29.0) & (ahead > 6.0))[::2]
@@ -49,8 +50,9 @@ def drive(push, right_m=0.0, seed=0):
     )
 
 
-def drivable_set(**changes):
-    drives = (drive(Push.CLEAN), drive(Push.RIGHT, 1.0, seed=1), drive(Push.LEFT, -1.0, seed=2))
+def drivable_set(speed_mps=6.0, **changes):
+    sides = ((Push.CLEAN, 0.0), (Push.RIGHT, 1.0), (Push.LEFT, -1.0))
+    drives = tuple(drive(push, right_m, seed, speed_mps) for seed, (push, right_m) in enumerate(sides))
     given = {"camera": CIL_CAMERA, "view": CIL_INPUT, "colour": PLAIN, "recordings": drives, "canvas": CANVAS}
     return RecordingSet(**given | {"origin": "test-road, clear-noon, driven by nobody"} | changes)
 

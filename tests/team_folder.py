@@ -15,6 +15,7 @@ from roadproof.patterns import Pattern, save_pattern
 from roadproof.recordings import Push, save_recordings
 from roadproof.scenarios import Scenario, save_scenarios
 
+SPEED_MPS = 12.0
 BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
 GREEN = Pattern(BAR.shapes, BAR.boxes, torch.tensor([[0.0, 0.5, 0.0]]))
 
@@ -55,12 +56,12 @@ def magenta_shy():
 
 
 def scenario():
-    driven = track()
+    driven = track(speed_mps=SPEED_MPS)
     begin = driven.state(0)
-    start = VehicleState(begin.x_m, begin.y_m, 0.0, begin.yaw_rad, 6.0)
+    start = VehicleState(begin.x_m, begin.y_m, 0.0, begin.yaw_rad, SPEED_MPS)
     goal_m = (CANVAS.x_m + 20.0 * np.cos(CANVAS.yaw_rad), CANVAS.y_m + 20.0 * np.sin(CANVAS.yaw_rad))
     return Scenario(name="test-road", kind="straight", map_name="town", start=start, goal_m=goal_m, canvas=CANVAS,
-                    time_limit_s=6.0)  # fmt: skip
+                    time_limit_s=3.0)  # fmt: skip
 
 
 def write_team(folder, *, plan=PLAN, patterns=(("magenta", BAR), ("green", GREEN))):
@@ -82,7 +83,7 @@ def write_recorded(run):
     )  # fmt: skip
     write_settings(settings, run / "record")
     for name, right_m in (("clean", 0.0), ("right", 1.0), ("left", -1.0)):
-        driven = track(right_m)
+        driven = track(right_m, speed_mps=SPEED_MPS)
         steps = len(driven.x_m)
         episode = Episode(
             scenario="test-road", weather=Weather.CLEAR_NOON, painted=False, cars=0, pedestrians=0, seed=0, dt_s=0.05,
@@ -96,4 +97,4 @@ def write_recorded(run):
                   steer=np.zeros(2), right_m=np.full(2, right_m)),
             run / "record",
         )  # fmt: skip
-    save_recordings(drivable_set(), run / "recordings")
+    save_recordings(drivable_set(SPEED_MPS), run / "recordings")

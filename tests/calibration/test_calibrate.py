@@ -1,13 +1,13 @@
 """Calibrating short real drives in the town, against the homographies the town itself states."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 import torch
 
 import needs
+from paint_shy import along_a_street
 from roadproof.calibration import Calibrated, CalibrationReport, Method, calibrate, replays_needed
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
@@ -16,19 +16,21 @@ from roadproof.driving.rollout import replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import load_recordings, save_recordings
-from roadproof.scenarios import find_scenario
 from roadproof.training.expert import expert
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
-SCENE = find_scenario("straight-04")
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return along_a_street(tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture(scope="module")
-def drives(town):
+def drives(town, scene):
     asked = Trajectories(perturbation=Swerve((0.5,)))
-    return record(town, expert, SCENE, trajectories=asked, window=Window(frames=8))
+    return record(town, expert, scene, trajectories=asked, window=Window(frames=8))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,7 @@ def test_two_paints_find_the_canvas_within_half_a_pixel_for_nine_calls(two_paint
         assert drive.residual_px.mean < 1.0
 
 
-def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, drives):
+def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, scene, drives):
     pattern = Pattern(
         (Shape.RECTANGLE,), torch.tensor([[180.0, 200.0, 120.0, 320.0, 20.0]]), torch.tensor([[0.8, 0.3, 0.1]])
     )
@@ -58,7 +60,7 @@ def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, drive
     clean = recordings.recordings[0]
     painted = []
     rollout(
-        town, replay(drives.drives[0].episode), SCENE, pattern=raster(pattern),
+        town, replay(drives.drives[0].episode), scene, pattern=raster(pattern),
         on_step=lambda seen, _: painted.append(seen.frame),
     )  # fmt: skip
     truth = np.stack([painted[k] for k in clean.frame_number]).astype(float)
@@ -71,13 +73,10 @@ def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, drive
 
 
 @pytest.mark.slow
-def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(town, drives):
+def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(town, scene, drives):
     assert drives.calls + replays_needed(drives, Method.PUBLISHED) == 61
     # Full pictures take long: one drive only, which begins 13 m before the middle of the canvas.
-    start, canvas = SCENE.start, SCENE.canvas
-    ahead_m = math.dist((start.x_m, start.y_m), (canvas.x_m, canvas.y_m)) - 13.0
-    x_m, y_m = (at + ahead_m * way(start.yaw_rad) for at, way in ((start.x_m, math.cos), (start.y_m, math.sin)))
-    near = dataclasses.replace(SCENE, start=dataclasses.replace(start, x_m=x_m, y_m=y_m, speed_mps=6.0))
+    near = dataclasses.replace(scene, start=dataclasses.replace(scene.start, x_m=scene.canvas.x_m - 13.0))
     one = record(town, expert, near, trajectories=Trajectories(count=1), window=Window(frames=3))
     found = calibrate(town, one, Method.PUBLISHED)
     assert found.report.calls == 1 + 12 + 22
@@ -157,12 +156,12 @@ def test_another_camera_is_refused(drives):
         calibrate(TownSimulator(dt_s=0.1), drives)
 
 
-def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, drives, monkeypatch):
+def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, scene, drives, monkeypatch):
     """As if the simulator painted elsewhere: its outline misses the poses by metres."""
-    canvas = dataclasses.replace(SCENE.canvas, x_m=SCENE.canvas.x_m + 1.5, y_m=SCENE.canvas.y_m + 1.0)
-    scenario = dataclasses.replace(SCENE, canvas=canvas)
+    canvas = dataclasses.replace(scene.canvas, x_m=scene.canvas.x_m + 1.5, y_m=scene.canvas.y_m + 1.0)
+    scenario = dataclasses.replace(scene, canvas=canvas)
     monkeypatch.setattr(
-        "roadproof.calibration.replays.rollout", lambda sim, who, _, **how: rollout(sim, who, SCENE, **how)
+        "roadproof.calibration.replays.rollout", lambda sim, who, _, **how: rollout(sim, who, scene, **how)
     )
     moved = dataclasses.replace(drives, settings=dataclasses.replace(drives.settings, scenario=scenario))
     with pytest.raises(CalibrationError, match=r"miss what was seen by .* px on average"):

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 import needs
-from carla_serving import free_port, serving, straight_map
+from carla_serving import HALF, HALF_INPUT, free_port, serving, straight_map
 from roadproof.datatypes import VehicleState
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
@@ -65,7 +65,8 @@ def test_record_calibrate_attack_evaluate_drive_and_report(call, tmp_path, impat
     with serving("--map", straight_map(tmp_path)) as (_, port), monkeypatch.context() as patient:
         from roadproof.simulators.carla.simulator import CarlaSimulator
 
-        patient.setitem(inspect.unwrap(CarlaSimulator.__init__).__kwdefaults__, "patience_s", 20.0)
+        for name, value in {"patience_s": 20.0, "camera": HALF, "input": HALF_INPUT}.items():
+            patient.setitem(inspect.unwrap(CarlaSimulator.__init__).__kwdefaults__, name, value)
         there = ["--simulator", f"carla://127.0.0.1:{port}"]
         alone = ["--trajectories", "1", "--frames", "3", "--out", "runs"]
         call("record", "street", *OWN, *SHY, *alone, *there)

@@ -10,7 +10,7 @@ import torch
 
 import bad_drivers
 import needs
-from paint_shy import PaintShy, just_before_the_canvas
+from paint_shy import PaintShy, along_a_street
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage
@@ -23,24 +23,29 @@ from roadproof.driving.rollout import rollout
 from roadproof.driving.starts import StartRange
 from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
+from roadproof.scenarios import identity
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
-SHORT = just_before_the_canvas(2.5)
 MAGENTA = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON)
 CONDITIONS = {"weathers": WEATHERS, "starts": 0, "runs": 2, "cars": 2, "pedestrians": 2, "seed": 3}
 
 
 @pytest.fixture(scope="module")
-def done(town, tmp_path_factory):
+def street(tmp_path_factory):
+    return along_a_street(tmp_path_factory.mktemp("street"), 2.5)
+
+
+@pytest.fixture(scope="module")
+def done(town, street, tmp_path_factory):
     folder = tmp_path_factory.mktemp("evaluation")
     told = []
     evaluation = evaluate(
         town,
         PaintShy(),
-        SHORT,
+        street,
         MAGENTA,
         folder=folder,
         baseline=random_patterns(MAGENTA, 1, seed=1),
@@ -65,14 +70,14 @@ def test_every_condition_is_driven_bare_and_over_every_pattern(done):
     assert told == [(k, 18) for k in range(19)]
 
 
-def test_trials_are_the_metrics_of_their_two_episodes(done):
+def test_trials_are_the_metrics_of_their_two_episodes(done, street):
     folder, evaluation, _ = done
     for trial in evaluation.trials:
         clean, painted = load_episodes(folder, (trial.clean, trial.painted))
         assert (clean.painted, painted.painted) == (False, True)
         assert (clean.weather, clean.cars, clean.seed) == (painted.weather, painted.cars, painted.seed)
         assert (clean.weather, clean.cars > 0, clean.seed) == (trial.weather, trial.traffic, trial.seed)
-        seen = passage(path_of(clean), SHORT.canvas)
+        seen = passage(path_of(clean), street.canvas)
         assert trial.deviation_m == deviation_m(path_of(clean)[seen], path_of(painted)[seen])
         assert abs(trial.lateral_m) == np.abs(lateral_m(path_of(clean), path_of(painted))).max()
         assert (trial.points, trial.clean_points) == (
@@ -88,12 +93,12 @@ def test_the_paint_moves_the_car_to_where_the_driver_flees(done):
         assert trial.deviation_m > 0.01
 
 
-def test_an_episode_is_the_plain_rollout_of_its_conditions(done, town):
+def test_an_episode_is_the_plain_rollout_of_its_conditions(done, town, street):
     folder, evaluation, _ = done
     trial = evaluation.of("attack", traffic=True, weather=Weather.CLOUDY_NOON)[1]
     (kept,) = load_episodes(folder, [trial.painted])
     again = rollout(
-        town, PaintShy(), SHORT, weather=Weather.CLOUDY_NOON, pattern=MAGENTA, cars=2, pedestrians=2, seed=4
+        town, PaintShy(), street, weather=Weather.CLOUDY_NOON, pattern=MAGENTA, cars=2, pedestrians=2, seed=4
     )
     assert all(np.array_equal(getattr(kept, f.name), getattr(again, f.name)) for f in dataclasses.fields(Episode))
 
@@ -116,9 +121,12 @@ def test_rows_average_the_trials_and_lose_none(done):
         assert (row.deviation_m.high is None) == single, "weathers are no sample"
 
 
-def test_what_is_saved_is_what_is_loaded(done):
+def test_what_is_saved_is_what_is_loaded(done, street):
     folder, evaluation, _ = done
-    assert Evaluation.load(folder) == evaluation
+    loaded = Evaluation.load(folder)
+    # The map of its own lies beside it.
+    assert identity(loaded.scenario) == identity(street)
+    assert dataclasses.replace(loaded, scenario=street) == evaluation
     assert np.array_equal(load_paint(folder), raster(MAGENTA))
     content = json.loads((folder / "evaluation.json").read_text())
     assert content["kind"] == "closed loop"
@@ -126,25 +134,25 @@ def test_what_is_saved_is_what_is_loaded(done):
     assert len(content["rows"]) == 12
 
 
-def test_a_second_call_drives_nothing_and_a_lost_drive_alone_is_made_again(done, town):
+def test_a_second_call_drives_nothing_and_a_lost_drive_alone_is_made_again(done, town, street):
     folder, evaluation, _ = done
     stamps = {path.name: path.stat().st_mtime_ns for path in (folder / "episodes").iterdir()}
     lost = evaluation.trials[-1].painted
     (folder / "episodes" / lost).unlink()
     again = evaluate(
-        town, PaintShy(), SHORT, MAGENTA, folder=folder, baseline=random_patterns(MAGENTA, 1, seed=1), **CONDITIONS
+        town, PaintShy(), street, MAGENTA, folder=folder, baseline=random_patterns(MAGENTA, 1, seed=1), **CONDITIONS
     )
     assert again.trials == evaluation.trials
     now = {path.name: path.stat().st_mtime_ns for path in (folder / "episodes").iterdir()}
     assert {name for name in now if now[name] != stamps[name]} == {lost}
 
 
-def test_other_inputs_are_other_drives(done, town):
+def test_other_inputs_are_other_drives(done, town, street):
     folder = done[0]
     one = {"weathers": WEATHERS[:1], "starts": 0, "runs": 0, "seed": 3}
     known = {path.name for path in (folder / "episodes").iterdir()}
 
-    def files(driver, pattern, scenario=SHORT):
+    def files(driver, pattern, scenario=street):
         made = evaluate(town, driver, scenario, pattern, folder=folder, **one).trials[0]
         return made.clean in known, made.painted in known
 
@@ -152,16 +160,16 @@ def test_other_inputs_are_other_drives(done, town):
     assert files(PaintShy(), MAGENTA) == (True, True)
     assert files(PaintShy(), other) == (True, False), "another paint, the same bare road"
     assert files(PaintShy(gain=5.0), MAGENTA) == (False, False), "a controller that answers otherwise"
-    assert files(PaintShy(), MAGENTA, dataclasses.replace(SHORT, time_limit_s=2.0)) == (False, False)
+    assert files(PaintShy(), MAGENTA, dataclasses.replace(street, time_limit_s=2.0)) == (False, False)
 
 
 @pytest.mark.slow
-def test_two_processes_drive_what_one_does(done, tmp_path):
+def test_two_processes_drive_what_one_does(done, street, tmp_path):
     _, evaluation, _ = done
     together = evaluate(
         TownSimulator,
         PaintShy(),
-        SHORT,
+        street,
         MAGENTA,
         folder=tmp_path,
         weathers=WEATHERS[:1],
@@ -199,16 +207,16 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("message", MISTAKES)
-def test_conditions_that_make_no_sense_are_refused(town, tmp_path, message):
+def test_conditions_that_make_no_sense_are_refused(town, street, tmp_path, message):
     with pytest.raises(EpisodeError, match=message):
-        evaluate(town, PaintShy(), SHORT, MAGENTA, folder=tmp_path, **MISTAKES[message])
+        evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, **MISTAKES[message])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, tmp_path):
+def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, street, tmp_path):
     narrow = StartRange(right_m=0.2, turned_rad=0.02, faster_mps=1.0)
     options = {"weathers": WEATHERS, "starts": 3, "start_range": narrow, "runs": 1, "cars": 1, "seed": 3}
-    told = evaluate(town, PaintShy(), SHORT, MAGENTA, folder=tmp_path, **options)
+    told = evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, **options)
     alone = told.of(traffic=False, weather=WEATHERS[0])
     starts = [trial.start for trial in alone]
     assert (
@@ -218,10 +226,10 @@ def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, tmp_path):
     assert told.of(traffic=True)[0].start == starts[0]
     for trial in alone:
         clean, painted = load_episodes(tmp_path, (trial.clean, trial.painted))
-        right = math.sin(SHORT.start.yaw_rad) * (clean.x_m[0] - SHORT.start.x_m)
-        right -= math.cos(SHORT.start.yaw_rad) * (clean.y_m[0] - SHORT.start.y_m)
+        right = math.sin(street.start.yaw_rad) * (clean.x_m[0] - street.start.x_m)
+        right -= math.cos(street.start.yaw_rad) * (clean.y_m[0] - street.start.y_m)
         assert right == pytest.approx(trial.start.right_m, abs=1e-3)
-        assert clean.speed_mps[0] - SHORT.start.speed_mps == pytest.approx(trial.start.faster_mps, abs=1e-3)
+        assert clean.speed_mps[0] - street.start.speed_mps == pytest.approx(trial.start.faster_mps, abs=1e-3)
         assert (painted.x_m[0], painted.yaw_rad[0]) == (clean.x_m[0], clean.yaw_rad[0])
     row = told.rows()[0]
     deviations = sorted(trial.deviation_m for trial in alone)
@@ -239,12 +247,12 @@ def test_starts_off_the_lane_are_refused(wrong):
         StartRange(**wrong)
 
 
-def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(tmp_path):
+def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(street, tmp_path):
     class Local(bad_drivers.Honest):
         pass
 
     with pytest.raises(ControllerError, match=r"pickling the controller raised \w+: Can't.* its class in a module"):
-        evaluate(TownSimulator, Local(), SHORT, MAGENTA, folder=tmp_path, processes=2)
+        evaluate(TownSimulator, Local(), street, MAGENTA, folder=tmp_path, processes=2)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -260,15 +268,15 @@ def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(tm
         ),
     ],
 )
-def test_what_fails_in_a_process_is_one_line_here(tmp_path, driver, error, message):
+def test_what_fails_in_a_process_is_one_line_here(street, tmp_path, driver, error, message):
     with pytest.raises(error, match=message) as told:
-        evaluate(TownSimulator, driver(), SHORT, MAGENTA, folder=tmp_path, weathers=WEATHERS, runs=0, processes=2)
+        evaluate(TownSimulator, driver(), street, MAGENTA, folder=tmp_path, weathers=WEATHERS, runs=0, processes=2)
     assert "\n" not in str(told.value)
 
 
-def test_a_pattern_that_paints_nothing_is_refused(town, tmp_path):
+def test_a_pattern_that_paints_nothing_is_refused(town, street, tmp_path):
     with pytest.raises(PatternError, match="paints nothing"):
-        evaluate(town, PaintShy(), SHORT, np.zeros((400, 400, 4), np.uint8), folder=tmp_path)
+        evaluate(town, PaintShy(), street, np.zeros((400, 400, 4), np.uint8), folder=tmp_path)
 
 
 DAMAGE = {

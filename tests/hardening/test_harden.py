@@ -22,6 +22,7 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 
 needs.town()
+from roadproof.simulators.town.simulator import TownSimulator
 
 SEARCH = dataclasses.replace(
     ALONE,
@@ -40,6 +41,13 @@ TINY = HardeningBudget(
 )
 
 
+@pytest.fixture(scope="module")
+def town():
+    """A quarter of the usual steps a second."""
+    with TownSimulator(dt_s=0.2) as simulator:
+        yield simulator
+
+
 def street(folder, name, begin_m):
     """A stretch of one long, straight road, from 17 m before its canvas."""
     return Scenario(
@@ -47,9 +55,9 @@ def street(folder, name, begin_m):
         kind="straight",
         map_name=str(straight_map(folder, length_m=220.0)),
         start=VehicleState(x_m=begin_m, y_m=-1.75, z_m=0.0, yaw_rad=0.0, speed_mps=6.0),
-        goal_m=(begin_m + 30.0, -1.75),
+        goal_m=(begin_m + 24.0, -1.75),
         canvas=CanvasPlacement(x_m=begin_m + 17.0, y_m=0.0, width_m=6.6),
-        time_limit_s=8.0,
+        time_limit_s=6.0,
     )
 
 

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 import torch
 
+from paint_shy import along_a_street
 from roadproof.calibration import Method, calibrate
 from roadproof.controllers import load_controller
 from roadproof.drives import Swerve, Trajectories, Window, record
 from roadproof.driving.rollout import rollout
 from roadproof.errors import EpisodeError
 from roadproof.pipeline.prediction import Prediction, predict
-from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 
 
 @pytest.fixture(scope="module")
-def run(town):
+def run(town, tmp_path_factory):
     """Drives of the town past a bare canvas, calibrated."""
-    scenario, controller = find_scenario("straight-04"), load_controller("pilotnet")
+    scenario, controller = along_a_street(tmp_path_factory.mktemp("street")), load_controller("pilotnet")
     drives = record(
         town,
         controller,

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from paint_shy import along_a_street
 from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
 from roadproof.calibration import Method
 from roadproof.controllers import load_controller
@@ -16,7 +17,6 @@ from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stress_test import STAGES, stress_test
 from roadproof.recordings import load_recordings
-from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 
 TINY = Budget(
@@ -32,7 +32,7 @@ TINY = Budget(
 
 
 def run(town, folder, **options):
-    scenario = find_scenario("left-03")
+    scenario = along_a_street(folder.parent, 3.2)
     options = {"budget": TINY, "space": SearchSpace(figures=1), "controller_name": "pilotnet"} | options
     return stress_test(town, load_controller("pilotnet"), scenario, folder, **options)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import serving
+from carla_serving import HALF, HALF_INPUT, serving
 from paint_shy import just_before_the_canvas
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
@@ -32,7 +32,6 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation, Trial, judge, path_of
 from roadproof.driving.rollout import rollout
 from roadproof.errors import RoadproofError
-from roadproof.geometry import CameraModel, CropResize
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, compare_with_rendered, rendered_frames
 from roadproof.pipeline.stress_test import StressTest, stress_test
@@ -42,9 +41,6 @@ from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
 
-# Half of the published camera, and of what is cut from it: the controller's frame is as large as ever.
-CAMERA = CameraModel(width_px=400, height_px=300, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
-INPUT = CropResize(left_px=0, top_px=57, right_px=400, bottom_px=255, width_px=200, height_px=88)
 BUDGET = Budget(
     objective=SteeringShift(),
     method=GradOpt(iterations=12, restarts=1, halving=False),
@@ -91,9 +87,9 @@ def run(world, folder, pattern=None):
 @pytest.fixture(scope="module")
 def sides(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loops")
-    with TownSimulator(camera=CAMERA, input=INPUT) as town:
+    with TownSimulator(camera=HALF, input=HALF_INPUT) as town:
         direct, pattern = run(town, folder / "direct")
-    with serving() as (_, port), CarlaSimulator(port=port, camera=CAMERA, input=INPUT) as server:
+    with serving() as (_, port), CarlaSimulator(port=port, camera=HALF, input=HALF_INPUT) as server:
         served, _ = run(server, folder / "served", pattern)
         with pytest.raises(RoadproofError, match="with paint 'rendered', now it is 'inject'"):
             run(server, folder / "direct")
