@@ -41,9 +41,9 @@ class Candidate:
         pattern: its best.
         group: the drives it was found on.
         surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames.
-        predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where nothing
-            was driven there.
-        predicted_range_m: least and most of it over those errors.
+        predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
+            steering; None where nothing was driven there.
+        predicted_range_m: least and most of it over those.
     """
 
     pattern: Pattern
@@ -65,9 +65,9 @@ class AttackResult:
         group: the group it was found for, e.g. "clean+right".
         objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
         surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
-        predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where the
-            search did not drive there.
-        predicted_range_m: least and most of it over those errors.
+        predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
+            steering; None where the search did not drive there.
+        predicted_range_m: least and most of it over those.
         by_group: the best value of every group, in the objective's unit: steer a frame, or metres; the published
             method's is a sum over frames.
         candidates: every start's best, the strongest first: by the least predicted deviation where there is one. The

@@ -15,6 +15,7 @@ from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, h
 from roadproof.calibration.replays import Replays, drive_digest
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
 from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
+from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import Homography, homography_from_pose
@@ -161,7 +162,8 @@ def calibrate(
         view=settings.view,
         colour=colour,
         recordings=tuple(
-            _recording(drive, g, shading) for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
+            _recording(drive, g, shading, settings.weather)
+            for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
         ),
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
         canvas=settings.scenario.canvas,
@@ -218,7 +220,7 @@ def _report(replays: Replays, drives: Drives, drive: Drive, geometry: _Geometry)
     )
 
 
-def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None) -> Recording:
+def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None, weather: Weather) -> Recording:
     kept = list(geometry.found)
     steps = drive.frame_number[kept]
     return Recording(
@@ -232,4 +234,5 @@ def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None) -> Rec
         steer=drive.steer[kept],
         maps=maps,
         track=drive.track,
+        weather=str(weather),
     )

@@ -72,10 +72,10 @@ class Budget:
                 f"choose {Calibration.TWO_PAINT}"
             )
         at_random = self.trajectories.scheme is Scheme.RANDOM
-        if self.is_predicted and (len(self.recorded_in) > 1 or self.pooled or at_random):
+        if self.is_predicted and (self.pooled or at_random):
             raise RoadproofError(
-                "a path deviation is searched in one weather for each side apart; attack several weathers, or drives "
-                "pooled or pushed at random, by their steering shift: objective=SteeringShift()"
+                "a path deviation is searched for each side apart; attack drives pooled or pushed at random by their "
+                "steering shift: objective=SteeringShift()"
             )
 
     def _check_published(self) -> None:

@@ -91,12 +91,18 @@ class RecordedWorld:
         device: where pictures are made and shown.
 
     Raises:
-        RecordingError: there is no clean drive, poses are not known, or the vehicle cannot be identified.
+        RecordingError: there is no clean drive, the drives are of several weathers, poses are not known, or the vehicle
+            cannot be identified.
     """
 
     def __init__(
         self, recordings: RecordingSet, *, vehicle: Vehicle | None = None, device: torch.device | str = "cpu"
     ) -> None:
+        weathers = sorted({drive.weather for drive in recordings.recordings})
+        if len(weathers) > 1:
+            raise RecordingError(
+                f"the set has drives in {', '.join(weathers)}, a recorded world has one light; take one of by_weather()"
+            )
         clean = next((drive for drive in recordings.recordings if drive.push is Push.CLEAN), None)
         if clean is None:
             raise RecordingError("the set has no clean drive, which a recorded world begins with; record one")

@@ -55,6 +55,7 @@ class _Drive:
     name: str
     push: Push
     frames: int = 0
+    weather: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -98,7 +99,7 @@ _PER_FRAME = RecordFile(
     kind=Recording,
     error=RecordingError,
     remedy=_AGAIN,
-    elsewhere=("name", "push", "frames", "maps", "track"),
+    elsewhere=("name", "push", "frames", "maps", "track", "weather"),
     header=None,
 )
 _TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
@@ -133,7 +134,10 @@ def _manifest(recordings: RecordingSet) -> _Manifest:
         crop_resize=recordings.view,
         colour=recordings.colour,
         canvas=recordings.canvas,
-        drives=tuple(_Drive(name=each.name, push=each.push, frames=len(each.frames)) for each in recordings.recordings),
+        drives=tuple(
+            _Drive(name=each.name, push=each.push, frames=len(each.frames), weather=each.weather)
+            for each in recordings.recordings
+        ),
     )
 
 
@@ -190,6 +194,7 @@ def _read_drive(root: Path, drive: _Drive, response: Response) -> Recording:
         frames=_read_frames(folder, content["frame_number"]),
         maps=_read_maps(folder / "shading.npz", response),
         track=_read_track(folder / "track.npz", content["frame_number"]),
+        weather=drive.weather,
     )
 
 
