@@ -27,8 +27,8 @@ from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
 from roadproof.driving.drive_store import Episodes, load_episodes
 from roadproof.driving.evaluation import ATTACK, Evaluation
-from roadproof.driving.evaluation import judge as judge_pair
 from roadproof.driving.starts import NOMINAL
+from roadproof.driving.trial import judge as judge_pair
 from roadproof.errors import CheckError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 
 from roadproof.datatypes import Ending, Weather
-from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m
+from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import Opening, make_together
-from roadproof.driving.evaluation import path_of
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive

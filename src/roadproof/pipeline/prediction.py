@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float
 
 from roadproof.controllers import Controller
-from roadproof.driving.deviation import passage
+from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.errors import EpisodeError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern

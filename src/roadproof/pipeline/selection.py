@@ -17,7 +17,7 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Trial
+from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.identity import require_same
 from roadproof.io.records import RecordFile, plain

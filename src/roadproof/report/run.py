@@ -25,7 +25,8 @@ from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Evaluation, Trial, load_paint
+from roadproof.driving.evaluation import Evaluation, load_paint
+from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.arrays import read_archive
 from roadproof.patterns import Pattern, load_pattern

@@ -12,9 +12,10 @@ import torch
 from roadproof.attacks import BayesianOptimisation
 from roadproof.attacks.blackbox import blackbox_search
 from roadproof.controllers import Controller, load_controller
+from roadproof.driving.deviation import path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
-from roadproof.driving.evaluation import Evaluation, path_of
+from roadproof.driving.evaluation import Evaluation
 from roadproof.io.arrays import packed
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import STEERING, Budget

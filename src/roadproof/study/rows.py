@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias, TypedDict
 
 from roadproof.datatypes import Event
-from roadproof.driving.evaluation import Trial
+from roadproof.driving.trial import Trial
 from roadproof.study.plan import Job
 
 Frame: TypeAlias = Any
@@ -46,7 +46,7 @@ class DriveColumns(TypedDict, total=False):
     leaderboard: float | None  # the CARLA Leaderboard's factor with paint, 1 where nothing happened
     clean_leaderboard: float | None  # the same without
     first_event_s: float | None  # seconds: when something first went wrong with paint; None where nothing did
-    left_lane: bool  # whether the car left its lane (`driving.evaluation.Trial`)
+    left_lane: bool  # whether the car left its lane (`driving.trial.Trial`)
     ending: str  # why the painted drive ended
     events: str  # of the painted drive, those that count, as JSON: kind, seconds, with what or where
     clean_events: str  # of the clean drive
