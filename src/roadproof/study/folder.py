@@ -5,7 +5,7 @@ jobs/KEY/job.json           what was asked for; KEY is a hash of it
 jobs/KEY/rows.json          its rows; there when the job is finished, or has failed
 jobs/KEY/pattern.json       what it found, and pattern.png
 jobs/KEY/paths.npz          clean_xy, painted_xy: world x, y in metres of both drives alone in the first weather
-jobs/KEY/view-WEATHER.jpg   what the car's camera sees of the pattern (`study.snapshots`)
+jobs/KEY/passage-*.jpg      what the car's camera sees while it passes the pattern (`study.passages`)
 jobs/KEY/history.json       how the search went (`study.history`)
 work/KEY/                   what a job keeps while it runs, to go on from
 rows.parquet                every row of every job (`study.rows`)

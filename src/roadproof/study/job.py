@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -17,7 +18,7 @@ from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.io.arrays import packed
-from roadproof.patterns import Pattern, save_pattern
+from roadproof.patterns import Pattern, raster, save_pattern
 from roadproof.pipeline.budget import STEERING, Budget
 from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.pipeline.selection import first_of_each_group
@@ -27,9 +28,9 @@ from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.history import Course, History
 from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
+from roadproof.study.passages import passages
 from roadproof.study.plan import BLACK, Job
 from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns
-from roadproof.study.snapshots import snapshots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +52,10 @@ class _Found:
     history: History
 
 
+PARTS = ("evaluation", "evaluation-alone")
+"""Folders of a job's evaluations."""
+
+
 def run_job(job: Job, scratch: Path) -> JobResult:
     """Find a pattern and evaluate it; the `Work` of a study.
 
@@ -67,8 +72,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         found = (_by_driving if drives else _in_recordings)(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
         shown = parts[0].shown()
-        clean, painted = load_episodes(scratch / "evaluation", [shown.clean, shown.painted])
-        pictures = snapshots(world, job.scenario, found.pattern, clean, job.weathers)
+        clean, painted = load_episodes(scratch / PARTS[0], [shown.clean, shown.painted])
+        pictures = _pictures(world, parts, scratch, found.pattern)
     costs: CostColumns = {
         "search_calls": found.calls,
         "search_seconds": found.seconds,
@@ -85,6 +90,13 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     files["paths.npz"] = packed({"clean_xy": path_of(clean), "painted_xy": path_of(painted)})
     files["history.json"] = found.history.to_json()
     return JobResult(rows, files | pictures)
+
+
+def _pictures(world: Simulator, parts: Sequence[Evaluation], scratch: Path, pattern: Pattern) -> dict[str, bytes]:
+    paint, files = raster(pattern), dict[str, bytes]()
+    for name, part in zip(PARTS, parts, strict=False):
+        files |= passages(world, part, scratch / name, paint)
+    return files
 
 
 def space_of(job: Job) -> SearchSpace:
@@ -182,9 +194,9 @@ def _evaluate(
     """All the study's conditions; where traffic is for the first weather alone, the others are a part of their own."""
     traffic = job.traffic
     split = traffic is not None and traffic.weathers == "first" and len(job.weathers) > 1
-    parts = [("evaluation", job.weathers[:1] if split else job.weathers, traffic)]
+    parts = [(PARTS[0], job.weathers[:1] if split else job.weathers, traffic)]
     if split:
-        parts.append(("evaluation-alone", job.weathers[1:], None))
+        parts.append((PARTS[1], job.weathers[1:], None))
     return tuple(
         evaluate(
             world,
