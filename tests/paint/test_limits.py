@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -64,7 +66,7 @@ def nearest_mark_m(pattern):
     least = np.inf
     for mark in SITE.marks:
         points = np.array(mark.points_m)
-        line = np.concatenate([np.linspace(a, b, 400) for a, b in zip(points[:-1], points[1:], strict=True)])
+        line = np.concatenate([np.linspace(a, b, 400) for a, b in pairwise(points)])
         for shape, box in zip(pattern.shapes, pattern.boxes.tolist(), strict=True):
             edge = (outline_px(shape, box) + 0.5) * np.array(SIZE_M) / CANVAS_SIZE_PX
             gap = np.linalg.norm(edge[:, None] - line, axis=2).min() - mark.width_m / 2

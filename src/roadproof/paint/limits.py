@@ -90,8 +90,8 @@ class PaintLimits:
             )
         if measured and self.contrast is not None and site.asphalt is None:
             raise PatternError(
-                'contrast needs the colour of the asphalt, which was not measured; give asphalt = "#rrggbb" in the file '
-                "of --paint (PaintLimits(asphalt=...))"
+                "contrast needs the colour of the asphalt, which was not measured; give asphalt in the file of --paint "
+                "(PaintLimits(asphalt=...))"
             )
         colours, _ = _maps(self, site, albedo)
         darkest = torch.full((1, 3), albedo[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -18,6 +18,7 @@ from roadproof.driving.evaluate import Opening, evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError
 from roadproof.io.identity import ANSWERS
+from roadproof.paint import LaneMark, Site
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
@@ -26,6 +27,7 @@ from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recordings import RecordingSet
+from roadproof.roads.marks import marks_of
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
@@ -58,7 +60,7 @@ class Stages:
         return {
             "scenario": self.scenario,
             "budget": repr(self.budget),
-            "space": self.space,
+            "space": self.space.stated,
             "seed": self.seed,
             "controller": self.controller_name,
             ANSWERS: identity_of(self.controller, size),
@@ -95,7 +97,26 @@ class Stages:
                 on_call=lambda made: self.on_progress("Calibrating", number * each + made, total, ""),
             )
             done.save(place)
+        if done.recordings.marks is None:
+            # Of a calibration that is older than marks, or by a simulator without a map.
+            return replace(done.recordings, marks=self._marks)
         return done.recordings
+
+    @property
+    def _marks(self) -> tuple[LaneMark, ...] | None:
+        return marks_of(self.simulator, self.scenario)
+
+    def check_paint(self) -> None:
+        """See, before anything is driven, that the method knows the patterns and the limits on paint leave some.
+
+        Raises:
+            PatternError: it does not, or they leave none.
+        """
+        space, canvas = self.space, self.scenario.canvas
+        self.budget.method.check_space(space)
+        if space.limits is not None:
+            site = space.limits.site(Site(size_m=(canvas.width_m, canvas.length_m), marks=self._marks))
+            space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
         """The method's own groups, or all drives pooled where the budget says so."""

@@ -113,6 +113,7 @@ def stress_test(
     Raises:
         RoadproofError: the folder holds a run of something else, another process works in it, or a stage refuses; the
             message says why.
+        PatternError: the limits on paint leave no pattern, or the search knows none.
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     if processes < 1 or (processes > 1 and another is None):
@@ -133,6 +134,7 @@ def stress_test(
         processes=processes,
         on_progress=on_progress,
     )
+    stages.check_paint()
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
