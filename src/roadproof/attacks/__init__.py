@@ -24,4 +24,5 @@ from roadproof.attacks.result import Candidate as Candidate
 from roadproof.attacks.result import Cost as Cost
 from roadproof.attacks.show import ShownDrive as ShownDrive
 from roadproof.attacks.show import show_pattern as show_pattern
+from roadproof.attacks.site import site_of as site_of
 from roadproof.attacks.surrogate import Surrogate as Surrogate

@@ -19,12 +19,13 @@ from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import Measure, Objective, SteeringShift
+from roadproof.attacks.objective import Measure, Objective, SteeringShift, variation_of
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.io.identity import require_same
+from roadproof.io.records import plain
 from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -150,6 +151,7 @@ def kept_attack(
     made_of = {
         "space": space.stated,
         "objective": objective.name,
+        "variation": plain(variation_of(objective)),
         "method": stored(method),
         "groups": groups and list(map(str, groups)),
         "seed": seed,

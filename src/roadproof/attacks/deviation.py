@@ -19,7 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.groups import Direction, Group
-from roadproof.attacks.surrogate import Surrogate
+from roadproof.attacks.surrogate import FIXED, Surrogate
+from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
 from roadproof.recorded.world import UNSURE, RecordedWorld, Start
 from roadproof.recordings import RecordingSet
@@ -40,6 +41,7 @@ class DeviationMeasure:
         every: steps from one picture to the next.
         saturation_m: s.
         device: where to drive.
+        variation: looks over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
         RecordingError: poses are not known, or the vehicle cannot be identified.
@@ -56,9 +58,10 @@ class DeviationMeasure:
         every: int = 2,
         saturation_m: float = 3.0,
         device: torch.device | str = "cpu",
+        variation: Variation | None = None,
     ) -> None:
         # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
-        self._open_loop = Surrogate(recordings, controller, groups, device=device)
+        self._open_loop = Surrogate(recordings, controller, groups, device=device, variation=variation)
         self.groups = tuple(groups)
         self.controller = controller
         self.world = RecordedWorld(recordings, device=device)
@@ -66,12 +69,18 @@ class DeviationMeasure:
         self.device = self.world.device
         self.frames_evaluated = 0
         self._starts, self.every, self._saturation_m = starts, every, saturation_m
+        self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
 
     def thinned(self, every: int) -> DeviationMeasure:
         """The same world with a picture every n steps: it chooses among many starts for less."""
         thin = copy.copy(self)
         thin.every, thin.frames_evaluated = every, 0
         return thin
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over other looks from now on; nothing without a variation."""
+        if self.variation is not None:
+            self._looks = self.variation.draw(seed, self.device)
 
     def open_loop(self) -> Surrogate:
         """The steering shift on the recorded frames."""
@@ -106,22 +115,29 @@ class DeviationMeasure:
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
         """Steering shift on the recorded frames, and the paper's deviation as predicted, with small steering errors."""
-        predicted = self.world.deviations_m(self.controller, space.pattern(unit.flatten(0, 1)), UNSURE)
+        looks = self.variation and self.variation.draw(FIXED, self.device, len(UNSURE))
+        self._open_loop.redraw(FIXED)
+        predicted = self.world.deviations_m(self.controller, space.pattern(unit.flatten(0, 1)), UNSURE, looks)
         return self._open_loop.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
 
     def fingerprint(self) -> str:
         """Tells this measure from another: drives, calibration, controller, starts."""
+        # The variation is in the fingerprint of the steering shift.
         more = repr((self._starts, self.every, self._saturation_m, self.world.vehicle))
         return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
 
     def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
-        pictures = len(self.groups) * len(self._starts) * -(-self.world.course.count // self.every)
+        looks = 1 if self._looks is None else len(self._looks)
+        pictures = len(self.groups) * len(self._starts) * looks * -(-self.world.course.count // self.every)
         at_once = max(1, MAX_PICTURES // pictures)
         yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
 
     def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         patterns = space.pattern(unit.flatten(0, 1))
-        rolled = self.world.roll(self.controller, patterns, starts=self._starts, every=self.every)
+        # Rows have the looks in turn: every start comes once with each.
+        times = 1 if self._looks is None else len(self._looks)
+        starts = tuple(start for start in self._starts for _ in range(times))
+        rolled = self.world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
         self.frames_evaluated += len(rolled.right_m) * -(-self.world.course.count // self.every)
         soft = self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)
         right = soft.mean(1).view(*unit.shape[:2], -1)

@@ -145,7 +145,7 @@ class Published(Method):
         Raises:
             RoadproofError: another objective is asked for.
         """
-        if not isinstance(objective, SteeringShift):
+        if not isinstance(objective, SteeringShift) or objective.variation is not None:
             raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
         return PublishedMeasure(recordings, controller, groups, masks=self.masks, device=device)
 

@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 from roadproof.attacks import AttackResult, kept_attack, parse_groups
 from roadproof.attacks.groups import Group
+from roadproof.attacks.objective import variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import identity_of
@@ -61,6 +62,7 @@ class Stages:
             "scenario": self.scenario,
             "budget": repr(self.budget),
             "space": self.space.stated,
+            "variation": variation_of(self.budget.objective),
             "seed": self.seed,
             "controller": self.controller_name,
             ANSWERS: identity_of(self.controller, size),
