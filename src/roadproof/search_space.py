@@ -6,7 +6,7 @@ means the same in every direction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
@@ -103,6 +103,12 @@ class SearchSpace:
             raise PatternError(f"albedo is {self.albedo}, expected 0 ≤ lowest < highest ≤ 1")
         if self.max_painted_share is not None and not 0.0 < self.max_painted_share <= 1.0:
             raise PatternError(f"max_painted_share is {self.max_painted_share}, expected a value in (0, 1]")
+
+    def __repr__(self) -> str:
+        # Runs and running searches are known by it; what limits nothing is not named, as before there were limits.
+        names = [each.name for each in fields(self) if each.name not in ("limits", "site")]
+        names += [name for name in ("limits", "site") if getattr(self, name) is not None]
+        return f"SearchSpace({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
     def on(self, site: Site) -> SearchSpace:
         """The same patterns as far as the limits leave them on a stretch of road; unlimited ones are left as they are.

@@ -8,7 +8,7 @@ An objective is a description; `measure` makes of it what values patterns on a s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -177,6 +177,19 @@ class PathDeviation:
 
 def _over(variation: Variation | None) -> str:
     return "" if variation is None else " over variations"
+
+
+def varied(objective: Objective, variation: Variation | None) -> Objective:
+    """An objective in expectation over a variation; itself where there is none.
+
+    Raises:
+        RoadproofError: it is one of the user's own, which has to take the mean itself.
+    """
+    if variation is None:
+        return objective
+    if isinstance(objective, SteeringShift | PathDeviation):
+        return replace(objective, variation=variation)
+    raise RoadproofError(f"the objective {objective.name} knows no variation; take its mean in its own measure")
 
 
 def variation_of(objective: Objective) -> Variation | None:

@@ -39,7 +39,8 @@ def _asphalt(recordings: RecordingSet) -> Rgb | None:
         flat = _flat(recordings, drive, k)
         if flat is not None and len(flat):
             painted = _painted(recordings.colour.response, flat.quantile(0.5, 0))
-            return cast("Rgb", tuple(round(each, 4) for each in painted.tolist()))
+            red, green, blue = cast("list[float]", painted.tolist())
+            return round(red, 4), round(green, 4), round(blue, 4)
     return None
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import cast
 
 import torch
 from jaxtyping import Float, Int
@@ -151,7 +152,7 @@ class Looks:
         for k in range(self.wave.shape[1]):
             wave, phase = self.wave[which, k], self.phase[which, k]
             field = field + torch.cos((centre * wave[:, None]).sum(-1) + phase[:, None])
-        level = torch.special.ndtri(1 - self.wear.clamp_min(_LEAST_WEAR))[which, None]
+        level = cast("Tensor", torch.special.ndtri(1 - self.wear.clamp_min(_LEAST_WEAR)))[which, None]
         worn = torch.sigmoid((field * math.sqrt(2 / self.wave.shape[1]) - level) / _SOFT)
         return torch.where((self.wear > 0)[which, None], 1 - worn, 1.0)
 

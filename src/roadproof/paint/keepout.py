@@ -12,7 +12,7 @@ over rectangles of the largest over axes: closed form, and differentiable in the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -65,9 +65,9 @@ class KeepOut:
         free = self.free.to(boxes)[y, x] / scale - 0.5
         # The gradient passes as if nothing had been moved.
         free = free + (middle - middle.detach())
-        return torch.where((self._clearance(at) < LEAST_M)[..., None], free, middle)
+        return torch.where((self.clearance(at) < LEAST_M)[..., None], free, middle)
 
-    def _clearance(self, points: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+    def clearance(self, points: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
         """How far points are outside of all rectangles, in the larger of the two axes; negative inside of one."""
         beside = torch.einsum("...qi,qai->...qa", points[..., None, :] - self.middle.to(points), self.axes.to(points))
         return (beside.abs() - self.extents.to(points)).amax(-1).amin(-1)
@@ -107,19 +107,20 @@ def keep_out(site: Site, distance_m: float) -> KeepOut | None:
     beyond = distance_m + widths / 2
     axes = np.stack([unit, np.stack([-unit[:, 1], unit[:, 0]], 1)], 1)
     extents = np.stack([length / 2 + beyond, beyond], 1)
-    parts = (torch.tensor(each) for each in (ends.mean(1), axes, extents))
     rows, columns = (max(1, int(np.ceil(extent / _CELL_M))) for extent in (site.size_m[1], site.size_m[0]))
     x, y = np.meshgrid((np.arange(columns) + 0.5) * _CELL_M, (np.arange(rows) + 0.5) * _CELL_M)
     cells = np.stack([x, y], -1)
-    found = KeepOut(site.size_m, *parts, torch.tensor(cells))
-    clear = found._clearance(torch.tensor(cells))  # noqa: SLF001
+    found = KeepOut(
+        site.size_m, torch.tensor(ends.mean(1)), torch.tensor(axes), torch.tensor(extents), torch.tensor(cells)
+    )
+    clear = found.clearance(torch.tensor(cells))
     free = (clear >= LEAST_M).numpy()
     if not free.any():
         raise PatternError(
             f"a keep-out of {distance_m:g} m around lane marks leaves no place for paint on the canvas; expected at "
             f"most {max(0.0, distance_m + float(clear.max()) - LEAST_M):.2f} m here"
         )
-    return KeepOut(found.size_m, found.middle, found.axes, found.extents, torch.tensor(_nearest(cells, free)))
+    return replace(found, free=torch.tensor(_nearest(cells, free)))
 
 
 def _nearest(cells: Float[np.ndarray, "r c 2"], free: Bool[np.ndarray, "r c"]) -> Float[np.ndarray, "r c 2"]:

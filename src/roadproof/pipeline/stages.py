@@ -19,7 +19,6 @@ from roadproof.driving.evaluate import Opening, evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError
 from roadproof.io.identity import ANSWERS
-from roadproof.paint import LaneMark, Site
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
@@ -28,7 +27,7 @@ from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recordings import RecordingSet
-from roadproof.roads.marks import marks_of
+from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
@@ -101,12 +100,8 @@ class Stages:
             done.save(place)
         if done.recordings.marks is None:
             # Of a calibration that is older than marks, or by a simulator without a map.
-            return replace(done.recordings, marks=self._marks)
+            return replace(done.recordings, marks=marks_of(self.simulator, self.scenario))
         return done.recordings
-
-    @property
-    def _marks(self) -> tuple[LaneMark, ...] | None:
-        return marks_of(self.simulator, self.scenario)
 
     def check_paint(self) -> None:
         """See, before anything is driven, that the method knows the patterns and the limits on paint leave some.
@@ -114,10 +109,10 @@ class Stages:
         Raises:
             PatternError: it does not, or they leave none.
         """
-        space, canvas = self.space, self.scenario.canvas
+        space = self.space
         self.budget.method.check_space(space)
         if space.limits is not None:
-            site = space.limits.site(Site(size_m=(canvas.width_m, canvas.length_m), marks=self._marks))
+            site = space.limits.site(site_at(self.simulator, self.scenario))
             space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:

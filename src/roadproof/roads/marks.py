@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
-from roadproof.paint.site import WHITE_MARK, YELLOW_MARK, LaneMark
+from roadproof.paint.site import WHITE_MARK, YELLOW_MARK, LaneMark, Site
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 
@@ -78,6 +78,16 @@ class Mapped(Protocol):
     def road_map(self, name: str) -> RoadMap:
         """The map that a scenario names."""
         ...
+
+
+def site_at(simulator: object, scenario: Scenario) -> Site:
+    """What is known of a scenario's canvas before anything is recorded there: all but the colour of the asphalt.
+
+    Raises:
+        SimulatorError, ScenarioError: as `marks_of`.
+    """
+    canvas = scenario.canvas
+    return Site(size_m=(canvas.width_m, canvas.length_m), marks=marks_of(simulator, scenario))
 
 
 def marks_of(simulator: object, scenario: Scenario) -> tuple[LaneMark, ...] | None:

@@ -11,6 +11,7 @@ import torch
 
 from roadproof.attacks import BayesianOptimisation
 from roadproof.attacks.blackbox import blackbox_search
+from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller, load_controller
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
@@ -21,6 +22,7 @@ from roadproof.pipeline.budget import STEERING, Budget
 from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.pipeline.selection import first_of_each_group
 from roadproof.pipeline.stress_test import StressTest, stress_test
+from roadproof.roads.marks import site_at
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
@@ -90,13 +92,14 @@ def space_of(job: Job) -> SearchSpace:
     """The patterns a job searches: published rectangles, in its own bounds for the published baseline."""
     family = BayesianOptimisation.family if job.method.search == BayesianOptimisation.word else "published"
     if job.figures == BLACK:
-        return SearchSpace(figures=1, family=family, colour=False)
-    return SearchSpace(figures=int(job.figures), family=family)
+        return SearchSpace(figures=1, family=family, colour=False, limits=job.paint)
+    return SearchSpace(figures=int(job.figures), family=family, limits=job.paint)
 
 
 def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Found:
     # Its own evaluation is a part of the study's conditions and kept where those are.
     budget = replace(budget_of(job.method, job.weathers[0]), starts=job.starts.count, start_range=job.starts.range)
+    budget = replace(budget, objective=varied(budget.objective, job.variation))
     found, calls, seconds = _searched(job, world, controller, folder, budget)
     strongest = found.attack.history.max((1, 2))
     before = [found.cost[stage] for stage in ("record", "calibrate")]
@@ -136,7 +139,7 @@ def _searched(
 
 
 def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Found:
-    plan, space = cast("BlackBoxPlan", job.method), space_of(job)
+    plan, space = cast("BlackBoxPlan", job.method), space_of(job).on(site_at(world, job.scenario))
     first, calls_before, seconds_before = None, 0, 0.0
     if plan.start:
         # Record, calibrate and search the steering shift; the candidates are for the black box to drive.
