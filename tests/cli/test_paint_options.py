@@ -91,7 +91,7 @@ def test_limits_of_the_options_come_before_those_of_the_file(here, tmp_path, inv
     ("options", "message"),
     [
         (["--max-area", "0"], "--max-area is 0.0, expected 0.01 to 10,000"),
-        (["--keep-out", "4"], "leaves no place for paint on the canvas"),
+        (["--keep-out", "9"], "leaves no place for paint on the canvas"),
         (["--contrast", "0.97", "0.99"], "no paint has a contrast of 0.97 to 0.99"),
         (["--contrast", "0.5", "0.4"], "contrast is (0.5, 0.4)"),
         (["--colours", "white"], "colour is 'white'"),

@@ -69,6 +69,7 @@ def attack(
     random_patterns: Annotated[
         int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
     ] = 100,
+    cheapest: options.CheapestFor = None,
     seed: Annotated[int, number("Of the random starts.", 0, MAX_SEED)] = 0,
     device: options.Device = "cpu",
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
@@ -80,12 +81,15 @@ def attack(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern, site_of
     from roadproof.attacks import attack as run
+    from roadproof.attacks import cheapest as fewest
+    from roadproof.attacks.cheapest import in_words
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
+    from roadproof.errors import RecordingError
     from roadproof.io.locks import hold
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
@@ -109,6 +113,8 @@ def attack(
     word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
     goal = varied(OBJECTIVES[word], paint.variation)
     space = space.on(site_of(drives))
+    if cheapest is not None and not drives.is_placed:
+        raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
@@ -135,6 +141,14 @@ def attack(
     draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, out)
+    if cheapest is not None:
+        with progress("Looking for less paint", 14) as on_step:
+            less = fewest(
+                drives, attacked, result, cheapest, groups=chosen, objective=goal, device=device, on_level=on_step
+            )
+        if less is not None:
+            less.save(out / "cheapest")
+        say(in_words(less, cheapest))
 
 
 def _summarise(result: AttackResult, out: Path) -> None:

@@ -31,6 +31,7 @@ def demo(
         str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
     ] = "clear-noon",
     figures: options.Figures = 5,
+    cheapest: options.CheapestFor = None,
     seed: Annotated[int, number("Of recording, search and traffic.", 0, MAX_SEED)] = 0,
     simulator: options.SimulatorSpec = "town",
     device: options.Device = "cpu",
@@ -43,6 +44,7 @@ def demo(
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.attacks.cheapest import in_words
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
@@ -74,6 +76,7 @@ def demo(
             device=device,
             another=partial(open_simulator, simulator),
             processes=processes,
+            cheapest_m=cheapest,
             on_progress=show,
         )
     given = {
@@ -86,12 +89,17 @@ def demo(
         "seed": seed,
         "simulator": simulator,
         **({"scenarios": scenarios} if scenarios else {}),
+        **({"cheapest": cheapest} if cheapest else {}),
         **paint.given,
         "out": out,
     }
     command = shlex.join(["roadproof", "demo", *words(given)])
     write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))
     _report(result, out)
+    if cheapest is not None:
+        less = result.cheapest
+        driven = "" if less is None else f"; driven {less[1].deviation_m:.2f} m"
+        say(in_words(less and less[0], cheapest) + driven)
 
 
 def _report(result: StressTest, out: Path) -> None:

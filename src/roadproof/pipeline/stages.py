@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
-from roadproof.attacks import AttackResult, kept_attack, parse_groups
+from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, parse_groups
+from roadproof.attacks.cheapest import FILE
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
@@ -17,8 +18,8 @@ from roadproof.drives import Drives, record
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import Opening, evaluate
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import EpisodeError
-from roadproof.io.identity import ANSWERS
+from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.io.identity import ANSWERS, digest, require_same
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
@@ -31,6 +32,9 @@ from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
+
+CHEAPEST = "cheapest"
+"""The folder of a run with the least paint for a deviation."""
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
 """Called with the name of a stage, how many of its steps are done, how many there are, and a word on the last one."""
@@ -170,6 +174,42 @@ class Stages:
             device=self.device,
             on_step=lambda done, total, word: self.on_progress("Searching on", done, total, word),
         )
+
+    def cheapest(
+        self, recordings: RecordingSet, found: AttackResult, wanted_m: float, drives: Drives
+    ) -> tuple[Cheapest, Selection] | None:
+        """The least paint for a deviation, and the drive over it; None where nothing found reaches that."""
+        folder, total = self.folder / CHEAPEST, 15
+        made_of = {"wanted_m": wanted_m, "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]}
+        if (folder / "cheapest.json").exists():
+            require_same(folder, "a search", FILE.content(folder / "cheapest.json")["made_of"], made_of, RoadproofError)
+            less = Cheapest.load(folder)
+        else:
+            less = cheapest(
+                recordings,
+                self.controller,
+                found,
+                wanted_m,
+                groups=self.groups(recordings),
+                objective=self.budget.objective,
+                device=self.device,
+                on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
+            )
+            if less is None:
+                return None
+            less.save(folder, made_of)
+        driven = select_by_driving(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            [less.candidate],
+            best=1,
+            weather=self.budget.recorded_in[0],
+            folder=folder / "selection",
+            clean=drives.drives[0].episode,
+            on_drive=lambda _done, _best: self.on_progress("Looking for less paint", total, total, ""),
+        )
+        return less, driven
 
     def predict(
         self, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None
