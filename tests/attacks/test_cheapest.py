@@ -86,7 +86,7 @@ def test_a_deviation_that_nothing_reaches_has_no_cheapest_pattern(searched):
 
 def test_deviations_out_of_range_and_canvases_of_unknown_size_are_one_line(searched):
     road, found = searched
-    with pytest.raises(RoadproofError, match="cheapest is 0.0 m, expected metres"):
+    with pytest.raises(RoadproofError, match=r"cheapest is 0\.0 m, expected metres"):
         cheapest(road, PullsToBrightPaint(), found, 0.0, groups=[RIGHT_GROUP])
     with pytest.raises((PatternError, RoadproofError), match="canvas"):
         cheapest(recording_set(frames=3), PullsToBrightPaint(), found, 0.5, groups=[RIGHT_GROUP])
