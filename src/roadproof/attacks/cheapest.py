@@ -227,7 +227,7 @@ class _Run:
         count = self.space.figures
         if count == 1:
             return None
-        rest = [[k for k in range(count) if k != gone] for gone in range(count)]
+        rest = torch.tensor([[k for k in range(count) if k != gone] for gone in range(count)])
         unit, space = self.unit[0, 0][rest][None], replace(self.space, figures=count - 1)
         least = self._least_m(space, unit)
         best = int(least.argmax())
