@@ -132,7 +132,8 @@ def cheapest(
         on_level: told after every limit of the area how many there were, and the least area so far.
 
     Returns:
-        The cheapest pattern; None where the strongest one is not predicted to reach the deviation.
+        The cheapest pattern; None where the strongest one is not predicted to reach the deviation under all small
+        errors of steering.
 
     Raises:
         RoadproofError: the deviation is out of its range.
@@ -181,7 +182,10 @@ def cheapest(
 def in_words(found: Cheapest | None, wanted_m: float) -> str:
     """What came of the search for less paint, as a sentence."""
     if found is None:
-        return f"No pattern that was found is predicted to deviate by {wanted_m:g} m, so there is none with less paint"
+        return (
+            f"The strongest pattern is not predicted to deviate by {wanted_m:g} m under all small errors of steering, "
+            "so there is none with less paint"
+        )
     return (
         f"Least paint that is predicted to deviate by {wanted_m:g} m ({found.predicted_m:.2f} m): "
         f"{found.conspicuousness.sentence}; the strongest pattern has {found.levels[0].area_m2:.2f} m²"

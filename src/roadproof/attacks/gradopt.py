@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
-from roadproof.attacks.objective import Measure, Varied, is_varied
+from roadproof.attacks.objective import Measure, Varied
 from roadproof.attacks.surrogate import FIXED
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
@@ -154,7 +154,7 @@ def gradopt(
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
     best = state["best"]
-    if isinstance(measure, Varied) and is_varied(measure):
+    if isinstance(measure, Varied) and measure.variation is not None:
         # Every step had looks of its own; results are compared in the same ones.
         measure.redraw(FIXED)
         best = measure.values(space, state["best_unit"])

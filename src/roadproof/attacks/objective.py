@@ -80,11 +80,6 @@ class Varied(Protocol):
         ...
 
 
-def is_varied(measure: Measure) -> bool:
-    """Whether a measure's values depend on what looks were drawn."""
-    return isinstance(measure, Varied) and measure.variation is not None
-
-
 @runtime_checkable
 class Objective(Protocol):
     """What a search makes large."""
