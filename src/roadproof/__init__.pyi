@@ -1,6 +1,5 @@
 from roadproof.attacks import attack as attack
 from roadproof.calibration import calibrate as calibrate
-from roadproof.compositing import Variation as Variation
 from roadproof.compositing import composite as composite
 from roadproof.controllers import Controller as Controller
 from roadproof.controllers import CruiseControl as CruiseControl
@@ -13,8 +12,6 @@ from roadproof.driving.evaluate import evaluate as evaluate
 from roadproof.driving.rollout import rollout as rollout
 from roadproof.errors import RoadproofError as RoadproofError
 from roadproof.hardening.harden import harden as harden
-from roadproof.paint import LaneMark as LaneMark
-from roadproof.paint import PaintLimits as PaintLimits
 from roadproof.patterns import Pattern as Pattern
 from roadproof.patterns import load_pattern as load_pattern
 from roadproof.patterns import save_pattern as save_pattern
