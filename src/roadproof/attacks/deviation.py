@@ -20,7 +20,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.groups import Direction, Group
-from roadproof.attacks.surrogate import Surrogate
+from roadproof.attacks.surrogate import FIXED, Surrogate
+from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
 from roadproof.patterns import Pattern
 from roadproof.recorded.world import UNSURE, RecordedWorld, Start
@@ -42,6 +43,7 @@ class DeviationMeasure:
         every: steps from one picture to the next.
         saturation_m: s.
         device: where to drive.
+        variation: looks over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
         RecordingError: poses are not known, or the vehicle cannot be identified.
@@ -58,9 +60,10 @@ class DeviationMeasure:
         every: int = 2,
         saturation_m: float = 3.0,
         device: torch.device | str = "cpu",
+        variation: Variation | None = None,
     ) -> None:
         # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
-        self._open_loop = Surrogate(recordings, controller, groups, device=device)
+        self._open_loop = Surrogate(recordings, controller, groups, device=device, variation=variation)
         self.groups = tuple(groups)
         self.controller = controller
         self.worlds = tuple(RecordedWorld(each, device=device) for each in recordings.by_weather())
@@ -69,12 +72,18 @@ class DeviationMeasure:
         self.device = torch.device(device)
         self.frames_evaluated = 0
         self._starts, self.every, self._saturation_m = starts, every, saturation_m
+        self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
 
     def thinned(self, every: int) -> DeviationMeasure:
         """The same world with a picture every n steps: it chooses among many starts for less."""
         thin = copy.copy(self)
         thin.every, thin.frames_evaluated = every, 0
         return thin
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over other looks from now on; nothing without a variation."""
+        if self.variation is not None:
+            self._looks = self.variation.draw(seed, self.device)
 
     def open_loop(self) -> Surrogate:
         """The steering shift on the recorded frames."""
@@ -113,11 +122,16 @@ class DeviationMeasure:
         The predictions of all weathers stand one after another.
         """
         patterns = space.pattern(unit.flatten(0, 1))
-        predicted = np.concatenate([each.deviations_m(self.controller, patterns, UNSURE) for each in self.worlds], 1)
+        looks = self.variation and self.variation.draw(FIXED, self.device, len(UNSURE))
+        self._open_loop.redraw(FIXED)
+        predicted = np.concatenate(
+            [world.deviations_m(self.controller, patterns, UNSURE, looks) for world in self.worlds], 1
+        )
         return self._open_loop.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
 
     def fingerprint(self) -> str:
         """Tells this measure from another: drives, calibration, controller, starts."""
+        # The variation is in the fingerprint of the steering shift.
         more = repr((self._starts, self.every, self._saturation_m, [each.vehicle for each in self.worlds]))
         return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
 
@@ -133,14 +147,19 @@ class DeviationMeasure:
         return torch.stack(sides).mean(-1).float()
 
     def _right(self, world: RecordedWorld, patterns: Pattern) -> Float[Tensor, " r"]:
-        """The mean offset of each drive in one world, start after start."""
-        rolled = world.roll(self.controller, patterns, starts=self._starts, every=self.every)
+        """The mean offset of each drive in one world, start after start, each of them once with every look."""
+        starts = tuple(start for start in self._starts for _ in range(self._times))
+        rolled = world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
         self.frames_evaluated += len(patterns.boxes) * self._pictures(world)
         return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
 
     def _pictures(self, world: RecordedWorld) -> int:
-        """How many a drive over one pattern from every start takes."""
-        return len(self._starts) * -(-world.course.count // self.every)
+        """How many all drives over one pattern take."""
+        return len(self._starts) * self._times * -(-world.course.count // self.every)
+
+    @property
+    def _times(self) -> int:
+        return 1 if self._looks is None else len(self._looks)
 
 
 def _to_side(right_m: Tensor, direction: Direction) -> Tensor:

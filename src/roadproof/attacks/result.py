@@ -16,6 +16,7 @@ from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
 from roadproof.io.records import Form, RecordFile
+from roadproof.paint import Conspicuousness
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
 
@@ -79,6 +80,7 @@ class AttackResult:
         space: where it looked.
         method: how it searched.
         seed: of everything random.
+        conspicuousness: of the strongest pattern, on this road; None in results older than the word.
     """
 
     pattern: Pattern
@@ -95,6 +97,7 @@ class AttackResult:
     objective: str = "steering shift"
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+    conspicuousness: Conspicuousness | None = None
 
     def save(self, folder: Path, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.

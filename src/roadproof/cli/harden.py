@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, choice, number
+from roadproof.cli.paint import Paint, with_paint
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from roadproof.scenarios import Scenario
 
 
+@with_paint
 def harden(
     controller: Annotated[str, typer.Argument(help=f"A torch.nn.Module: {CONTROLLERS}", show_default=False)],
     scenarios: Annotated[str, typer.Option(help="Scenarios to train on, with commas between.", show_default=False)],
@@ -40,6 +42,8 @@ def harden(
     simulator: SimulatorSpec = "town",
     device: Annotated[str, typer.Option(help="cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
     out: Annotated[Path, typer.Option(help="Folder; the same folder goes on where it was.")] = Path("out/harden"),
+    *,
+    paint: Paint,
 ) -> None:
     """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on streets not trained on."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
@@ -62,7 +66,7 @@ def harden(
     def named(names: str) -> list[Scenario]:
         return [find_scenario(name.strip(), known) for name in names.split(",") if name.strip()]
 
-    spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))]
+    spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))].varied(paint.variation)
     training, judging = named(scenarios), named(judge_on)
     step = (
         usual_step
@@ -82,7 +86,7 @@ def harden(
             clean_on=known if clean_on == "all" else named(clean_on),
             rounds=rounds,
             budget=spent,
-            space=SearchSpace(figures=figures),
+            space=SearchSpace(figures=figures, limits=paint.limits),
             training_step=step,
             seed=seed,
             device=("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device,

@@ -84,6 +84,12 @@ WorldSpec: TypeAlias = Annotated[
 ]
 Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
+CheapestFor: TypeAlias = Annotated[
+    float | None,
+    number(
+        "Also find the fewest square metres of paint for so many metres of deviation.", 0.05, 100.0, show_default=False
+    ),
+]
 Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, MAX_FIGURES)]
 Cars: TypeAlias = Annotated[int, number("Other cars on the road.", 0, MAX_CROWD)]
 Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]

@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from roadproof.attacks.objective import variation_of
 from roadproof.controllers import CIL, ConditionalPilotNet, Controller, SteeringController, load_controller
 from roadproof.controllers.identity import identity_of
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
@@ -257,13 +258,15 @@ def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> Non
     network = load_trainable(run.spec_of(number - 1))
     streets: list[Street] = []
     found: list[torch.Tensor] = []
+    # It learns from paint of all kinds, also where attacks are limited.
+    space = run.space.unlimited
     for past, attacked in enumerate(tests):
         driver = run.controller(past)
         for scenario, test in zip(run.scenarios, attacked, strict=True):
             recordings = load_recordings(run.folder / f"round-{past}" / scenario.name / "recordings")
-            points = torch.stack([run.space.point(each.pattern) for each in test.attack.candidates])
+            points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
             street = Street(recordings, run.teacher, device=run.device)
-            street.add_ways(driver, run.space.pattern(points.to(run.device)))
+            street.add_ways(driver, space.pattern(points.to(run.device)))
             streets.append(street)
             found.append(points)
     tuning = run.budget.tuning
@@ -271,7 +274,7 @@ def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> Non
         network,
         run.teacher,
         streets,
-        run.space,
+        space,
         torch.cat(found),
         town,
         tuning,
@@ -358,6 +361,7 @@ def _claim(run: _Run) -> None:
         "scenarios": [identity(each) for each in run.scenarios],
         "budget": repr(replace(run.budget, judge=run.budget.attack)),
         "space": repr(run.space),
+        "variation": repr(variation_of(run.budget.attack.objective)),
         "seed": run.seed,
         "training step": f"{run.step.__module__}:{run.step.__qualname__}",
     }

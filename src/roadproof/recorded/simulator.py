@@ -117,6 +117,11 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         self._weather = Weather(weather)
 
     @property
+    def recordings(self) -> RecordingSet:
+        """What it drives in."""
+        return self._world.recordings
+
+    @property
     def paint(self) -> PaintKind:
         """How patterns are put on the road: composited into the pictures."""
         return PaintKind.COMPOSITED

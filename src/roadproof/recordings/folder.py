@@ -1,7 +1,7 @@
 """Recorded drives on disk: folders that explain themselves, checked when they are read.
 
     SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, the
-                               canvas' place (null where it is not known), drives
+                               canvas' place and the lane marks on it (null where they are not known), drives
     SET/DRIVE/drive.npz        per frame: frame number, homography, speed, command, steer
     SET/DRIVE/frames/N.png     the controller's input, unpainted; or all of them in SET/DRIVE/frames.npy
     SET/DRIVE/shading.npz      optional: gain, offset and visibility of every pixel (see `photometry.PixelMaps`)
@@ -27,6 +27,7 @@ from roadproof.io.arrays import read_archive, read_array, write_archive
 from roadproof.io.files import inside, write_folder_atomically
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import Form, RecordFile
+from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 from roadproof.recordings.recording import Push, Recording, RecordingSet
 from roadproof.recordings.track import Track
@@ -38,6 +39,7 @@ _UNITS = {
     "command": "2 follow, 3 left, 4 right, 5 straight",
     "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
     "canvas": "its middle and extents in m, yaw in rad: direction of travel, in a right-handed world with z up",
+    "marks": "middle lines in m on the canvas, x from its left edge, y from its far edge; width in m, paint as #rrggbb",
     "track": "steps numbered as frames, dt_s apart; x_m, y_m, yaw_rad (left positive) of the vehicle's origin in that "
     "world, speed in m/s; steer, throttle and brake as given at each step and held until the next",
 }
@@ -68,6 +70,7 @@ class _Manifest:
     crop_resize: CropResize
     colour: ColourTransform
     canvas: CanvasPlacement | None = None
+    marks: tuple[LaneMark, ...] | None = None
     drives: tuple[_Drive, ...]
 
     def __post_init__(self) -> None:
@@ -134,6 +137,7 @@ def _manifest(recordings: RecordingSet) -> _Manifest:
         crop_resize=recordings.view,
         colour=recordings.colour,
         canvas=recordings.canvas,
+        marks=recordings.marks,
         drives=tuple(
             _Drive(name=each.name, push=each.push, frames=len(each.frames), weather=each.weather)
             for each in recordings.recordings
@@ -178,6 +182,7 @@ def load_recordings(folder: Path) -> RecordingSet:
         recordings=tuple(_read_drive(folder, drive, manifest.colour.response) for drive in manifest.drives),
         origin=manifest.origin,
         canvas=manifest.canvas,
+        marks=manifest.marks,
     )
 
 

@@ -13,6 +13,7 @@ from roadproof.datatypes import Command
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
 from roadproof.io.files import check_name
+from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps
 from roadproof.recordings.track import FASTEST_MPS, Track
 
@@ -131,6 +132,7 @@ class RecordingSet:
         recordings: the drives.
         origin: where they come from, in words.
         canvas: where it lies in the world of the tracks, where that is known.
+        marks: the lane marks on the canvas and near it; None where they are not known.
 
     Raises:
         RecordingError: no drive, two of one name, or frames of another size than the controller's input.
@@ -142,6 +144,7 @@ class RecordingSet:
     recordings: tuple[Recording, ...]
     origin: str = ""
     canvas: CanvasPlacement | None = None
+    marks: tuple[LaneMark, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.recordings:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeAlias, TypedDict
 
 from roadproof.datatypes import Event
 from roadproof.driving.trial import Trial
+from roadproof.paint import Conspicuousness
 from roadproof.study.plan import Job
 
 Frame: TypeAlias = Any
@@ -52,6 +53,16 @@ class DriveColumns(TypedDict, total=False):
     clean_events: str  # of the clean drive
 
 
+class PaintColumns(TypedDict, total=False):
+    """How conspicuous the pattern of a job is; the same in all its rows, None for what is not known of the road."""
+
+    painted_figures: int  # figures
+    area_m2: float | None  # square metres: the sum of the figures' areas
+    contrast: float | None  # to the asphalt, 0 none, 1 black on white
+    mark_distance_m: float | None  # metres from the nearest lane mark
+    mark_likeness: float | None  # how like a lane mark its most similar figure is, 0 to 1
+
+
 class CostColumns(TypedDict, total=False):
     """What a job took; the same in all its rows."""
 
@@ -61,7 +72,7 @@ class CostColumns(TypedDict, total=False):
     seconds: float  # seconds of the whole job; of an evaluation that was interrupted, only of what was left
 
 
-class Row(JobColumns, DriveColumns, CostColumns, total=False):
+class Row(JobColumns, DriveColumns, PaintColumns, CostColumns, total=False):
     """A row of rows.parquet."""
 
     controller: str  # spec of who drove
@@ -114,6 +125,17 @@ def job_columns(job: Job) -> JobColumns:
         "figures": str(job.figures),
         "method": job.method.name,
         "seed": job.seed,
+    }
+
+
+def paint_columns(told: Conspicuousness) -> PaintColumns:
+    """The columns of a job's pattern."""
+    return {
+        "painted_figures": told.figures,
+        "area_m2": told.area_m2,
+        "contrast": told.contrast,
+        "mark_distance_m": told.mark_distance_m,
+        "mark_likeness": told.mark_likeness,
     }
 
 
