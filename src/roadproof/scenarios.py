@@ -27,6 +27,7 @@ Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 BUILTIN_FILE = Path(__file__).with_name("scenarios.toml")
+MAX_TIME_S, MAX_SPEED_MPS, MAX_CANVAS_M = 3600.0, 100.0, 100.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,10 +61,19 @@ class Scenario:
         for what, value in {**numbers, "time_limit_s": self.time_limit_s}.items():
             if not math.isfinite(value):
                 raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number")
-        if self.time_limit_s <= 0:
-            raise ScenarioError(f"scenario {self.name}: time_limit_s is {self.time_limit_s}, expected more than 0")
-        if self.start.speed_mps < 0:
-            raise ScenarioError(f"scenario {self.name}: start speed_mps is {self.start.speed_mps}, expected 0 or more")
+        if not 0 < self.time_limit_s <= MAX_TIME_S:
+            raise ScenarioError(
+                f"scenario {self.name}: time_limit_s is {self.time_limit_s:g}, expected more than 0, at most {MAX_TIME_S:g}"
+            )
+        if not 0 <= self.start.speed_mps <= MAX_SPEED_MPS:
+            raise ScenarioError(
+                f"scenario {self.name}: start speed_mps is {self.start.speed_mps:g}, expected 0 to {MAX_SPEED_MPS:g}"
+            )
+        if max(self.canvas.width_m, self.canvas.length_m) > MAX_CANVAS_M:
+            raise ScenarioError(
+                f"scenario {self.name}: canvas is {self.canvas.width_m:g} × {self.canvas.length_m:g} m, expected at most "
+                f"{MAX_CANVAS_M:g} m"
+            )
         if math.dist(self.goal_m, (self.start.x_m, self.start.y_m)) < 1.0:
             raise ScenarioError(f"scenario {self.name}: the goal is less than 1 m from the start; move it")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import traceback
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -65,6 +65,8 @@ app.add_typer(study, name="study")
 
 
 _debug = False
+_INTERRUPTED = 130
+_UsageError: Any = typer.BadParameter.__base__  # typer brings click along, in a place that changes
 
 
 def _version(wanted: bool | None) -> None:
@@ -92,14 +94,28 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 def main() -> None:
     """Entry point of the `roadproof` command."""
     keep_freed_memory()
-    complain = Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print
     try:
-        app()
-    except RoadproofError as error:
+        code = app(prog_name="roadproof", standalone_mode=False)
+    except _UsageError as error:
+        # Where no words were given, the help was shown instead, and there is nothing to say.
+        if said := error.format_message().rstrip("."):
+            _complain(f"{said}; see: {error.ctx.command_path if error.ctx else 'roadproof'} --help")
+        sys.exit(2)
+    except (RoadproofError, OSError) as error:
         if _debug:
             traceback.print_exc()
-        complain(f"roadproof: {error!s:.1000}")  # what a message quotes may be long
+        # The system's own words come from a path that no file can have, or a disk that fails.
+        system = not isinstance(error, RoadproofError) and isinstance(error, OSError) and error.strerror
+        _complain(f"{str(error.filename)[:200]!r}: {error.strerror}; check the path" if system else str(error))
         sys.exit(2)
-    except KeyboardInterrupt:
-        complain("roadproof: interrupted; give the same command again to go on")
-        sys.exit(130)
+    except typer.Abort:
+        code = _INTERRUPTED
+    if code == _INTERRUPTED:
+        _complain("interrupted; give the same command again to go on")
+    sys.exit(code)
+
+
+def _complain(message: str) -> None:
+    """One line on standard error; what a message quotes may be long, or hold line ends and a terminal's commands."""
+    plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in message)
+    Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"roadproof: {plain:.1000}")

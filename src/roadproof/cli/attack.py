@@ -25,7 +25,7 @@ def attack(
     ] = "published",
     shape: Annotated[str, typer.Option(help="rectangle, ellipse, triangle or diamond.")] = "rectangle",
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
-    albedo: Annotated[tuple[float, float], typer.Option(help="Darkest and brightest paint, 0 to 1.")] = (0.0, 1.0),
+    albedo: Annotated[tuple[float, float], number("Darkest and brightest paint.", 0.0, 1.0)] = (0.0, 1.0),
     max_painted_share: Annotated[
         float | None, number("Largest share of the canvas that may be painted.", 0.0, 1.0, show_default=False)
     ] = None,

@@ -34,7 +34,9 @@ def evaluate(
     ] = 5,
     start_range: Annotated[
         tuple[float, float, float],
-        typer.Option(help="Those starts: at most so many metres aside, radians turned and m/s faster."),
+        typer.Option(
+            help="Those starts: at most so many metres aside, radians turned and m/s faster.  [0 to 1, 0.3 and 5]"
+        ),
     ] = (0.3, 0.05, 2.0),
     runs: Annotated[
         int | None,
@@ -69,6 +71,7 @@ def evaluate(
     from roadproof.patterns import load_pattern, read_paint
     from roadproof.pipeline.fidelity import measure_fidelity
     from roadproof.pipeline.film import film_trial
+    from roadproof.recorded.simulator import check_canvas
     from roadproof.recordings import load_recordings
 
     where = world_asked(simulator, device, controller, scenario, scenarios)
@@ -85,6 +88,8 @@ def evaluate(
     if figures is None and (random or recordings):
         raise PatternError(f"{pattern} is a picture; --random and --recordings need the pattern.json of an attack")
     recorded = None if recordings is None else load_recordings(recordings)
+    if recorded is not None and recorded.canvas is not None and where.scenario is not None:
+        check_canvas(where.scenario.canvas, recorded.canvas)
     hold(out)
     who = options.driver_of(controller, device)
     with where.open() as (world, driven):

@@ -22,16 +22,29 @@ def record(
     driver: options.DriverSpec = "expert",
     weather: options.WeatherName = "clear-noon",
     budget: options.BudgetName = "quick",
-    trajectories: Annotated[int | None, unset("T, how many drives: 1, 3, 5 or 7.  [default: the budget's]")] = None,
+    trajectories: Annotated[
+        int | None, number("T, how many drives, an odd number.  [default: the budget's]", 1, 7, show_default=False)
+    ] = None,
     scheme: Annotated[
         str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
     ] = "group",
     deviation_m: Annotated[
         list[float] | None,
-        unset("How far drives are pushed aside; several are taken in turn.  [default: the budget's]"),
+        number(
+            "How far drives are pushed aside; several are taken in turn.  [default: the budget's]",
+            0.1,
+            5.0,
+            show_default=False,
+        ),
     ] = None,
     noise_deg: Annotated[
-        tuple[int, int] | None, unset("Push by noise on the steering instead, least and most, as published.")
+        tuple[int, int] | None,
+        number(
+            "Push by noise on the steering instead, least and most, as published.",
+            0,
+            57,
+            show_default=False,
+        ),
     ] = None,
     horizon_m: Annotated[float, number("Keep frames from so far before the canvas.", 1.0, 1000.0)] = 25.0,
     frames: Annotated[

@@ -15,7 +15,7 @@ from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
 SPECS = "town or carla://HOST:PORT"
-CARLA_PORT = 2000
+CARLA_PORT, LAST_PORT = 2000, 65534  # sensor data goes through the next
 
 
 class MappedSimulator(Simulator, OpenWorld, Protocol):
@@ -79,6 +79,8 @@ def _address(spec: str) -> tuple[str, int, PaintChoice]:
         host, port = parts.hostname, parts.port
     except ValueError as error:
         raise SimulatorError(f"simulator {spec!r} is no address ({error}), expected carla://HOST:PORT") from None
+    if port is not None and not 1 <= port <= LAST_PORT:
+        raise SimulatorError(f"simulator {spec!r} has port {port}, expected 1 to {LAST_PORT:,}")
     if not host or parts.path or parts.fragment or parts.username:
         raise SimulatorError(f"simulator {spec!r} is no address, expected carla://HOST:PORT")
     match parts.query:

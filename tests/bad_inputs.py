@@ -1,0 +1,135 @@
+"""What someone may give `roadproof` by mistake or to do harm: command lines, plans, scenarios, patterns, recordings,
+weights. Made by code, so that no option that is added is forgotten."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import random
+import shutil
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import typer
+from typer.models import ArgumentInfo
+
+from mutations import mutated
+
+NOWHERE = "/dev/null/nowhere"
+"""A folder that nobody can write: where all else is well, a command is refused here, before any work."""
+
+NUMBERS = ("-1", "-9" + 22 * "9", "1" + 23 * "0", "nan", "inf", "-inf", "1e999", "-0.5", "abc", "", " ", "0x10", "1;2")
+"""Out of the range of every number that is asked for, or no number at all."""
+
+WORDS = ("", " ", "nosuch", "x" * 5000, "../../x", "a\nb", "\x1b[31mred", "<script>", "ä", "-", "left-03\\", "{}", ",")
+"""Names of nothing."""
+
+PLACES = ("", ".", "nowhere", "/dev/null", "/dev/null/x", "/", "x" * 5000, "a\nb", "~", "nul\tx", "/proc/self/mem")
+"""Files and folders that are not there, or are no such thing."""
+
+UNWRITABLE = ("/dev/null", "/dev/null/x", "/proc/self/mem", "/proc/nowhere/x", "x" * 5000, "a/" * 3000)
+ADDRESSES = ("moon", "carla://", "carla://x:0", "carla://x:65535", "carla://x:1e9", "carla://[::1", "recorded:", "carla:")
+GATES = {
+    ("calibrate",): ("nowhere",), ("report",): ("nowhere",), ("select",): ("nowhere", "--controller", "nosuch"),
+    ("attack",): ("nowhere", "--controller", "nosuch"), ("evaluate",): ("nowhere.json", "--out", NOWHERE),
+    ("check",): ("nowhere.toml",), ("check-controller",): ("nosuch",), ("convert-cil",): ("nowhere.npz", NOWHERE),
+    ("harden",): ("nosuch", "--scenarios", "nosuch", "--out", NOWHERE), ("record",): ("left-03", "--out", NOWHERE),
+    ("study", "run"): ("nowhere.toml",), ("study", "tables"): ("nowhere",), ("controllers",): ("nosuch",),
+    ("study", "transfer"): ("nowhere.toml", "--controllers", "nosuch"), ("scenarios",): ("--file", "nowhere.toml"),
+    ("carla", "scenario"): ("0", "1", "--port", "1"), ("carla", "doctor"): ("--port", "1"),
+    ("carla", "serve"): ("--map", "nowhere.xodr"),
+}  # fmt: skip
+"""What ends each command before it works, where nothing else does; by default the folder that cannot be written."""
+
+
+@dataclass(frozen=True)
+class Bad:
+    """One bad input.
+
+    Args:
+        kind: of input.
+        words: of the command line.
+        names: what the refusal must name; empty where any refusal will do.
+        may_pass: whether it may be harmless: then the command may go on to what ends it, or end well.
+    """
+
+    kind: str
+    words: tuple[str, ...]
+    names: str = ""
+    may_pass: bool = False
+
+
+def command_lines() -> Iterator[Bad]:
+    """Every option of every command, with every odd value of its kind."""
+    from roadproof.cli import app
+
+    for path, function in _verbs(app):
+        gate = GATES.get(path, ("--out", NOWHERE))
+        hints = get_type_hints(function, include_extras=True)
+        for name in inspect.signature(function).parameters:
+            hint = hints[name]
+            kind, said = get_args(hint)[0], next(each for each in get_args(hint)[1:] if hasattr(each, "param_decls"))
+            if isinstance(said, ArgumentInfo):
+                continue
+            option = next((word for word in said.param_decls or () if len(word) > 2), f"--{name.replace('_', '-')}")
+            words = (*path, *gate)
+            if kind is bool:
+                yield Bad("command lines", (*words, f"{option}=maybe"))
+                continue
+            number = any(each in repr(kind) for each in ("int", "float"))
+            values = NUMBERS if number else PLACES if "Path" in repr(kind) else WORDS
+            if option == "--out":
+                values = UNWRITABLE
+            for value in (*values, *(ADDRESSES if option == "--simulator" else ())):
+                many = len(get_args(kind)) if get_origin(kind) is tuple else 1
+                # `=`, since a value may begin with a dash.
+                given = (f"{option}={value}",) if many == 1 else (option, *[value] * many)
+                yield Bad("command lines", (*words, *given), option if number and many == 1 else "")
+        yield Bad("command lines", (*path, *gate, "--no-such-option"), "--no-such-option")
+        yield Bad("command lines", (*path, *gate, *["too-much"] * 9))
+
+
+def _verbs(group: typer.Typer, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for each in group.registered_commands:
+        assert each.callback is not None
+        yield (*path, each.name or each.callback.__name__.replace("_", "-")), each.callback
+    for inner in group.registered_groups:
+        assert inner.typer_instance is not None
+        yield from _verbs(inner.typer_instance, (*path, str(inner.name)))
+
+
+def attempt(bad: Bad, limit_s: float = 60.0) -> str:
+    """Call the command in this process: "" where it was refused as it should be, "taken" where that may be; else what
+    happened instead, in a few words."""
+    from roadproof.cli import main
+
+    out, err, code, began = io.StringIO(), io.StringIO(), None, time.perf_counter()
+    before, sys.argv = sys.argv, ["roadproof", *bad.words]
+    try:
+        with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            main()
+    except SystemExit as ended:
+        code = ended.code or 0
+    except BaseException as error:
+        return f"{type(error).__name__}: {error!s:.300}"
+    finally:
+        sys.argv = before
+    said, seconds = err.getvalue(), time.perf_counter() - began
+    if seconds > limit_s:
+        return f"took {seconds:.0f} s"
+    if code != 2:
+        return "taken" if bad.may_pass and code in (0, 1) else f"exit code {code}: {(said or out.getvalue())[-300:]!r}"
+    if said.count("\n") != 1 or not said.startswith("roadproof: "):
+        return f"not one line: {said[-300:]!r}"
+    if out.getvalue():
+        return f"said on the way: {out.getvalue()[:300]!r}"
+    if bad.names not in said:
+        return "taken" if bad.may_pass else f"refused for something else: {said:.300}"
+    return ""
