@@ -5,21 +5,16 @@ from __future__ import annotations
 
 import inspect
 import io
-import random
-import shutil
 import sys
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo
-
-from mutations import mutated
 
 NOWHERE = "/dev/null/nowhere"
 """A folder that nobody can write: where all else is well, a command is refused here, before any work."""
@@ -34,7 +29,16 @@ PLACES = ("", ".", "nowhere", "/dev/null", "/dev/null/x", "/", "x" * 5000, "a\nb
 """Files and folders that are not there, or are no such thing."""
 
 UNWRITABLE = ("/dev/null", "/dev/null/x", "/proc/self/mem", "/proc/nowhere/x", "x" * 5000, "a/" * 3000)
-ADDRESSES = ("moon", "carla://", "carla://x:0", "carla://x:65535", "carla://x:1e9", "carla://[::1", "recorded:", "carla:")
+ADDRESSES = (
+    "moon",
+    "carla://",
+    "carla://x:0",
+    "carla://x:65535",
+    "carla://x:1e9",
+    "carla://[::1",
+    "recorded:",
+    "carla:",
+)
 GATES = {
     ("calibrate",): ("nowhere",), ("report",): ("nowhere",), ("select",): ("nowhere", "--controller", "nosuch"),
     ("attack",): ("nowhere", "--controller", "nosuch"), ("evaluate",): ("nowhere.json", "--out", NOWHERE),
@@ -42,7 +46,7 @@ GATES = {
     ("harden",): ("nosuch", "--scenarios", "nosuch", "--out", NOWHERE), ("record",): ("left-03", "--out", NOWHERE),
     ("study", "run"): ("nowhere.toml",), ("study", "tables"): ("nowhere",), ("controllers",): ("nosuch",),
     ("study", "transfer"): ("nowhere.toml", "--controllers", "nosuch"), ("scenarios",): ("--file", "nowhere.toml"),
-    ("carla", "scenario"): ("0", "1", "--port", "1"), ("carla", "doctor"): ("--port", "1"),
+    ("carla", "scenario"): ("--port", "0", "0", "1"), ("carla", "doctor"): ("--port", "0"),
     ("carla", "serve"): ("--map", "nowhere.xodr"),
 }  # fmt: skip
 """What ends each command before it works, where nothing else does; by default the folder that cannot be written."""
@@ -78,9 +82,11 @@ def command_lines() -> Iterator[Bad]:
             if isinstance(said, ArgumentInfo):
                 continue
             option = next((word for word in said.param_decls or () if len(word) > 2), f"--{name.replace('_', '-')}")
-            words = (*path, *gate)
+            # What is tried comes first, since the first mistake is told.
+            place = gate.index(option) if option in gate else len(gate)
+            rest = (*gate[:place], *gate[place + 2 :])
             if kind is bool:
-                yield Bad("command lines", (*words, f"{option}=maybe"))
+                yield Bad("command lines", (*path, f"{option}=maybe", *rest))
                 continue
             number = any(each in repr(kind) for each in ("int", "float"))
             values = NUMBERS if number else PLACES if "Path" in repr(kind) else WORDS
@@ -90,7 +96,7 @@ def command_lines() -> Iterator[Bad]:
                 many = len(get_args(kind)) if get_origin(kind) is tuple else 1
                 # `=`, since a value may begin with a dash.
                 given = (f"{option}={value}",) if many == 1 else (option, *[value] * many)
-                yield Bad("command lines", (*words, *given), option if number and many == 1 else "")
+                yield Bad("command lines", (*path, *given, *rest), option if number and many == 1 else "")
         yield Bad("command lines", (*path, *gate, "--no-such-option"), "--no-such-option")
         yield Bad("command lines", (*path, *gate, *["too-much"] * 9))
 
@@ -128,8 +134,6 @@ def attempt(bad: Bad, limit_s: float = 60.0) -> str:
         return "taken" if bad.may_pass and code in (0, 1) else f"exit code {code}: {(said or out.getvalue())[-300:]!r}"
     if said.count("\n") != 1 or not said.startswith("roadproof: "):
         return f"not one line: {said[-300:]!r}"
-    if out.getvalue():
-        return f"said on the way: {out.getvalue()[:300]!r}"
     if bad.names not in said:
         return "taken" if bad.may_pass else f"refused for something else: {said:.300}"
     return ""

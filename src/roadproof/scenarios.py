@@ -63,7 +63,8 @@ class Scenario:
                 raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number")
         if not 0 < self.time_limit_s <= MAX_TIME_S:
             raise ScenarioError(
-                f"scenario {self.name}: time_limit_s is {self.time_limit_s:g}, expected more than 0, at most {MAX_TIME_S:g}"
+                f"scenario {self.name}: time_limit_s is {self.time_limit_s:g}, expected more than 0, at most "
+                f"{MAX_TIME_S:g}"
             )
         if not 0 <= self.start.speed_mps <= MAX_SPEED_MPS:
             raise ScenarioError(
@@ -71,8 +72,8 @@ class Scenario:
             )
         if max(self.canvas.width_m, self.canvas.length_m) > MAX_CANVAS_M:
             raise ScenarioError(
-                f"scenario {self.name}: canvas is {self.canvas.width_m:g} × {self.canvas.length_m:g} m, expected at most "
-                f"{MAX_CANVAS_M:g} m"
+                f"scenario {self.name}: canvas is {self.canvas.width_m:g} × {self.canvas.length_m:g} m, expected "
+                f"at most {MAX_CANVAS_M:g} m"
             )
         if math.dist(self.goal_m, (self.start.x_m, self.start.y_m)) < 1.0:
             raise ScenarioError(f"scenario {self.name}: the goal is less than 1 m from the start; move it")

@@ -95,7 +95,7 @@ def film_frames(path):
 
 def test_a_drive_leaves_film_episode_and_a_summary(workplace, tmp_path):
     options = ["--cars", "2", "--pedestrians", "3", "--seed", "5", "--weather", "rainy-noon", "--out", str(tmp_path)]
-    done = drive(workplace, "--scenario", "short", *options)
+    done = drive(workplace, "--scenario", "short", "--quiet", *options)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert "short, rainy-noon, bare road, 2 cars, 3 pedestrians: time limit after 0.4 s, no events" in done.stdout

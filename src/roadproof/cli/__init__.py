@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import traceback
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -31,6 +31,7 @@ from roadproof.cli.scenarios import scenarios
 from roadproof.cli.select import select
 from roadproof.cli.study import study
 from roadproof.cli.train import train
+from roadproof.cli.verbs import verb
 from roadproof.errors import RoadproofError
 from roadproof.foreign import LIMIT_S, end_calls_after
 from roadproof.memory import keep_freed_memory
@@ -42,24 +43,24 @@ app = typer.Typer(
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
 VERBS = (
-    demo,
-    record,
-    calibrate,
-    attack,
-    select,
-    evaluate,
+    verb(demo, estimates=True),
+    verb(record, estimates=True),
+    verb(calibrate),
+    verb(attack, estimates=True),
+    verb(select),
+    verb(evaluate, estimates=True),
     report,
-    check,
-    drive,
+    verb(check, estimates=True),
+    verb(drive),
     scenarios,
     controllers,
-    check_controller,
+    verb(check_controller),
     convert_cil,
-    train,
-    harden,
+    verb(train),
+    verb(harden, estimates=True),
 )
-for verb in VERBS:
-    app.command()(verb)
+for each in VERBS:
+    app.command()(each)
 app.add_typer(carla, name="carla")
 app.add_typer(study, name="study")
 
@@ -101,18 +102,24 @@ def main() -> None:
         if said := error.format_message().rstrip("."):
             _complain(f"{said}; see: {error.ctx.command_path if error.ctx else 'roadproof'} --help")
         sys.exit(2)
-    except (RoadproofError, OSError) as error:
-        if _debug:
-            traceback.print_exc()
-        # The system's own words come from a path that no file can have, or a disk that fails.
-        system = not isinstance(error, RoadproofError) and isinstance(error, OSError) and error.strerror
-        _complain(f"{str(error.filename)[:200]!r}: {error.strerror}; check the path" if system else str(error))
-        sys.exit(2)
+    except RoadproofError as error:
+        _fail(str(error))
+    except OSError as error:
+        # The system's own words: of a path that no file can have, or a disk that fails.
+        _fail(f"{str(error.filename)[:200]!r}: {error.strerror}; check the path" if error.strerror else str(error))
     except typer.Abort:
         code = _INTERRUPTED
     if code == _INTERRUPTED:
         _complain("interrupted; give the same command again to go on")
     sys.exit(code)
+
+
+def _fail(message: str) -> NoReturn:
+    """End with a line on the exception that is being handled."""
+    if _debug:
+        traceback.print_exc()
+    _complain(message)
+    sys.exit(2)
 
 
 def _complain(message: str) -> None:

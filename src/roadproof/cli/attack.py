@@ -10,6 +10,7 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import say
+from roadproof.cli.verbs import begin
 from roadproof.limits import MANY, MAX_SEED
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def attack(
     from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
-    from roadproof.io.locks import hold
+    from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
@@ -96,7 +97,6 @@ def attack(
     )
     given = {"iterations": iterations, "restarts": restarts, "masks": masks, "calls": calls}
     searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
-    hold(out)
     drives = load_recordings(recordings)
     driven_in = method != "published" and drives.is_placed and drives.has_both_sides
     word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
@@ -106,6 +106,8 @@ def attack(
     chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
     size = (drives.view.height_px, drives.view.width_px)
     require_usable(attacked, size=size, device=device, drives=False, gradients=searched.by_gradient)
+    frames = sum(len(each.frames) for each in drives.recordings)
+    begin(of_search(searched, OBJECTIVES[word], frames, attacked, groups=len(chosen)), out)
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(OBJECTIVES[word])) as on_step:
         result = run(

@@ -90,15 +90,16 @@ Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]
 Processes: TypeAlias = Annotated[int, number("Drives of the evaluation made at once.", 1, MAX_PROCESSES)]
 
 
-def check_processes(processes: int, simulator: str) -> None:
-    """See that several processes have a simulator each.
+def check_simulator(simulator: str, processes: int = 1) -> None:
+    """See that a simulator is named, and that several processes have one each.
 
     Raises:
-        RoadproofError: they would share one server.
+        RoadproofError: there is none of this name, or they would share one server.
     """
     # The road map comes with it; `--help` is spared.
-    from roadproof.simulators.loading import is_server
+    from roadproof.simulators.loading import check_spec, is_server
 
+    check_spec(simulator)
     if processes > 1 and is_server(simulator):
         raise RoadproofError(
             f"--processes is {processes}, but all of them would step the one server of {simulator}; expected 1"

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli import options
-from roadproof.cli.options import argument, number, unset
+from roadproof.cli.options import argument, number
 from roadproof.cli.output import say
+from roadproof.cli.verbs import begin
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
@@ -64,8 +65,8 @@ def record(
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError, ScenarioError
     from roadproof.io.files import inside
-    from roadproof.io.locks import hold
     from roadproof.pipeline.budget import BUDGETS
+    from roadproof.pipeline.estimate import RECORDED_DRIVE
     from roadproof.simulators.loading import open_simulator
 
     chosen = [options.scenario_of(name, scenarios) for name in dict.fromkeys(names)]
@@ -86,9 +87,9 @@ def record(
     kept = usual.window.frames if frames is None else frames
     window = replace(usual.window, horizon_m=horizon_m, frames=kept)
     places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
-    for place in places.values():
-        hold(place)
+    options.check_simulator(simulator)
     who = options.driver_of(driver, device)
+    begin(RECORDED_DRIVE.times(wanted.count * len(chosen)), *places.values())
 
     with open_simulator(simulator) as world:
         for scenario in chosen:
