@@ -21,7 +21,7 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import check_name, inside
+from roadproof.io.files import AnyPath, as_path, check_name, inside
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -63,7 +63,7 @@ class Scenario:
                 raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number")
         if not 0 < self.time_limit_s <= MAX_TIME_S:
             raise ScenarioError(
-                f"scenario {self.name}: time_limit_s is {self.time_limit_s:g}, expected more than 0, at most "
+                f"scenario {self.name}: time_limit_s is {self.time_limit_s}, expected more than 0, at most "
                 f"{MAX_TIME_S:g}"
             )
         if not 0 <= self.start.speed_mps <= MAX_SPEED_MPS:
@@ -115,7 +115,7 @@ def find_scenario(name: str, scenarios: Sequence[Scenario] | None = None) -> Sce
     raise ScenarioError(f"no scenario is called {name!r}; {hint}")
 
 
-def load_scenarios(path: Path) -> tuple[Scenario, ...]:
+def load_scenarios(path: AnyPath) -> tuple[Scenario, ...]:
     """Read scenarios from a TOML file.
 
     A `map_name` that ends in ".xodr" is the name of an OpenDRIVE file in the folder of the TOML file.
@@ -123,6 +123,7 @@ def load_scenarios(path: Path) -> tuple[Scenario, ...]:
     Raises:
         ScenarioError: the file cannot be read, or an entry is not a valid scenario; the message names it.
     """
+    path = as_path(path)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -145,13 +146,14 @@ def load_scenarios(path: Path) -> tuple[Scenario, ...]:
     return tuple(scenarios)
 
 
-def save_scenarios(scenarios: Sequence[Scenario], path: Path) -> None:
+def save_scenarios(scenarios: Sequence[Scenario], path: AnyPath) -> None:
     """Write scenarios as TOML, under a temporary name first.
 
     Raises:
         OutputError: the file cannot be written.
         ScenarioError: a scenario's map is an OpenDRIVE file in another folder.
     """
+    path = as_path(path)
     blocks = [_block(scenario, path.parent) for scenario in scenarios]
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

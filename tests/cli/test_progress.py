@@ -2,11 +2,15 @@
 
 import re
 import time
+from pathlib import Path
 
 import pytest
 
 from roadproof.cli import progress as saying
 from roadproof.cli.progress import Loudness, in_words, progress, speak, stages
+from roadproof.cli.verbs import begin
+from roadproof.errors import OutputError
+from roadproof.pipeline.estimate import Estimate
 
 
 @pytest.fixture(autouse=True)
@@ -68,18 +72,15 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(invoke, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_takes_long_says_so_once_nothing_else_refuses(invoke, tmp_path):
-    many = ["record", *(f"straight-{k:02}" for k in range(1, 17)), "--trajectories", "7"]
-    code, printed = invoke(*many, "--out", "/dev/null/x")
-    assert code == 2
-    assert printed.err.startswith("roadproof: cannot write /dev/null/x")
-    code, printed = invoke(*many, "--simulator", "moon", "--out", tmp_path)
-    assert code == 2
-    first, last = printed.err.splitlines()
-    assert (
-        first
-        == "This takes 112 drives, about 4 min, 123 MB on the disk; when it is interrupted, the same command goes on"
-    )
-    assert last.startswith("roadproof: simulator 'moon' is unknown")
-    code, printed = invoke(*many, "--quiet", "--simulator", "moon", "--out", tmp_path)
-    assert printed.err.splitlines() == [last]
+def test_what_takes_long_says_so_once_the_folder_is_its_own(capsys, tmp_path):
+    long, short = (Estimate(drives=3, seconds=seconds, megabytes=20.0) for seconds in (3600.0, 20.0))
+    with pytest.raises(OutputError):
+        begin(long, Path("/dev/null/x"))
+    assert capsys.readouterr().err == ""
+    begin(long, tmp_path)
+    said = "This takes 3 drives, about 60 min, 20 MB on the disk; when it is interrupted, the same command goes on\n"
+    assert capsys.readouterr().err == said
+    begin(short, tmp_path)
+    speak(Loudness.QUIET)
+    begin(long, tmp_path)
+    assert capsys.readouterr().err == ""

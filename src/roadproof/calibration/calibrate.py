@@ -18,6 +18,7 @@ from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import Homography, homography_from_pose
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
@@ -112,7 +113,7 @@ def calibrate(
     drives: Drives,
     method: Method = Method.TWO_PAINT,
     *,
-    folder: Path | None = None,
+    folder: AnyPath | None = None,
     on_call: Callable[[int], object] = lambda _done: None,
 ) -> Calibrated:
     """Find out where the canvas is in every frame of recorded drives, and how paint looks there.
@@ -129,6 +130,7 @@ def calibrate(
         SimulatorError, ScenarioError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
+    folder = None if folder is None else as_path(folder)
     settings = drives.settings
     if (simulator.camera, simulator.input, simulator.dt_s) != (settings.camera, settings.view, settings.dt_s):
         raise CalibrationError(

@@ -45,7 +45,11 @@ def verb(function: Callable[..., None], *, estimates: bool = False) -> Callable[
             raise RoadproofError("both --quiet and --verbose are given; choose one")
         speak(Loudness.QUIET if quiet else Loudness.VERBOSE if verbose else Loudness.USUAL)
         _dry_run = dry_run
-        function(**given)
+        try:
+            function(**given)
+        finally:
+            _dry_run = False
+            speak(Loudness.USUAL)
 
     more: dict[str, Any] = {"quiet": _Quiet, "verbose": _Verbose} | ({"dry_run": _DryRun} if estimates else {})
     hints = get_type_hints(function, include_extras=True) | more

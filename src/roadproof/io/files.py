@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from roadproof.errors import OutputError, RoadproofError
 
@@ -19,10 +19,27 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+AnyPath: TypeAlias = str | os.PathLike[str]
+"""What public functions take as a path."""
+
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
 _MOST_DIGITS = 20
 _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
+
+
+def as_path(path: Any) -> Path:  # noqa: ANN401  # users without a type checker give anything
+    """A path as users of the library give it.
+
+    Raises:
+        OutputError: it is no path at all; the message says what came.
+    """
+    try:
+        if os.fspath(path):
+            return Path(path)
+    except TypeError:
+        pass
+    raise OutputError(f"{path!r:.60} is no path, expected a text or a pathlib.Path")
 
 
 def is_plain_name(name: object) -> bool:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
-from roadproof.io.files import read_toml
+from roadproof.io.files import AnyPath, as_path, read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
@@ -197,7 +197,7 @@ class Study(Conditions):
         )
 
 
-def load_study(path: Path, *, trust: bool = False) -> Study:
+def load_study(path: AnyPath, *, trust: bool = False) -> Study:
     """Read a study.
 
     Args:
@@ -208,6 +208,7 @@ def load_study(path: Path, *, trust: bool = False) -> Study:
         StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or it is not trusted with
             what it asks for; says which.
     """
+    path = as_path(path)
     content = read_toml(path, StudyError)
     try:
         study = _study(content, path.parent)
