@@ -105,6 +105,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         try:
             write(part)
             part.chmod(0o644)
+            _settle(part)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
@@ -125,9 +126,18 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], object]) -> No
         try:
             write(part)
             part.chmod(0o755)
+            for each in part.rglob("*"):
+                if each.is_file():
+                    _settle(each)
             part.replace(folder)
         finally:
             shutil.rmtree(part, ignore_errors=True)
+
+
+def _settle(path: Path) -> None:
+    """Wait until the disk has a file, so that a power cut cannot leave its name with half of it."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 @contextmanager
