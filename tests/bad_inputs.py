@@ -5,16 +5,37 @@ from __future__ import annotations
 
 import inspect
 import io
+import random
+import shutil
 import sys
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo
+
+from killable import STUDY
+from mutations import files_of, mutated
+from paint_shy import along_a_street
+from recorded_drives import drivable_set
+from roadproof.controllers.shipped import shipped_weights
+from roadproof.patterns import save_pattern
+from roadproof.recordings import save_recordings
+from roadproof.scenarios import save_scenarios
+from team_folder import BAR, PLAN, write_team
+
+KINDS = (".json", ".npz", ".png", ".npy")
+ODD_TOML = (
+    "nan", "-inf", "-1", "0", "1e39", "1" + 23 * "0", "1.5", "true", '""', "[]", "{}", "[[]]", "[1, 1]", "1979-05-27",
+    "'x'", f"'{'x' * 5000}'", "'../../x'", "'/etc/passwd'", "'a\u0000b'", "['left-03', 'left-03']", "[nan, nan]",
+    "1000000000", "{ x_m = nan }", "[" * 5000, "'",
+)  # fmt: skip
+"""Values that no plan has where they are put."""
 
 NOWHERE = "/dev/null/nowhere"
 """A folder that nobody can write: where all else is well, a command is refused here, before any work."""
@@ -137,3 +158,57 @@ def attempt(bad: Bad, limit_s: float = 60.0) -> str:
     if bad.names not in said:
         return "taken" if bad.may_pass else f"refused for something else: {said:.300}"
     return ""
+
+
+def damaged_files(place: Path, count: int, seed: int) -> Iterator[Bad]:
+    """Plans, scenario files, patterns, recordings and weights, one change in each; the file is put back afterwards."""
+    rng, kinds = random.Random(seed), _whole_files(place)
+    for k in range(count):
+        kind, (words, paths) = list(kinds.items())[k % len(kinds)]
+        path = rng.choice(paths)
+        kept = path.read_bytes()
+        text = path.suffix == ".toml" and rng.random() < 0.8
+        path.write_bytes(_with_odd_line(kept, rng) if text else _changed(kept, path.suffix, rng))
+        # What is refused names the file, or the folder of it; else the command went on to what ends it.
+        yield Bad(kind, words, paths[0].parent.name if len(paths) > 1 else path.name, may_pass=True)
+        path.write_bytes(kept)
+
+
+def _whole_files(place: Path) -> dict[str, tuple[tuple[str, ...], list[Path]]]:
+    """What is damaged: by kind the command that reads it, and its files."""
+    plan, set_, out = place / "study.toml", place / "damaged-set", str(place / "out")
+    save_scenarios([along_a_street(place, 2.0)], place / "scenarios.toml")
+    plan.write_text(STUDY)
+    pattern, weights = place / "pattern.json", place / "weights.safetensors"
+    save_pattern(BAR, pattern)
+    shutil.copyfile(shipped_weights("pilotnet"), weights)
+    save_recordings(drivable_set(), set_)
+    check = write_team(place / "team", plan=PLAN.replace("team_folder:magenta_shy", "nosuch.safetensors"))
+    street = ("--scenarios", f"{place}/scenarios.toml", "--scenario", "street", "--out", NOWHERE)
+    return {
+        "study plans": (("study", "run", str(plan), "--out", out), [plan]),
+        "check plans": (("check", str(check), "--out", out), [check]),
+        "scenario files": (("demo", *street), [place / "scenarios.toml"]),
+        "patterns": (("evaluate", str(pattern), "--controller", "expert", "--out", NOWHERE), [pattern]),
+        "recordings": (("attack", str(set_), "--controller", "nosuch", "--out", out), files_of(set_, *KINDS)),
+        "weights": (("demo", "--controller", str(weights), "--out", NOWHERE), [weights]),
+    }
+
+
+def _with_odd_line(content: bytes, rng: random.Random) -> bytes:
+    """One value of a TOML file for an odd one, or a line twice, or gone."""
+    lines = content.decode().splitlines()
+    k = rng.choice([number for number, line in enumerate(lines) if line.strip()])
+    key, equals, _ = lines[k].partition("=")
+    if equals and rng.random() < 0.8:
+        lines[k] = f"{key}= {rng.choice(ODD_TOML)}"
+    else:
+        lines[k : k + 1] = rng.choice(([], [lines[k]] * 2))
+    return "\n".join(lines).encode()
+
+
+def _changed(content: bytes, suffix: str, rng: random.Random) -> bytes:
+    """As `mutated`; of weights rather what says how they lie."""
+    if suffix == ".safetensors" and rng.random() < 0.7:
+        return mutated(content[:2000], suffix, rng) + content[2000:]
+    return mutated(content, suffix, rng)

@@ -138,7 +138,7 @@ def run(name: str, folder: Path) -> None:
     BUDGETS["quick"], HARDENING_BUDGETS["quick"] = TINY, HARDENING
     methods.SHIFT_RUNGS = (Rung(3, 12, every=2),)
     # One place for what all runs of a command are given: it is a part of what they leave.
-    given = folder.parent / f"{name}-given"
+    given = folder.parent / f"given-{name}"
     given.mkdir(exist_ok=True)
     sys.path.append(str(Path(__file__).parent))
     sys.argv = ["roadproof", *COMMANDS[name](given), "--out", str(folder)]
@@ -173,9 +173,9 @@ def differences(one: Path, two: Path) -> list[str]:
         contents = [(folder / name).read_bytes() for folder in (one, two)]
         if name.endswith(".json"):
             contents = [json.dumps(_without_times(json.loads(each))).encode() for each in contents]
-            contents = [
-                each.replace(str(folder).encode(), b"OUT") for each, folder in zip(contents, (one, two), strict=True)
-            ]
+        if name.endswith((".json", ".md")):
+            pairs = zip(contents, (one, two), strict=True)
+            contents = [each.replace(str(folder).encode(), b"OUT") for each, folder in pairs]
         if contents[0] != contents[1]:
             told.append(f"{name} differs")
     return told
@@ -202,14 +202,14 @@ def kill_and_resume(
     Args:
         begin: of `starter`.
         name: of the command.
-        straight: what it left where it was not killed.
+        straight: what it left where it was not killed; its name is no beginning of that of another folder there.
         whole_s: how long it took.
         rng: when, by which signal, and how much of the file is lost.
 
     Returns:
         What was lost or went wrong; empty where the result is the same.
     """
-    folder = straight.with_name(f"{name}-killed")
+    folder = straight.with_name(f"killed-{name}")
     shutil.rmtree(folder, ignore_errors=True)
     folder.with_suffix(".log").unlink(missing_ok=True)
     process, how = begin(name, folder), rng.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))

@@ -106,7 +106,7 @@ def check_same(one, two):
 
 @pytest.mark.slow
 def test_what_is_killed_at_any_time_ends_as_what_is_not(start, tmp_path):
-    name, straight = "attack", tmp_path / "attack"
+    name, straight = "attack", tmp_path / "straight"
     began = time.monotonic()
     process = start(name, straight)
     process.join(PATIENCE_S)
