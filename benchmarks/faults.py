@@ -33,6 +33,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,8 @@ def files(count: int, seed: int, place: Path) -> dict[str, Any]:
 def inputs(count: int, seed: int, place: Path) -> dict[str, Any]:
     """Every command line, and so many damaged files."""
     counted, wrong = Counter[str](), list[str]()
-    for bad in (*command_lines(), *damaged_files(place, count, seed)):
+    # One by one: a file is damaged only while it is tried.
+    for bad in chain(command_lines(), damaged_files(place, count, seed)):
         happened = attempt(bad)
         counted[f"{bad.kind}, {'taken' if happened == 'taken' else 'wrong' if happened else 'refused'}"] += 1
         if happened not in ("", "taken"):

@@ -186,7 +186,7 @@ def _whole_files(place: Path) -> dict[str, tuple[tuple[str, ...], list[Path]]]:
     check = write_team(place / "team", plan=PLAN.replace("team_folder:magenta_shy", "nosuch.safetensors"))
     street = ("--scenarios", f"{place}/scenarios.toml", "--scenario", "street", "--out", NOWHERE)
     return {
-        "study plans": (("study", "run", str(plan), "--out", out), [plan]),
+        "study plans": (("study", "run", str(plan), "--out", NOWHERE), [plan]),
         "check plans": (("check", str(check), "--out", out), [check]),
         "scenario files": (("demo", *street), [place / "scenarios.toml"]),
         "patterns": (("evaluate", str(pattern), "--controller", "expert", "--out", NOWHERE), [pattern]),
