@@ -108,7 +108,7 @@ def test_an_unknown_name_is_answered_with_the_nearest() -> None:
 
 
 def test_lists_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="cannot be read"):
+    with pytest.raises(ScenarioError, match="cannot read"):
         load_scenarios(tmp_path / "missing.toml")
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="cannot be written"):

@@ -12,7 +12,6 @@ import hashlib
 import json
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import AnyPath, as_path, check_name, inside
+from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -124,13 +123,7 @@ def load_scenarios(path: AnyPath) -> tuple[Scenario, ...]:
         ScenarioError: the file cannot be read, or an entry is not a valid scenario; the message names it.
     """
     path = as_path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ScenarioError(f"scenarios {path} cannot be read ({error.strerror}); check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise ScenarioError(f"scenarios {path} is not valid TOML ({error})") from error
-    entries = content.get("scenario")
+    entries = read_toml(path, ScenarioError).get("scenario")
     if not isinstance(entries, list) or not entries:
         raise ScenarioError(f"scenarios {path} has no [[scenario]], expected at least one")
     scenarios: list[Scenario] = []

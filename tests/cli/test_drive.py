@@ -128,7 +128,7 @@ MISTAKES = {
     "unknown weather": (["--weather", "rainy-non"], "did you mean rainy-noon?"),
     "unknown driver": (["--controller", "exprt"], "--controller is 'exprt', expected expert or a controller"),
     "missing weights": (["--controller", "none.safetensors"], "none.safetensors does not exist"),
-    "missing list": (["--scenarios", "none.toml"], "none.toml cannot be read"),
+    "missing list": (["--scenarios", "none.toml"], "cannot read none.toml"),
     "missing pattern": (["--pattern", "none.json"], "cannot read none.json"),
     "missing picture": (["--pattern", "none.png"], "none.png is missing; give a pattern"),
     "broken pattern": (["--pattern", "broken.json"], "broken.json is not valid JSON"),

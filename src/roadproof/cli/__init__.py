@@ -6,6 +6,7 @@ A `RoadproofError` is one line on standard error and exit code 2, a traceback on
 from __future__ import annotations
 
 import math
+import os
 import sys
 import traceback
 from typing import Annotated, Any, NoReturn
@@ -111,6 +112,9 @@ def main() -> None:
         code = _INTERRUPTED
     if code == _INTERRUPTED:
         _complain("interrupted; give the same command again to go on")
+        # At once: what works beside this process ends with it, and would be waited for.
+        sys.stdout.flush()
+        os._exit(code)
     sys.exit(code)
 
 

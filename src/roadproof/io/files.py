@@ -24,6 +24,7 @@ AnyPath: TypeAlias = str | os.PathLike[str]
 
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
+_LONGEST_TEXT = 1000
 _MOST_DIGITS = 20
 _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
 
@@ -256,14 +257,33 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
         error: what is raised.
 
     Raises:
-        error: the file cannot be read, or is not valid TOML; the message names it.
+        error: the file cannot be read, is not valid TOML, or has a text that can name nothing: of more than 1,000
+            characters, or with a NUL; the message names it.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
     except (ValueError, RecursionError) as reason:
         raise error(f"{path} is not valid TOML ({reason})") from None
+    for text in _texts(content):
+        if len(text) > _LONGEST_TEXT or "\0" in text:
+            raise error(
+                f"{path} has the text {text!r:.40} of {len(text)} characters, expected at most {_LONGEST_TEXT} and no NUL"
+            )
+    return content
+
+
+def _texts(value: object) -> Generator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, each in cast("dict[str, object]", value).items():
+            yield key
+            yield from _texts(each)
+    elif isinstance(value, list):
+        for each in cast("list[object]", value):
+            yield from _texts(each)
 
 
 def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:
