@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,6 +14,7 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import Form, RecordFile
 from roadproof.paint import Conspicuousness
 from roadproof.patterns import Pattern, load_pattern, save_pattern
@@ -99,7 +99,7 @@ class AttackResult:
     predicted_range_m: tuple[float, float] | None = None
     conspicuousness: Conspicuousness | None = None
 
-    def save(self, folder: Path, made_of: Mapping[str, object] | None = None) -> None:
+    def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
 
         Args:
@@ -109,6 +109,7 @@ class AttackResult:
         Raises:
             OutputError: the folder cannot be written.
         """
+        folder = as_path(folder)
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
@@ -122,12 +123,13 @@ class AttackResult:
         )
 
     @staticmethod
-    def load(folder: Path) -> AttackResult:
+    def load(folder: AnyPath) -> AttackResult:
         """Read what `save` wrote.
 
         Raises:
             RoadproofError: a file is missing, damaged or of another format.
         """
+        folder = as_path(folder)
         path = folder / "result.json"
         content = RESULT_FILE.content(path)
         if "method" not in content:

@@ -19,6 +19,7 @@ from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import Homography, homography_from_pose
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
@@ -114,7 +115,7 @@ def calibrate(
     drives: Drives,
     method: Method = Method.TWO_PAINT,
     *,
-    folder: Path | None = None,
+    folder: AnyPath | None = None,
     on_call: Callable[[int], object] = lambda _done: None,
 ) -> Calibrated:
     """Find out where the canvas is in every frame of recorded drives, and how paint looks there.
@@ -131,6 +132,7 @@ def calibrate(
         SimulatorError, ScenarioError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
+    folder = None if folder is None else as_path(folder)
     settings = drives.settings
     if (simulator.camera, simulator.input, simulator.dt_s) != (settings.camera, settings.view, settings.dt_s):
         raise CalibrationError(

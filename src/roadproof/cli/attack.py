@@ -11,6 +11,7 @@ from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import say
 from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.verbs import begin
 from roadproof.limits import MANY, MAX_SEED
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def attack(
     ] = "published",
     shape: Annotated[str, typer.Option(help="rectangle, ellipse, triangle or diamond.")] = "rectangle",
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
-    albedo: Annotated[tuple[float, float], typer.Option(help="Darkest and brightest paint, 0 to 1.")] = (0.0, 1.0),
+    albedo: Annotated[tuple[float, float], number("Darkest and brightest paint.", 0.0, 1.0)] = (0.0, 1.0),
     max_painted_share: Annotated[
         float | None, number("Largest share of the canvas that may be painted.", 0.0, 1.0, show_default=False)
     ] = None,
@@ -90,7 +91,7 @@ def attack(
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
     from roadproof.errors import RecordingError
-    from roadproof.io.locks import hold
+    from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
@@ -107,7 +108,6 @@ def attack(
     given = {"iterations": iterations, "restarts": restarts, "masks": masks, "calls": calls}
     searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
     searched.check_space(space)
-    hold(out)
     drives = load_recordings(recordings)
     driven_in = method != "published" and drives.is_placed and drives.has_both_sides
     word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
@@ -121,6 +121,8 @@ def attack(
     chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
     size = (drives.view.height_px, drives.view.width_px)
     require_usable(attacked, size=size, device=device, drives=False, gradients=searched.by_gradient)
+    frames = sum(len(each.frames) for each in drives.recordings)
+    begin(of_search(searched, OBJECTIVES[word], frames, attacked, groups=len(chosen)), out)
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(goal)) as on_step:
         result = run(

@@ -14,6 +14,7 @@ from roadproof.cli import options
 from roadproof.cli.options import number
 from roadproof.cli.output import say
 from roadproof.cli.paint import Paint, with_paint, words
+from roadproof.cli.verbs import begin
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
@@ -49,20 +50,20 @@ def demo(
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.io.files import write_atomically
-    from roadproof.io.locks import hold
     from roadproof.pipeline.budget import BUDGETS
+    from roadproof.pipeline.estimate import of_run
     from roadproof.pipeline.stress_test import stress_test
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
     tested = options.scenario_of(scenario, scenarios)
-    options.check_processes(processes, simulator)
+    options.check_simulator(simulator, processes)
     spent = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
     spent = replace(spent, rounds=rounds, attack_weathers=options.weathers_of(attack_weathers, "attack-weathers"))
     spent = replace(spent, objective=varied(spent.objective, paint.variation))
     space = SearchSpace(figures=figures, limits=paint.limits)
-    hold(out)
     who = load_controller(controller, device=device)
+    begin(of_run(spent, who, processes=processes), out)
     with open_simulator(simulator) as world, stages() as show:
         result = stress_test(
             world,

@@ -7,12 +7,16 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, choice, number
+from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, check_simulator, choice, number
 from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.verbs import begin
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
+    from roadproof.controllers import Controller
+    from roadproof.hardening.budget import HardeningBudget
     from roadproof.hardening.tuning import TrainingStep
+    from roadproof.pipeline.estimate import Estimate
     from roadproof.scenarios import Scenario
 
 
@@ -51,12 +55,11 @@ def harden(
     from rich.console import Console
 
     from roadproof.cli.progress import stages
-    from roadproof.controllers.loading import imported, load_trainable
+    from roadproof.controllers.loading import imported, load_controller, load_trainable
     from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
     from roadproof.hardening.harden import harden as run
     from roadproof.hardening.page import write_hardening
     from roadproof.hardening.tuning import training_step as usual_step
-    from roadproof.io.locks import hold
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -73,10 +76,12 @@ def harden(
         if training_step is None
         else cast("TrainingStep", imported(training_step, "a function of model and batch that gives the loss"))
     )
+    check_simulator(simulator)
     check_streets(training, judging)
     load_trainable(controller)
+    on = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    begin(_estimate(spent, load_controller(controller, device=on), rounds, len(training), len(judging)), out)
     with open_simulator(simulator) as world, stages() as show:
-        hold(out)
         found = run(
             world,
             controller,
@@ -89,7 +94,7 @@ def harden(
             space=SearchSpace(figures=figures, limits=paint.limits),
             training_step=step,
             seed=seed,
-            device=("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device,
+            device=on,
             on_progress=show,
         )
     page = write_hardening(found, out)
@@ -100,3 +105,19 @@ def harden(
     if found.judgement is not None:
         say(found.judgement.verdict().sentence)
     say(f"The hardened controller is {found.hardened}, the page {page}")
+
+
+def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int) -> Estimate:
+    """Of attacks and tuning, and of judging before and after; streets of training and judging are driven clean."""
+    from roadproof.pipeline.estimate import Estimate, frame_seconds, of_drives, of_run, of_search
+
+    tuning = budget.tuning
+    learnt = Estimate(seconds=tuning.steps * tuning.batch * frame_seconds(who))
+    whole = of_run(budget.attack, who, film=False).times((rounds + 1) * training) + learnt.times(rounds)
+    whole += of_drives(budget.town_drives)
+    if judging:
+        found = of_search(budget.unseen, budget.judge.objective, 0, who)
+        again = of_search(budget.judge.method, budget.judge.objective, budget.judge.window.frames, who)
+        whole += (of_run(budget.judge, who, film=False) + found + again).times(2 * judging)
+        whole += of_drives(2 * len(budget.clean_weathers) * (training + judging))
+    return whole

@@ -26,7 +26,7 @@ from roadproof.driving.intervals import Mean, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
 from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.io.files import write_atomically
+from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
 from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
@@ -150,13 +150,14 @@ class Evaluation:
         """The trial that stands for all in pictures: the first weather's, without traffic."""
         return self.of(traffic=False)[0]
 
-    def save(self, folder: Path, paint: PatternImage) -> None:
+    def save(self, folder: AnyPath, paint: PatternImage) -> None:
         """Write everything but the episodes, which are there already.
 
         Raises:
             OutputError: the folder cannot be written.
             ScenarioError: the scenario's map cannot be written beside it.
         """
+        folder = as_path(folder)
         _save_scenario(self.scenario, folder)
         picture = Image.fromarray(paint)
         write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
@@ -168,12 +169,13 @@ class Evaluation:
         )
 
     @staticmethod
-    def load(folder: Path) -> Evaluation:
+    def load(folder: AnyPath) -> Evaluation:
         """Read what `save` wrote.
 
         Raises:
             EpisodeError: a file is missing, damaged or of another format.
         """
+        folder = as_path(folder)
         path = folder / "evaluation.json"
         content = EVALUATION_FILE.content(path)
         try:

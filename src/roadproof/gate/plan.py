@@ -14,7 +14,7 @@ from roadproof.driving.starts import StartRange
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, each_once, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
-from roadproof.io.files import read_toml
+from roadproof.io.files import AnyPath, as_path, read_toml
 from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
@@ -130,7 +130,7 @@ class _Stated:
     change: dict[str, str | dict[str, Any]] = field(default_factory=dict[str, str | dict[str, Any]])
 
 
-def load_check(path: Path, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
+def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
     """Read a plan for one budget, with everything that it names; see the head of this module.
 
     Args:
@@ -142,6 +142,7 @@ def load_check(path: Path, *, budget: str | None = None, trust: bool = False) ->
         CheckError: the file or something that it names is missing, damaged or unknown, a number is out of its range,
             the drives are too few for the limits, or it is not trusted with what it asks for; the message says which.
     """
+    path = as_path(path)
     content = read_toml(path, CheckError)
     try:
         if content.pop("format", None) != FORMAT:

@@ -40,7 +40,7 @@ from roadproof.hardening.judgement import Clean, Judge, Judged, Judgement, clean
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
-from roadproof.io.files import read_json, write_atomically, write_json, write_tensors
+from roadproof.io.files import AnyPath, as_path, read_json, write_atomically, write_json, write_tensors
 from roadproof.io.identity import ANSWERS, require_same, stated
 from roadproof.io.locks import working_in
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
@@ -102,7 +102,7 @@ def harden(
     simulator: Simulator,
     controller: str,
     scenarios: Sequence[Scenario],
-    folder: Path,
+    folder: AnyPath,
     *,
     judge_on: Sequence[Scenario] = (),
     clean_on: Sequence[Scenario] = (),
@@ -138,6 +138,7 @@ def harden(
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: a stage refuses.
     """
+    folder = as_path(folder)
     check_streets(scenarios, judge_on)
     if rounds < 1:
         raise TrainingError(f"rounds is {rounds}, expected 1 or more")

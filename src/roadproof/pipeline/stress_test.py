@@ -20,7 +20,6 @@ weather but the first in RUN/WEATHER/, as those of the first are in RUN.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from roadproof.attacks import AttackResult, Cheapest
 from roadproof.attacks.cheapest import check_wanted
@@ -30,6 +29,7 @@ from roadproof.controllers.checks import require_usable
 from roadproof.driving.evaluate import Opening
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.locks import working_in
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
@@ -85,7 +85,7 @@ def stress_test(
     simulator: Simulator,
     controller: Controller,
     scenario: Scenario,
-    folder: Path,
+    folder: AnyPath,
     *,
     budget: Budget = QUICK,
     space: SearchSpace | None = None,
@@ -124,6 +124,7 @@ def stress_test(
         PatternError: the limits on paint leave no pattern, or the search knows none.
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
+    folder = as_path(folder)
     if processes < 1 or (processes > 1 and another is None):
         raise RoadproofError(
             f"{processes} processes; expected 1, or more with a function that opens another simulator for each"

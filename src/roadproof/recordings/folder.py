@@ -24,7 +24,7 @@ from PIL import Image
 from roadproof.errors import ColourError, OutputError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_archive, read_array, write_archive
-from roadproof.io.files import inside, write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, inside, write_folder_atomically
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import Form, RecordFile
 from roadproof.paint.site import LaneMark
@@ -108,7 +108,7 @@ _PER_FRAME = RecordFile(
 _TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
 
 
-def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = False) -> None:
+def save_recordings(recordings: RecordingSet, folder: AnyPath, *, compact: bool = False) -> None:
     """Write a set to a new folder, all or nothing.
 
     Args:
@@ -119,6 +119,7 @@ def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = F
     Raises:
         OutputError: the folder is there already, or cannot be written.
     """
+    folder = as_path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} exists already; choose a new folder for the recordings")
 
@@ -164,12 +165,13 @@ def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
         Image.fromarray(frame).save(folder / "frames" / f"{number}.png")
 
 
-def load_recordings(folder: Path) -> RecordingSet:
+def load_recordings(folder: AnyPath) -> RecordingSet:
     """Read and check a set of recorded drives.
 
     Raises:
         RecordingError: the folder or a part of it is missing, damaged or inconsistent; the message names it.
     """
+    folder = as_path(folder)
     if not folder.is_dir():
         raise RecordingError(f"no folder {folder}; expected a set of recordings with a recordings.json")
     if not (folder / "recordings.json").is_file():

@@ -16,7 +16,7 @@ import roadproof
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
 from roadproof.driving.infractions import counted
-from roadproof.io.files import write_atomically
+from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording
@@ -46,7 +46,7 @@ PAINTED = {
 Fields = dict[str, Any]
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: AnyPath) -> Path:
     """Write report.html and result.json of a run folder.
 
     Args:
@@ -59,6 +59,7 @@ def write_report(folder: Path) -> Path:
         RoadproofError: there is nothing to report, or a stage is damaged.
         OutputError: the folder cannot be written.
     """
+    folder = as_path(folder)
     run = read_run(folder)
     result = json.dumps(result_of(run), indent=1, ensure_ascii=False) + "\n"
     page = render(run)

@@ -55,9 +55,11 @@ def read_rows(job: Job, folder: Path) -> tuple[Row, ...] | None:
     path = folder / "jobs" / job.key / "rows.json"
     if not path.exists():
         return None
-    rows: list[dict[str, Any]] = read_json(path, *ROWS, StudyError)["rows"]
+    rows: object = read_json(path, *ROWS, StudyError).get("rows")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in cast("list[object]", rows)):
+        raise StudyError(f"{path} is damaged (it has no list of rows); remove it, and the job is done again")
     # Rows of an older roadproof have no key of their own.
-    return tuple(cast("Row", {"job": job.key, **row}) for row in rows)
+    return tuple(cast("Row", {"job": job.key, **row}) for row in cast("list[dict[str, Any]]", rows))
 
 
 def is_done(job: Job, folder: Path) -> bool:

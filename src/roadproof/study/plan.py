@@ -17,7 +17,7 @@ from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
-from roadproof.io.files import read_toml
+from roadproof.io.files import AnyPath, as_path, read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
@@ -215,7 +215,7 @@ class Study(Conditions):
         )
 
 
-def load_study(path: Path, *, trust: bool = False) -> Study:
+def load_study(path: AnyPath, *, trust: bool = False) -> Study:
     """Read a study.
 
     Args:
@@ -226,6 +226,7 @@ def load_study(path: Path, *, trust: bool = False) -> Study:
         StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or it is not trusted with
             what it asks for; says which.
     """
+    path = as_path(path)
     content = read_toml(path, StudyError)
     try:
         study = _study(content, path.parent)
