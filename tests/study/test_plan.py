@@ -84,6 +84,7 @@ def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
         {"traffic": None},
         {"simulator": "carla://localhost"},
         {"method": dataclasses.replace(job.method, iterations=1)},
+        {"method": dataclasses.replace(job.method, attack_weathers=(Weather.RAINY_NOON,))},
         {"scenario": dataclasses.replace(job.scenario, time_limit_s=1.0)},
     ):
         assert dataclasses.replace(job, **change).key != job.key

@@ -66,6 +66,8 @@ class Budget:
             self._check_published()
         if self.rounds and not self.select:
             raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
+        if len(set(self.recorded_in)) < len(self.recorded_in):
+            raise RoadproofError(f"attack_weathers are {', '.join(self.recorded_in)}; expected each once")
         if len(self.recorded_in) > 1 and self.calibration is Calibration.PUBLISHED:
             raise RoadproofError(
                 f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "

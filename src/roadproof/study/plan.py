@@ -140,10 +140,11 @@ class Job(Conditions):
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
         told = {"job_version": JOB_VERSION, **asdict(self)}
-        for name in ("weights", "paint", "variation"):
-            # Jobs are older than these words.
-            if not told[name]:
-                del told[name]
+        # Jobs are older than these words.
+        words = [(told, name) for name in ("weights", "paint", "variation")] + [(told["method"], "attack_weathers")]
+        for table, name in words:
+            if not table.get(name):
+                table.pop(name, None)
         content = json.dumps(told, sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
