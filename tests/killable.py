@@ -15,6 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from safetensors.numpy import load_file
+
 from carla_serving import straight_map
 from paint_shy import along_a_street
 from recorded_drives import drivable_set
@@ -169,16 +172,23 @@ def differences(one: Path, two: Path) -> list[str]:
     """Which files of two results differ in anything but times."""
     left, right = (dict(_files(folder)) for folder in (one, two))
     told = [f"only one has {name}" for name in sorted(left.keys() ^ right.keys())]
-    for name in sorted(left.keys() & right.keys()):
-        contents = [(folder / name).read_bytes() for folder in (one, two)]
-        if name.endswith(".json"):
-            contents = [json.dumps(_without_times(json.loads(each))).encode() for each in contents]
-        if name.endswith((".json", ".md")):
-            pairs = zip(contents, (one, two), strict=True)
-            contents = [each.replace(str(folder).encode(), b"OUT") for each, folder in pairs]
-        if contents[0] != contents[1]:
-            told.append(f"{name} differs")
-    return told
+    same = left.keys() & right.keys()
+    return told + [f"{name} differs" for name in sorted(same) if _content(one, name) != _content(two, name)]
+
+
+def _content(folder: Path, name: str) -> object:
+    """What a file holds but for times and the folder's name."""
+    path = folder / name
+    if path.suffix == ".npz":
+        with np.load(path) as archive:
+            arrays = dict(archive)
+        header = json.loads(str(arrays.pop("header", "{}")))
+        return _without_times(header), _without_times({key: each.tobytes() for key, each in arrays.items()})
+    if path.suffix == ".safetensors":
+        return _without_times({key: each.tobytes() for key, each in load_file(path).items()})
+    if path.suffix == ".json":
+        return json.dumps(_without_times(json.loads(path.read_bytes()))).replace(str(folder), "OUT")
+    return path.read_bytes().replace(str(folder).encode(), b"OUT")
 
 
 def _files(folder: Path) -> Iterator[tuple[str, Path]]:

@@ -268,10 +268,8 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
         raise error(f"{path} is not valid TOML ({reason})") from None
     for text in _texts(content):
         if len(text) > _LONGEST_TEXT or "\0" in text:
-            raise error(
-                f"{path} has the text {text!r:.40} of {len(text)} characters, expected at most {_LONGEST_TEXT} and no "
-                "NUL"
-            )
+            told = f"{text!r:.40} of {len(text)} characters"
+            raise error(f"{path} has the text {told}, expected at most {_LONGEST_TEXT} and no NUL")
     return content
 
 
