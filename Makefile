@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 OUT ?= out/demo
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test fuzz lint bench clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; \
@@ -28,6 +28,10 @@ endif
 # The order is the tests' own, the slow files first.
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+
+# The property tests of what comes from outside, a hundred times as long as in `make test`, and not the same again.
+fuzz: $(STAMP)
+	ROADPROOF_FUZZ=$(or $(TIMES),100) $(BIN)/python -m pytest tests/io/test_any_file.py tests/simulators/carla_server/test_requests.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,11 +1,24 @@
-"""What happens to those who open a run folder in which someone changed a file?
+"""What happens to those who give roadproof bad input, change its files, kill it, or let it work for long?
 
-    python benchmarks/faults.py --json OUT [--files 1000] [--seed 0]
+    python benchmarks/faults.py --json OUT [--part files|inputs|kills|memory] [--count N] [--seed 0]
 
-A small run folder is made by the real stages, as the tests make it. One file of it is changed at a time: a value in its
-JSON for an odd one, bytes flipped, cut, doubled, zeroed. Then it is read as a run, as recordings and as recorded
+files: a small run folder is made by the real stages, as the tests make it. One file of it is changed at a time: a value
+in its JSON for an odd one, bytes flipped, cut, doubled, zeroed. Then it is read as a run, as recordings and as recorded
 drives, and for every fifth change a report is made of it. Counted: opened as if nothing were, refused in one line, and
 what went wrong: any other exception, a message of several lines, more than 30 s, a file written elsewhere.
+
+inputs: every option of every command with every odd value of its kind, and damaged plans, scenario files, patterns,
+recordings and weights. Expected of each: exit code 2 and one line on standard error, which names the option where a
+number is out of its range. What is damaged and still makes sense may be taken.
+
+kills: demo, attack, check, study with two workers, training and hardening, tiny, each killed at a random time by
+SIGKILL, SIGTERM or SIGINT; half the times the file written last loses its end. The same command is given again, where
+need be after the file that it names was removed. Expected: all files as without a kill, byte for byte but for times.
+
+memory: what the process holds after 50 evaluations and after 200 searches in the recorded world, beside what it held
+after the first tenth of them.
+
+Without --part all of them. A part's counts replace the old ones in OUT; the others stay.
 """
 
 from __future__ import annotations
@@ -13,42 +26,114 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import random
+import resource
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import roadproof
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from bad_inputs import attempt, command_lines, damaged_files
+from killable import EXPECTED, kill_and_resume, starter
+from long_work import evaluations, searches
 from mutations import DOORS, REPORT, open_changed
 from runs import write_run
 
 
-def main() -> None:
+def files(count: int, seed: int, place: Path) -> dict[str, Any]:
     """Change, open, count."""
+    run = place / "run"
+    write_run(run)
+    read, unread = open_changed(run, DOORS, count, seed)
+    made, unmade = open_changed(run, REPORT, count // 5, seed + 1)
+    return {"changed_files": count + count // 5, "read": read, "reported": made, "wrong": unread + unmade}
+
+
+def inputs(count: int, seed: int, place: Path) -> dict[str, Any]:
+    """Every command line, and so many damaged files."""
+    counted, wrong = Counter[str](), list[str]()
+    # One by one: a file is damaged only while it is tried.
+    for bad in chain(command_lines(), damaged_files(place, count, seed)):
+        happened = attempt(bad)
+        counted[f"{bad.kind}, {'taken' if happened == 'taken' else 'wrong' if happened else 'refused'}"] += 1
+        if happened not in ("", "taken"):
+            wrong.append(f"{' '.join(bad.words):.200}: {happened}")
+    return {"inputs": sum(counted.values()), "counted": counted, "wrong": wrong}
+
+
+def kills(count: int, seed: int, place: Path) -> dict[str, Any]:
+    """So many kills, dealt out to the commands in turn."""
+    begin, counted, wrong = starter(), Counter[str](), list[str]()
+    for k, name in enumerate(EXPECTED):
+        began, straight = time.perf_counter(), place / f"straight-{name}"
+        whole = begin(name, straight)
+        whole.join()
+        whole_s = time.perf_counter() - began
+        if whole.exitcode != EXPECTED[name]:
+            wrong.append(f"{name} alone ended with {whole.exitcode}")
+            continue
+        rng = random.Random(f"{seed} {name}")
+        for _ in range(count // len(EXPECTED) + (k < count % len(EXPECTED))):
+            lost = kill_and_resume(begin, name, straight, whole_s, rng)
+            counted[f"{name}, {'lost' if lost else 'the same'}"] += 1
+            wrong += [lost] if lost else []
+    return {"kills": sum(counted.values()), "counted": counted, "wrong": wrong}
+
+
+def memory(count: int, seed: int, place: Path) -> dict[str, Any]:
+    """What the process held after a tenth of the work, and at its end, in MiB."""
+    del seed
+    told: dict[str, Any] = {}
+    for name, work, times in (("evaluations", evaluations, count // 4), ("searches", searches, count)):
+        steps, first = work(place / name), 0.0
+        for k in range(times):
+            next(steps)
+            if k + 1 == max(times // 10, 1):
+                first = _held_mib()
+        told[name] = {"count": times, "after_a_tenth_mib": first, "at_the_end_mib": _held_mib()}
+    grown = [name for name, each in told.items() if each["at_the_end_mib"] > 1.1 * each["after_a_tenth_mib"]]
+    return told | {"wrong": [f"{name} grow" for name in grown]}
+
+
+def _held_mib() -> float:
+    """Resident memory, as Linux counts it."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+PARTS: dict[str, tuple[Callable[[int, int, Path], dict[str, Any]], int]] = {
+    "files": (files, 1000),
+    "inputs": (inputs, 500),
+    "kills": (kills, 100),
+    "memory": (memory, 200),
+}
+
+
+def main() -> None:
+    """One part, or all of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--files", type=int, default=1000)
+    parser.add_argument("--part", choices=PARTS)
+    parser.add_argument("--count", type=int, help="of the part; by default 1000, 500, 100 and 200")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as place:
-        run = Path(place) / "run"
-        write_run(run)
-        read, unread = open_changed(run, DOORS, given.files, given.seed)
-        made, unmade = open_changed(run, REPORT, given.files // 5, given.seed + 1)
-    content = {
-        "roadproof": roadproof.__version__,
-        "python": platform.python_version(),
-        "changed_files": given.files + given.files // 5,
-        "read": dict(read),
-        "reported": dict(made),
-        "wrong": unread + unmade,
-        "seconds": time.perf_counter() - began,
-    }
-    given.json.write_text(json.dumps(content, indent=1) + "\n")
-    print(json.dumps(content, indent=1))
+    content: dict[str, Any] = json.loads(given.json.read_text()) if given.json.exists() else {}
+    content |= {"roadproof": roadproof.__version__, "python": platform.python_version()}
+    for name in [given.part] if given.part else PARTS:
+        part, usual = PARTS[name]
+        began = time.perf_counter()
+        with tempfile.TemporaryDirectory() as place:
+            done = part(given.count or usual, given.seed, Path(place))
+        content[name] = done | {"seconds": time.perf_counter() - began}
+        given.json.write_text(json.dumps(content, indent=1) + "\n")
+        print(json.dumps({name: content[name]}, indent=1))
 
 
 if __name__ == "__main__":

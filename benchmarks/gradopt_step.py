@@ -1,12 +1,17 @@
 """What one step of GradOpt costs, against the bare controller and against the published way.
 
-    python benchmarks/gradopt_step.py --json OUT [--frames 88] [--recordings SET] [--quick]
+    python benchmarks/gradopt_step.py --json OUT [--frames 88] [--recordings SET] [--controllers cil pilotnet] [--quick]
 
 A step composites the frames, shows them to the controller and goes back to the pattern's parameters. The bare
 controller's forward and backward pass to the same frames is the physical limit: ratio 1. The published way renders
 1 + 8 K whole sets of frames for one gradient. All three are measured in turn, in one run, on the same frames. Beside
 the clock stands processor time, which others on the machine disturb less; with one thread its ratio is the one to trust
 where the machine is busy.
+
+A set of recordings that can be driven in has a second part, with shipped weights: one step of the search in the
+recorded world (three starts a side, a picture every second step), against the bare controller's passes to as many
+pictures, those of an instant at a time as a closed loop must and all of them in one batch; and how long drives over
+1,000 patterns take.
 """
 
 import argparse
@@ -22,10 +27,11 @@ import numpy as np
 import torch
 
 import roadproof
-from roadproof.attacks import Surrogate
-from roadproof.attacks.groups import parse_groups
+from roadproof.attacks import PathDeviation, Surrogate
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.published import PublishedMeasure
 from roadproof.controllers import CIL, pilotnet_controller
+from roadproof.controllers.asking import controls_of
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.memory import keep_freed_memory
@@ -131,6 +137,50 @@ def measure(
     }
 
 
+def measure_path(recordings: RecordingSet, name: str, repeats: int, patterns: int) -> dict[str, object]:
+    """One step of the search in the recorded world, and drives over many patterns, on the CPU."""
+    controller, space = roadproof.load_controller(name), SearchSpace(figures=5)
+    path = PathDeviation()
+    world = path.measure(recordings, controller, (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    unit = space.random((2, 3), torch.Generator().manual_seed(0))
+    rolled = world.worlds[0]
+    instants = -(-rolled.course.count // path.every)
+    seen = (rolled.bank.levels[:6] / 255, rolled.bank.speed_mps[:6], rolled.bank.command[:6])
+
+    def bare(copies: int) -> None:
+        frames, speed, command = (part.repeat(copies, *[1] * (part.ndim - 1)) for part in seen)
+        leaf = frames.contiguous(memory_format=torch.channels_last).requires_grad_()
+        torch.autograd.grad(controls_of(controller, leaf, speed, command).float().sum(), leaf)
+
+    runs = {
+        "step": lambda: world.values_and_gradients(space, unit),
+        "bare": lambda: [bare(1) for _ in range(instants)],
+        "batch": lambda: bare(instants),
+    }
+    times: dict[str, list[float]] = {key: [] for key in runs}
+    cpu_times: dict[str, list[float]] = {key: [] for key in runs}
+    for repeat in range(repeats + 1):
+        for key, function in runs.items():
+            elapsed, processor = milliseconds(function, "cpu")
+            if repeat:
+                times[key].append(elapsed)
+                cpu_times[key].append(processor)
+    many = space.pattern(space.random((patterns,), torch.Generator().manual_seed(1)))
+    began = time.perf_counter()
+    rolled.deviations_m(controller, many)
+    return {
+        "controller": name,
+        "figures": 5,
+        "pictures": 6 * instants,
+        **{f"{key}_ms": round(statistics.median(values), 1) for key, values in times.items()},
+        "ratio": _median_ratio(times),
+        "cpu_ratio": _median_ratio(cpu_times),
+        "ratio_to_one_batch": _median_ratio({"step": times["step"], "bare": times["batch"]}),
+        "patterns_driven": patterns,
+        "seconds_for_1000": round((time.perf_counter() - began) * 1000 / patterns, 1),
+    }
+
+
 def _median_ratio(times: dict[str, list[float]]) -> float:
     return round(statistics.median(s / b for s, b in zip(times["step"], times["bare"], strict=True)), 3)
 
@@ -146,6 +196,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=88)
     parser.add_argument("--recordings", type=Path, help="a set of real recordings instead of the synthetic drive")
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--controllers", nargs="+", choices=("cil", "pilotnet"), default=("cil", "pilotnet"))
     parser.add_argument("--quick", action="store_true", help="K = 5 in float32 on the CPU only")
     args = parser.parse_args()
     keep_freed_memory()  # as the command line does
@@ -154,12 +205,16 @@ def main() -> None:
     dtypes = [torch.float32] if args.quick else [torch.float32, torch.bfloat16]
     cases = []
     for device in devices:
-        for name in ("cil", "pilotnet"):
+        for name in args.controllers:
             for figures in (5,) if args.quick else (1, 5):
                 for dtype in dtypes:
                     case = measure(recordings, name, figures, dtype, device, args.repeats, dtype == torch.float32)
                     cases.append(case)
                     print(json.dumps(case), flush=True)
+    paths = []
+    for name in args.controllers if recordings.is_placed else ():
+        paths.append(measure_path(recordings, name, args.repeats, 64 if args.quick else 1000))
+        print(json.dumps(paths[-1]), flush=True)
     result = {
         "benchmark": "gradopt_step",
         "roadproof": roadproof.__version__,
@@ -168,6 +223,7 @@ def main() -> None:
         "processor": platform.processor() or platform.machine(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cases": cases,
+        "paths": paths,
     }
     args.json.write_text(json.dumps(result, indent=1) + "\n")
 

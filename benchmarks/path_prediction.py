@@ -87,7 +87,7 @@ def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict
         calibrated = calibrate(simulator, drives, QUICK.calibration)
         names, painted, world = patterns(calibrated.recordings, controller, space, seed)
         rolling = time.perf_counter()
-        predicted = world.world.deviations_m(controller, painted)[:, 0]
+        predicted = world.worlds[0].deviations_m(controller, painted)[:, 0]
         rolled_s = time.perf_counter() - rolling
         objective = DrivenObjective(simulator, controller, scenario, space, measure="deviation")
         driven = [objective.effect(painted[k]).deviation for k in range(len(names))]
@@ -95,9 +95,9 @@ def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict
         "cell": f"{controller_name} {scenario.name}",
         "seed": seed,
         "calls": calibrated.report.calls,
-        "vehicle_r2": world.world.vehicle.r2,
+        "vehicle_r2": world.worlds[0].vehicle.r2,
         "seconds": time.perf_counter() - began,
-        "roll_ms_a_picture": 1000 * rolled_s / (len(names) * world.world.course.count),
+        "roll_ms_a_picture": 1000 * rolled_s / (len(names) * world.worlds[0].course.count),
         "each": [
             {"source": name, "predicted_m": round(p, 4), "driven_m": round(d, 4)}
             for name, p, d in zip(names, predicted, driven, strict=True)

@@ -138,5 +138,5 @@ def write_made_up_study(folder, study, *, failing=(), seed=0):
         save_pattern(pattern, place / "pattern.json")
         np.savez(place / "paths.npz", **paths)
         for shade, weather in enumerate(job.weathers, 1):
-            Image.new("RGB", (400, 300), (60 * shade,) * 3).save(place / f"view-{weather}.jpg")
+            Image.new("RGB", (1440, 180), (60 * shade,) * 3).save(place / f"passage-{weather}.jpg")
     return write_table(study.jobs, folder)

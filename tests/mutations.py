@@ -56,7 +56,7 @@ def mutated(content: bytes, suffix: str, rng: random.Random) -> bytes:
 
 def _with_odd_value(content: bytes, rng: random.Random) -> bytes:
     whole: Any = json.loads(content)
-    places = list(_places(whole))
+    places = list(places_in(whole))
     if not places:
         return b"[" * 100_000
     box, key = rng.choice(places)
@@ -67,12 +67,12 @@ def _with_odd_value(content: bytes, rng: random.Random) -> bytes:
     return json.dumps(whole).encode("utf-8", "surrogatepass")
 
 
-def _places(value: Any) -> Any:
+def places_in(value: Any) -> Any:
     """Every key of every object and every index of every list."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, each in list(inner):
         yield value, key
-        yield from _places(each)
+        yield from places_in(each)
 
 
 def open_changed(

@@ -16,7 +16,8 @@ from roadproof.datatypes import Ending, Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window
 from roadproof.drives.folder import Settings, write_drive, write_settings
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Evaluation, judge
+from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.trial import judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.film import Strip

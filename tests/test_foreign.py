@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -128,6 +129,41 @@ def test_a_worker_that_hangs_ends(tmp_path):
     done = child(tmp_path, "processes_beside(1).submit(hang).result()")
     assert "roadproof: the driver has not answered for " in done.stderr
     assert "BrokenProcessPool" in done.stderr
+
+
+SUSPENDED = """
+    import time
+    from roadproof import foreign
+
+    def healthy():
+        print("begun", flush=True)
+        until = time.process_time() + 0.3
+        while time.process_time() < until:
+            pass
+        return "done"
+
+    foreign.NOTICE_S, foreign._LOOK_S, foreign.GRACE_S = 1.0, 0.05, 0.2
+    foreign.end_calls_after(2.0)
+    print(foreign.call("the driver", healthy), flush=True)
+"""
+
+
+def test_a_process_that_was_stopped_goes_on(tmp_path):
+    (tmp_path / "suspended.py").write_text(textwrap.dedent(SUSPENDED))
+    process = subprocess.Popen(
+        [sys.executable, "suspended.py"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "begun\n"
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(3.0)
+    process.send_signal(signal.SIGCONT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "done\n", "")
 
 
 def test_workers_have_the_limit_of_the_process_that_began_them(hasty):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
+import random
 import time
 
 import numpy as np
 import pytest
 
 import needs
+from killable import EXPECTED, kill_and_resume, starter
 from roadproof.attacks import AttackResult
 from roadproof.driving.evaluation import Evaluation
 from roadproof.pipeline.selection import Selection
@@ -33,19 +34,8 @@ PATIENCE_S = 600.0
 
 
 @pytest.fixture(scope="module")
-def start(tmp_path_factory):
-    """Starts the demo in a process of its own, which finds everything imported."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["demo_child"])
-
-    def begin(folder):
-        import demo_child
-
-        process = context.Process(target=demo_child.demo, args=(folder, folder.with_suffix(".log")))
-        process.start()
-        return process
-
-    return begin
+def start():
+    return starter()
 
 
 def finished(folder):
@@ -73,15 +63,15 @@ def kill_at_first_step(process, folder, stage):
 @pytest.mark.slow
 def test_a_run_killed_in_every_stage_ends_as_one_that_is_not(start, tmp_path):
     straight, killed = tmp_path / "straight", tmp_path / "killed"
-    whole = start(straight)
+    whole = start("demo", straight)
     before = {}
     for stage in FIRST_STEP:
-        process = start(killed)
+        process = start("demo", killed)
         kill_at_first_step(process, killed, stage)
         now = finished(killed)
         assert before.items() <= now.items(), f"something was done twice before {stage}"
         before = now
-    process = start(killed)
+    process = start("demo", killed)
     for each in (process, whole):
         each.join(PATIENCE_S)
         assert each.exitcode == 0
@@ -112,3 +102,15 @@ def check_same(one, two):
         content.pop("calibration")
         content.pop("name")
     assert numbers[0] == numbers[1]
+
+
+@pytest.mark.slow
+def test_what_is_killed_at_any_time_ends_as_what_is_not(start, tmp_path):
+    name, straight = "attack", tmp_path / "straight"
+    began = time.monotonic()
+    process = start(name, straight)
+    process.join(PATIENCE_S)
+    assert process.exitcode == EXPECTED[name], straight.with_suffix(".log").read_text()
+    whole_s = time.monotonic() - began
+    rng = random.Random(name)
+    assert [kill_and_resume(start, name, straight, whole_s, rng) for _ in range(2)] == ["", ""]

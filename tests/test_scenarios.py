@@ -76,7 +76,7 @@ def test_what_a_file_leaves_out_has_the_usual_values(tmp_path: Path) -> None:
         ("goal_m = [50, 0]", "goal_m = [50]", "goal_m is [50], expected [x, y]"),
         ("goal_m = [50, 0]", "goal_m = [0.5, 0]", "less than 1 m from the start"),
         ("start = { x_m = 0, y_m = 0 }", "start = { x_m = 0 }", "start has no y_m"),
-        ("start = { x_m = 0, y_m = 0 }", "start = { x_m = 0, y_m = 0, speed_mps = -1 }", "expected 0 or more"),
+        ("start = { x_m = 0, y_m = 0 }", "start = { x_m = 0, y_m = 0, speed_mps = -1 }", "expected 0 to 100"),
         ("start = { x_m = 0, y_m = 0 }", "start = 7", "start is 7, expected a table"),
         ("x_m = 20.0, y_m = 0.0", "x_m = 20.0, y_m = 0.0, width_m = -2", "canvas is -2.0 m"),
         ('map_name = "town"', 'map_name = "../town.xodr"', "is not a plain name"),
@@ -108,7 +108,7 @@ def test_an_unknown_name_is_answered_with_the_nearest() -> None:
 
 
 def test_lists_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="cannot be read"):
+    with pytest.raises(ScenarioError, match="cannot read"):
         load_scenarios(tmp_path / "missing.toml")
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="cannot be written"):

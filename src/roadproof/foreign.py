@@ -39,7 +39,7 @@ LONGEST = 300
 Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")
 
-_LOOK_S = 1.0
+_LOOK_S, _MOST_LOOKS = 1.0, 3
 _OURS = f"{Path(__file__).parent}{os.sep}"
 _STANDARD = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib")})
 _INSTALLED = ("site-packages", "dist-packages")
@@ -50,11 +50,12 @@ _log = logging.getLogger("roadproof")
 
 @dataclass(slots=True, eq=False)
 class _Call:
-    """One that has not come back yet."""
+    """One that has not come back yet; `waited_s` counts the time since then in which the watch ran."""
 
     what: str
     thread: int = field(default_factory=threading.get_ident)
-    since_s: float = field(default_factory=time.monotonic)
+    seen_s: float = field(default_factory=time.monotonic)
+    waited_s: float = 0.0
     notice_s: float = field(default_factory=lambda: NOTICE_S)
     interrupted_s: float = math.inf
 
@@ -164,11 +165,16 @@ def _begin_watch() -> None:
 def _look() -> None:
     while True:
         time.sleep(_LOOK_S)
+        now_s = time.monotonic()
         for each in list(_calls.values()):
-            _judge(each, time.monotonic() - each.since_s)
+            # While the process, or its machine, stood still, the call could not come back either.
+            each.waited_s += min(now_s - each.seen_s, _MOST_LOOKS * _LOOK_S)
+            each.seen_s = now_s
+            _judge(each)
 
 
-def _judge(this: _Call, waited_s: float) -> None:
+def _judge(this: _Call) -> None:
+    waited_s = this.waited_s
     if waited_s >= this.notice_s:
         ended = f"; it is ended after {_limit_s:g} s" if math.isfinite(_limit_s) else ""
         _log.warning("%s has not answered for %.0f s%s%s", this.what, waited_s, _where(this), ended)

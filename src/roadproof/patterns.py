@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
@@ -22,7 +21,7 @@ from torch import Tensor
 from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
-from roadproof.io.files import write_atomically
+from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import RecordFile
 from roadproof.limits import MAX_FIGURES
@@ -212,12 +211,13 @@ class _Figures:
 _FILE = RecordFile(kind=_Figures, name="roadproof-pattern", error=PatternError, remedy="make it again")
 
 
-def save_pattern(pattern: Pattern, path: Path) -> None:
+def save_pattern(pattern: Pattern, path: AnyPath) -> None:
     """Write `path` (JSON: every figure by name and unit) and, beside it, its raster as PNG.
 
     Raises:
         OutputError: the folder cannot be written.
     """
+    path = as_path(path)
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())
     figures = [
@@ -231,23 +231,25 @@ def save_pattern(pattern: Pattern, path: Path) -> None:
     write_atomically(path.with_suffix(".png"), lambda part: picture.save(part, format="PNG"))
 
 
-def load_pattern(path: Path) -> Pattern:
+def load_pattern(path: AnyPath) -> Pattern:
     """Read a pattern written by `save_pattern`.
 
     Raises:
         PatternError: the file is missing, is not a pattern of this format, or a figure of it is not valid.
     """
+    path = as_path(path)
     figures = _FILE.read(path).figures
     boxes, colours = [figure.box for figure in figures], [figure.rgb for figure in figures]
     return Pattern(tuple(figure.shape for figure in figures), torch.tensor(boxes), torch.tensor(colours))
 
 
-def read_paint(path: Path) -> UInt8[np.ndarray, "s s 4"]:
+def read_paint(path: AnyPath) -> UInt8[np.ndarray, "s s 4"]:
     """What a file says to paint, as RGBA of the canvas: the raster of a pattern (.json), or a picture as it is.
 
     Raises:
         PatternError: it is neither a pattern nor a picture of the canvas' size.
     """
+    path = as_path(path)
     if path.suffix == ".json":
         return raster(load_pattern(path))
     remedy = "give a pattern (.json), or a picture (.png, .jpg)"

@@ -12,7 +12,6 @@ import hashlib
 import json
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -21,12 +20,13 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import check_name, inside
+from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 BUILTIN_FILE = Path(__file__).with_name("scenarios.toml")
+MAX_TIME_S, MAX_SPEED_MPS, MAX_CANVAS_M = 3600.0, 100.0, 100.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,10 +60,20 @@ class Scenario:
         for what, value in {**numbers, "time_limit_s": self.time_limit_s}.items():
             if not math.isfinite(value):
                 raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number")
-        if self.time_limit_s <= 0:
-            raise ScenarioError(f"scenario {self.name}: time_limit_s is {self.time_limit_s}, expected more than 0")
-        if self.start.speed_mps < 0:
-            raise ScenarioError(f"scenario {self.name}: start speed_mps is {self.start.speed_mps}, expected 0 or more")
+        if not 0 < self.time_limit_s <= MAX_TIME_S:
+            raise ScenarioError(
+                f"scenario {self.name}: time_limit_s is {self.time_limit_s}, expected more than 0, at most "
+                f"{MAX_TIME_S:g}"
+            )
+        if not 0 <= self.start.speed_mps <= MAX_SPEED_MPS:
+            raise ScenarioError(
+                f"scenario {self.name}: start speed_mps is {self.start.speed_mps:g}, expected 0 to {MAX_SPEED_MPS:g}"
+            )
+        if max(self.canvas.width_m, self.canvas.length_m) > MAX_CANVAS_M:
+            raise ScenarioError(
+                f"scenario {self.name}: canvas is {self.canvas.width_m:g} × {self.canvas.length_m:g} m, expected "
+                f"at most {MAX_CANVAS_M:g} m"
+            )
         if math.dist(self.goal_m, (self.start.x_m, self.start.y_m)) < 1.0:
             raise ScenarioError(f"scenario {self.name}: the goal is less than 1 m from the start; move it")
 
@@ -104,7 +114,7 @@ def find_scenario(name: str, scenarios: Sequence[Scenario] | None = None) -> Sce
     raise ScenarioError(f"no scenario is called {name!r}; {hint}")
 
 
-def load_scenarios(path: Path) -> tuple[Scenario, ...]:
+def load_scenarios(path: AnyPath) -> tuple[Scenario, ...]:
     """Read scenarios from a TOML file.
 
     A `map_name` that ends in ".xodr" is the name of an OpenDRIVE file in the folder of the TOML file.
@@ -112,13 +122,8 @@ def load_scenarios(path: Path) -> tuple[Scenario, ...]:
     Raises:
         ScenarioError: the file cannot be read, or an entry is not a valid scenario; the message names it.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ScenarioError(f"scenarios {path} cannot be read ({error.strerror}); check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise ScenarioError(f"scenarios {path} is not valid TOML ({error})") from error
-    entries = content.get("scenario")
+    path = as_path(path)
+    entries = read_toml(path, ScenarioError).get("scenario")
     if not isinstance(entries, list) or not entries:
         raise ScenarioError(f"scenarios {path} has no [[scenario]], expected at least one")
     scenarios: list[Scenario] = []
@@ -134,13 +139,14 @@ def load_scenarios(path: Path) -> tuple[Scenario, ...]:
     return tuple(scenarios)
 
 
-def save_scenarios(scenarios: Sequence[Scenario], path: Path) -> None:
+def save_scenarios(scenarios: Sequence[Scenario], path: AnyPath) -> None:
     """Write scenarios as TOML, under a temporary name first.
 
     Raises:
         OutputError: the file cannot be written.
         ScenarioError: a scenario's map is an OpenDRIVE file in another folder.
     """
+    path = as_path(path)
     blocks = [_block(scenario, path.parent) for scenario in scenarios]
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

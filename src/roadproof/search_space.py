@@ -6,8 +6,8 @@ means the same in every direction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -17,7 +17,10 @@ from torch import Tensor
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.io.records import plain
 from roadproof.limits import MAX_FIGURES
+from roadproof.paint.limits import PaintLimits, shrunk
+from roadproof.paint.site import Site
 from roadproof.patterns import Pattern, boxes_from_published, published_from_boxes
 
 Family = Literal["published", "published-canvas-centre", "published-bo", "free"]
@@ -75,6 +78,8 @@ class SearchSpace:
         albedo: lowest and highest value of a colour channel; real paint is neither 0 nor 1.
         max_painted_share: where given, widths shrink together until the figures' areas sum to at most this share of
             the canvas.
+        limits: what paint may be, in metres and colours; None limits nothing.
+        site: the road that the limits are about; `on` sets it.
 
     Raises:
         PatternError: a bound makes no sense.
@@ -86,6 +91,8 @@ class SearchSpace:
     colour: bool = True
     albedo: tuple[float, float] = (0.0, 1.0)
     max_painted_share: float | None = None
+    limits: PaintLimits | None = None
+    site: Site | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.figures <= MAX_FIGURES:
@@ -96,6 +103,35 @@ class SearchSpace:
             raise PatternError(f"albedo is {self.albedo}, expected 0 ≤ lowest < highest ≤ 1")
         if self.max_painted_share is not None and not 0.0 < self.max_painted_share <= 1.0:
             raise PatternError(f"max_painted_share is {self.max_painted_share}, expected a value in (0, 1]")
+
+    def __repr__(self) -> str:
+        # Runs and running searches are known by it; what limits nothing is not named, as before there were limits.
+        names = [each.name for each in fields(self) if each.name not in ("limits", "site")]
+        names += [name for name in ("limits", "site") if getattr(self, name) is not None]
+        return f"SearchSpace({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
+
+    def on(self, site: Site) -> SearchSpace:
+        """The same patterns as far as the limits leave them on a stretch of road; unlimited ones are left as they are.
+
+        Raises:
+            PatternError: the limits leave no pattern there, or need something that is not known of it.
+        """
+        if self.limits is None:
+            return self
+        known = self.limits.site(site)
+        self.limits.check(known, albedo=self.albedo, black=not self.colour)
+        return replace(self, site=known)
+
+    @property
+    def unlimited(self) -> SearchSpace:
+        """All patterns, whatever the limits."""
+        return replace(self, limits=None, site=None)
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What tells it from another, for files: limits are not named where there are none."""
+        told = cast("dict[str, Any]", plain(replace(self, site=None)))
+        return {name: value for name, value in told.items() if value is not None or name not in ("limits", "site")}
 
     @property
     def _shape_parameters(self) -> tuple[_Parameter, ...]:
@@ -142,7 +178,11 @@ class SearchSpace:
         darkest, brightest = self.albedo
         shares = unit[..., len(parameters) :] if self.colour else torch.zeros_like(unit[..., :3])
         pattern = Pattern((self.shape,) * self.figures, boxes, darkest + shares * (brightest - darkest))
-        return pattern if self.max_painted_share is None else _shrunk(pattern, self.max_painted_share)
+        if self.limits is not None:
+            if self.site is None:
+                raise PatternError("limits on paint hold on a stretch of road; say which, by space.on(site)")
+            return self.limits.applied(pattern, self.site, albedo=self.albedo, max_share=self.max_painted_share)
+        return pattern if self.max_painted_share is None else shrunk(pattern, self.max_painted_share)
 
     def point(self, pattern: Pattern) -> Float[Tensor, "*b k n"]:
         """The point of a pattern: what `pattern` makes it from; the nearest one where the pattern is outside.
@@ -170,13 +210,6 @@ class SearchSpace:
 
     def _published_boxes(self, natural: Float[Tensor, "*b k 4"]) -> Float[Tensor, "*b k 5"]:
         return boxes_from_published(natural, rotate_about=self._rotate_about)
-
-
-def _shrunk(pattern: Pattern, max_painted_share: float) -> Pattern:
-    excess = (pattern.painted_share / max_painted_share).clamp_min(1.0)
-    x, y, width, length, rotation_deg = pattern.boxes.unbind(-1)
-    boxes = torch.stack([x, y, width / excess[..., None], length, rotation_deg], -1)
-    return Pattern(pattern.shapes, boxes, pattern.colours)
 
 
 def derived_seed(seed: int, number: int) -> int:

@@ -14,6 +14,7 @@ from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.recorded import RecordedWorld, Start, Vehicle
 from roadproof.recorded.world import UNSURE
+from roadproof.recordings import pooled
 from roadproof.search_space import SearchSpace
 
 SPACE = SearchSpace(figures=1)
@@ -58,6 +59,27 @@ def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp
     assert (loaded.objective, loaded.predicted_m) == ("path deviation", result.predicted_m)
     assert [each.predicted_m for each in loaded.candidates] == found
     assert [each.predicted_range_m for each in loaded.candidates] == [c.predicted_range_m for c in result.candidates]
+
+
+def test_a_search_drives_in_every_weather_that_was_recorded(road):
+    dim = tuple(dataclasses.replace(drive, frames=(drive.frames * 0.6).astype(np.uint8)) for drive in road.recordings)
+    dark = dataclasses.replace(road, recordings=dim)
+    both = pooled({"clear-noon": road, "rainy-noon": dark})
+    unit = SPACE.random((2, 3), torch.Generator().manual_seed(4))
+    values = [
+        PathDeviation().measure(each, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").values(SPACE, unit)
+        for each in (road, dark, both)
+    ]
+    assert (values[0] - values[1]).abs().max() > 0.01
+    assert torch.allclose(values[2], (values[0] + values[1]) / 2, atol=1e-5)
+    result = attack(both, RampFollower(), SPACE, objective=PathDeviation(), method=SHORT)
+    apart = [
+        RecordedWorld(each).deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)
+        for each in both.by_weather()
+    ]
+    assert result.predicted_range_m == pytest.approx((np.min(apart), np.max(apart)), abs=0.05)
+    with pytest.raises(RecordingError, match="drives in clear-noon, rainy-noon, a recorded world has one light"):
+        RecordedWorld(both)
 
 
 def test_a_search_doubts_a_controller_that_was_not_recorded(road):

@@ -66,7 +66,7 @@ def command(*options, recordings="set", controller="own_controller:Linear"):
 
 
 def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke):
-    code, printed = invoke(*command("--out", str(tmp_path / "out")))
+    code, printed = invoke(*command("--quiet", "--out", str(tmp_path / "out")))
     assert code == 0, printed.err
     assert "Strongest for clean+" in printed.out
     assert "on recorded frames" in printed.out

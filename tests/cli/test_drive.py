@@ -95,7 +95,7 @@ def film_frames(path):
 
 def test_a_drive_leaves_film_episode_and_a_summary(workplace, tmp_path):
     options = ["--cars", "2", "--pedestrians", "3", "--seed", "5", "--weather", "rainy-noon", "--out", str(tmp_path)]
-    done = drive(workplace, "--scenario", "short", *options)
+    done = drive(workplace, "--scenario", "short", "--quiet", *options)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert "short, rainy-noon, bare road, 2 cars, 3 pedestrians: time limit after 0.4 s, no events" in done.stdout
@@ -128,7 +128,7 @@ MISTAKES = {
     "unknown weather": (["--weather", "rainy-non"], "did you mean rainy-noon?"),
     "unknown driver": (["--controller", "exprt"], "--controller is 'exprt', expected expert or a controller"),
     "missing weights": (["--controller", "none.safetensors"], "none.safetensors does not exist"),
-    "missing list": (["--scenarios", "none.toml"], "none.toml cannot be read"),
+    "missing list": (["--scenarios", "none.toml"], "cannot read none.toml"),
     "missing pattern": (["--pattern", "none.json"], "cannot read none.json"),
     "missing picture": (["--pattern", "none.png"], "none.png is missing; give a pattern"),
     "broken pattern": (["--pattern", "broken.json"], "broken.json is not valid JSON"),

@@ -49,7 +49,16 @@ def call(workplace, *options):
 
 def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path):
     run = tmp_path / "run"
-    options = ["--scenarios", "own.toml", "--scenario", "short", *ONE_DRIVE, "--out", str(run / "evaluation")]
+    options = [
+        "--scenarios",
+        "own.toml",
+        "--scenario",
+        "short",
+        "--quiet",
+        *ONE_DRIVE,
+        "--out",
+        str(run / "evaluation"),
+    ]
     done = call(workplace, "evaluate", "pattern.json", *options)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

@@ -45,7 +45,7 @@ def call(workplace, *words):
 
 @pytest.mark.parametrize("folder", ["run", "run/recordings"])
 def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path, folder):
-    options = ["--simulator", f"recorded:{folder}", "--controller", "paint_shy:paint_shy", "--no-film"]
+    options = ["--simulator", f"recorded:{folder}", "--controller", "paint_shy:paint_shy", "--no-film", "--quiet"]
     done = call(workplace, "evaluate", "pattern.json", *options, "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

@@ -40,7 +40,7 @@ def test_mistakes_are_one_clear_line(scenarios, tmp_path):
     save_scenarios([dataclasses.replace(first, map_name="city")], tmp_path / "city.toml")
     (tmp_path / "file").write_text("")
     for options, message in (
-        (["--file", tmp_path / "none.toml"], "cannot be read"),
+        (["--file", tmp_path / "none.toml"], "cannot read"),
         (["--file", tmp_path / "city.toml"], "has no map 'city'"),
         (["--out", tmp_path / "file" / "map.png"], "cannot write"),
         (["--out", tmp_path / "map.mp3"], "cannot be drawn"),

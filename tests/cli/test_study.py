@@ -36,7 +36,7 @@ def plan(tmp_path):
 def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_path):
     needs.town()
     for _ in range(2):
-        code, printed = study("run", plan, "--out", tmp_path / "out")
+        code, printed = study("run", plan, "--quiet", "--out", tmp_path / "out")
         assert code == 0, printed.err + printed.out
         assert "chance" in printed.out
         assert "found with 2 simulator calls" in printed.out

@@ -13,11 +13,11 @@ import needs
 from paint_shy import PaintShy, along_a_street
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
-from roadproof.driving.deviation import deviation_m, lateral_m, passage
+from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import evaluate, random_patterns
-from roadproof.driving.evaluation import Evaluation, load_paint, path_of
+from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.infractions import infraction_points
 from roadproof.driving.rollout import rollout
 from roadproof.driving.starts import StartRange

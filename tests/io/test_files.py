@@ -3,10 +3,15 @@
 import dataclasses
 
 import pytest
+import torch
 
-from roadproof.errors import RecordingError, ScenarioError
-from roadproof.io.files import inside, is_plain_name
+import roadproof
+from roadproof.coverage import Shape
+from roadproof.errors import RecordingError, RoadproofError, ScenarioError
+from roadproof.io.files import as_path, inside, is_plain_name
+from roadproof.patterns import Pattern
 from roadproof.scenarios import builtin_scenarios, load_scenarios, save_scenarios
+from scenes import recording_set
 
 PLAIN = (
     "left-03",
@@ -62,5 +67,21 @@ def test_a_scenario_is_called_by_a_plain_name_however_it_comes(name, tmp_path):
     save_scenarios([scenario], path)
     escaped = name.replace("\0", "\\u0000")
     path.write_text(path.read_text().replace(f'"{scenario.name}"', f'"{escaped}"'))
-    with pytest.raises(ScenarioError, match=r"own.toml.*(is not a plain name|valid TOML)"):
+    with pytest.raises(ScenarioError, match=r"own.toml.*(is not a plain name|valid TOML|no NUL)"):
         load_scenarios(path)
+
+
+def test_public_functions_take_paths_as_text(tmp_path):
+    pattern = Pattern((Shape.ELLIPSE,), torch.tensor([[200.0, 200.0, 90.0, 60.0, 0.0]]), torch.ones(1, 3))
+    roadproof.save_pattern(pattern, f"{tmp_path}/pattern.json")
+    assert roadproof.load_pattern(f"{tmp_path}/pattern.json").shapes == pattern.shapes
+    roadproof.save_recordings(recording_set(frames=3), f"{tmp_path}/run/recordings")
+    assert len(roadproof.load_recordings(f"{tmp_path}/run/recordings").recordings) == 3
+    with pytest.raises(RoadproofError, match="nothing to report yet"):
+        roadproof.write_report(str(tmp_path))
+
+
+@pytest.mark.parametrize("given", [None, 3, b"x", ""])
+def test_what_is_no_path_is_one_line(given):
+    with pytest.raises(RoadproofError, match=f"^{given!r} is no path, expected a text or a pathlib.Path$"):
+        as_path(given)

@@ -9,8 +9,8 @@ import torch
 
 from paint_shy import along_a_street
 from roadproof.controllers import load_controller
-from roadproof.driving.evaluation import judge
 from roadproof.driving.rollout import rollout
+from roadproof.driving.trial import judge
 from roadproof.errors import RoadproofError
 from roadproof.pipeline.driven_objective import DrivenObjective, effect_of
 from roadproof.scenarios import find_scenario

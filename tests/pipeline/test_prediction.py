@@ -1,5 +1,7 @@
 """The recorded world's word against a real drive of the town."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from roadproof.drives import Swerve, Trajectories, Window, record
 from roadproof.driving.rollout import rollout
 from roadproof.errors import EpisodeError
 from roadproof.pipeline.prediction import Prediction, predict
+from roadproof.recordings import pooled
 from roadproof.search_space import SearchSpace
 
 
@@ -41,6 +44,9 @@ def test_what_is_foretold_of_a_pattern_is_close_to_what_the_town_drives(town, ru
     assert found.path_error_m < 0.4
     # The car is where it is; so is its recorded way.
     assert np.allclose(found.clean_xy[0], found.predicted_xy[0], atol=0.05)
+    dim = tuple(replace(drive, frames=drive.frames // 2, weather="clear-sunset") for drive in recordings.recordings)
+    both = pooled({"clear-noon": recordings, "clear-sunset": replace(recordings, recordings=dim)})
+    assert predict(both, controller, pattern, clean, painted).predicted_m == found.predicted_m
     found.save(tmp_path / "prediction.npz")
     loaded = Prediction.load(tmp_path / "prediction.npz")
     assert loaded.predicted_m == found.predicted_m

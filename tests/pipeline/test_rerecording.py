@@ -152,5 +152,7 @@ def test_one_search_may_be_for_several_weathers(town, street, tmp_path):
 def test_budgets_that_contradict_themselves_are_refused():
     with pytest.raises(RoadproofError, match="2 rounds begin from candidates"):
         dataclasses.replace(BUDGET, select=0)
+    with pytest.raises(RoadproofError, match="attack_weathers are clear-noon, clear-noon; expected each once"):
+        dataclasses.replace(BUDGET, attack_weathers=(NOON, NOON))
     with pytest.raises(RoadproofError, match="published calibration holds in one weather"):
         dataclasses.replace(BUDGET, calibration=Method.PUBLISHED, attack_weathers=(NOON, RAIN))

@@ -12,9 +12,9 @@ from recorded_drives import drivable_set
 from roadproof.attacks import Candidate
 from roadproof.coverage import Shape
 from roadproof.datatypes import VehicleState, Weather
-from roadproof.driving.deviation import passage
+from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.evaluate import evaluate
-from roadproof.driving.evaluation import Evaluation, passage_deviation_m, path_of
+from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.selection import Selection, select_by_driving

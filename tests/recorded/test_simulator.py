@@ -9,8 +9,8 @@ import torch
 from paint_shy import PaintShy
 from recorded_drives import CANVAS, VEHICLE, drivable_set, shown_from, track
 from roadproof.datatypes import Control, Ending, Weather
+from roadproof.driving.deviation import path_of
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import path_of
 from roadproof.driving.rollout import rollout
 from roadproof.errors import RecordingError, SimulatorError
 from roadproof.recorded.simulator import FURTHEST_ASIDE_M, FURTHEST_TURNED_RAD, RecordedSimulator

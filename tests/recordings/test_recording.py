@@ -109,6 +109,13 @@ def test_the_canvas_and_the_tracks_travel_with_the_set(saved_placed):
     assert "held until the next" in manifest["units"]["track"]
 
 
+def test_the_weather_of_a_drive_travels_with_it(tmp_path):
+    noon = recording_set(frames=2)
+    both = pooled({"noon": noon, "rain": noon})
+    save_recordings(both, tmp_path / "set")
+    assert [drive.weather for drive in load_recordings(tmp_path / "set").recordings] == ["noon"] * 3 + ["rain"] * 3
+
+
 def test_sets_written_before_there_were_tracks_still_load(saved):
     assert json.loads((saved / "recordings.json").read_text())["canvas"] is None
     edit_manifest(saved, lambda m: m.pop("canvas"))
@@ -348,7 +355,14 @@ def test_sets_are_pooled_and_all_their_drives_keep_a_name():
         "clean", "right", "left", "rain-clean", "rain-right", "rain-left"
     ]  # fmt: skip
     assert [len(drive.frames) for drive in both.recordings] == [3, 3, 3, 2, 2, 2]
-    assert pooled({"noon": dry}).recordings == dry.recordings
+    assert [drive.weather for drive in both.recordings] == ["noon"] * 3 + ["rain"] * 3
+    apart = both.by_weather()
+    assert [[drive.name for drive in part.recordings] for part in apart] == [
+        ["clean", "right", "left"], ["rain-clean", "rain-right", "rain-left"]
+    ]  # fmt: skip
+    known = replace(dry, recordings=tuple(replace(drive, weather="dusk") for drive in dry.recordings))
+    assert pooled({"noon": known}).recordings[0].weather == "dusk"
+    assert len(dry.by_weather()) == 1
     darker = replace(wet, colour=ColourTransform(AffineResponse(0.5 * torch.eye(3), torch.zeros(3))))
     with pytest.raises(RecordingError, match="the recordings rain have another camera, crop or colour"):
         pooled({"noon": dry, "rain": darker})

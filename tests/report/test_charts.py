@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from roadproof.driving.evaluation import path_of
+from roadproof.driving.deviation import path_of
 from roadproof.driving.intervals import Mean
 from roadproof.patterns import raster
 from roadproof.report import charts

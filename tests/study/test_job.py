@@ -96,20 +96,20 @@ def test_gradopt_finds_and_is_judged_in_every_condition(street, tmp_path):
     assert history["driven"]["best"][0] > 0
     assert history["driven"]["best"] != [first["deviation_m"]]
     assert first["start_right_m"] != 0
-    check_files(result, figures=1, weathers=("clear-noon", "rainy-noon"))
+    check_files(result, figures=1, conditions=("clear-noon", "clear-noon-traffic", "rainy-noon"))
 
 
-def check_files(result, figures, weathers=("clear-noon",)):
+def check_files(result, figures, conditions=("clear-noon",)):
     stored = np.load(io.BytesIO(result.files["paths.npz"]))
     assert stored["clean_xy"].shape[1] == stored["painted_xy"].shape[1] == 2
     assert np.ptp(stored["clean_xy"], 0).max() > 20
-    views = {f"view-{weather}.jpg" for weather in weathers}
+    views = {f"passage-{condition}.jpg" for condition in conditions}
     assert set(result.files) == {"pattern.json", "pattern.png", "paths.npz", "history.json"} | views
     for name in views:
         with Image.open(io.BytesIO(result.files[name])) as picture:
-            assert picture.size == (400, 300)
+            assert picture.size == (6 * 240, 180)
             assert np.asarray(picture).std() > 10
-    assert len({result.files[name] for name in views}) == len(views), "every weather looks different"
+    assert len({result.files[name] for name in views}) == len(views), "every condition looks different"
     assert len(json.loads(result.files["pattern.json"])["figures"]) == figures
 
 

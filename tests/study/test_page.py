@@ -43,7 +43,7 @@ def test_every_file_is_there(finished):
         path.relative_to(folder / "tables").as_posix() for path in (folder / "tables").rglob("*") if path.is_file()
     }
     assert {"tables.html", "tables.md", "overall-bo.tex", "missing.tex"} <= names
-    drawn = ("by-figures", "progress", "trajectories", "patterns", "weathers")
+    drawn = ("by-figures", "progress", "trajectories", "patterns", "passage-straight", "passage-left")
     assert {f"figures/{name}.png" for name in drawn} <= names
     for name in names:
         if name.endswith(".png"):
@@ -57,7 +57,7 @@ def test_the_page_escapes_and_needs_nothing_else(finished):
     assert "&lt;b&gt;_all_ 100% $x" in page
     assert not re.search(r"<script|src=\"(?!data:)|https?://(?!www\.w3\.org)", page)
     assert page.count("<table") == page.count("</table>") > 8
-    assert page.count("data:image/png;base64,") == 5
+    assert page.count("data:image/png;base64,") == 6
 
 
 def test_what_failed_is_in_every_kind_of_file(finished):
@@ -84,11 +84,14 @@ def test_a_list_of_gaps_goes_when_they_are_filled(tmp_path):
 
 def test_a_weather_never_names_a_file_elsewhere(finished):
     folder, rows, _ = finished
-    job = next(each for each in read_jobs(folder, rows).values() if each.view("clear-noon") is not None)
-    assert (job.view("rainy-noon"), job.view("hard-rain-noon")) == (pytest.approx(180, abs=3), None)
+    job = next(
+        each for each in read_jobs(folder, rows).values() if each.passage("clear-noon", traffic=False) is not None
+    )
+    assert job.passage("rainy-noon", traffic=False) == pytest.approx(180, abs=3)
+    assert job.passage("hard-rain-noon", traffic=False) is None
     other = next(each for each in job.folder.parent.iterdir() if each != job.folder)
-    (job.folder / "view-").mkdir()
-    assert job.view(f"/../../{other.name}/view-clear-noon") is None
+    (job.folder / "passage-").mkdir()
+    assert job.passage(f"/../../{other.name}/passage-clear-noon", traffic=False) is None
 
 
 def test_a_weather_of_the_rows_never_names_a_table_elsewhere(finished, tmp_path):
@@ -100,13 +103,15 @@ def test_a_weather_of_the_rows_never_names_a_table_elsewhere(finished, tmp_path)
     assert (tmp_path / "study" / "tables" / "up-rain-alone-bo.tex").exists()
 
 
-def test_a_damaged_view_is_named(finished, tmp_path):
+def test_a_damaged_strip_is_named(finished, tmp_path):
     folder, rows, _ = finished
     shutil.copytree(folder / "jobs", tmp_path / "jobs")
-    job = next(each for each in read_jobs(tmp_path, rows).values() if each.view("clear-noon") is not None)
-    (job.folder / "view-clear-noon.jpg").write_bytes(b"no picture")
-    with pytest.raises(StudyError, match=r"view-clear-noon\.jpg cannot be read"):
-        job.view("clear-noon")
+    job = next(
+        each for each in read_jobs(tmp_path, rows).values() if each.passage("clear-noon", traffic=False) is not None
+    )
+    (job.folder / "passage-clear-noon.jpg").write_bytes(b"no picture")
+    with pytest.raises(StudyError, match=r"passage-clear-noon\.jpg cannot be read"):
+        job.passage("clear-noon", traffic=False)
 
 
 def test_a_folder_of_an_older_plan_is_not_taken(finished, tmp_path):

@@ -84,6 +84,7 @@ def test_the_key_of_a_job_depends_on_all_that_it_does(tmp_path):
         {"traffic": None},
         {"simulator": "carla://localhost"},
         {"method": dataclasses.replace(job.method, iterations=1)},
+        {"method": dataclasses.replace(job.method, attack_weathers=(Weather.RAINY_NOON,))},
         {"scenario": dataclasses.replace(job.scenario, time_limit_s=1.0)},
     ):
         assert dataclasses.replace(job, **change).key != job.key
@@ -190,7 +191,7 @@ def test_the_studies_that_come_with_the_project_can_be_read(path):
     study = load_study(path)
     searches = {method.search for method in study.methods}
     assert "gradopt" in searches
-    assert {"published-bo", "published"} & searches or path.stem == "ablation"
+    assert {"published-bo", "published"} & searches or path.stem in ("ablation", "weathers")
     assert len(study.jobs) == len({job.key for job in study.jobs})
 
 

@@ -8,6 +8,8 @@ from roadproof.attacks.blackbox import BayesianOptimisation as BayesianOptimisat
 from roadproof.attacks.blackbox import BlackBox as BlackBox
 from roadproof.attacks.blackbox import GaussianProcess as GaussianProcess
 from roadproof.attacks.blackbox import RandomSearch as RandomSearch
+from roadproof.attacks.cheapest import Cheapest as Cheapest
+from roadproof.attacks.cheapest import cheapest as cheapest
 from roadproof.attacks.checks import Check as Check
 from roadproof.attacks.groups import parse_groups as parse_groups
 from roadproof.attacks.method import Method as Method
@@ -24,4 +26,5 @@ from roadproof.attacks.result import Candidate as Candidate
 from roadproof.attacks.result import Cost as Cost
 from roadproof.attacks.show import ShownDrive as ShownDrive
 from roadproof.attacks.show import show_pattern as show_pattern
+from roadproof.attacks.site import site_of as site_of
 from roadproof.attacks.surrogate import Surrogate as Surrogate

@@ -19,12 +19,14 @@ from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import Measure, Objective, SteeringShift
+from roadproof.attacks.objective import Measure, Objective, SteeringShift, variation_of
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
+from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.io.identity import require_same
 from roadproof.io.records import plain
+from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -65,8 +67,12 @@ def attack(
     Raises:
         ControllerError: the controller takes other frames, or answers NaN.
         RecordingError: a group names drives that the set lacks.
+        PatternError: the method does not know these patterns, or the limits on paint leave none on this road.
     """
     objective, method = objective or SteeringShift(), method or GradOpt()
+    method.check_space(space)
+    site = site_of(recordings)
+    space = space.on(site)
     groups = groups or method.groups(recordings)
     measure = method.measure(objective, recordings, controller, groups, device=device)
     start = time.perf_counter()
@@ -101,6 +107,7 @@ def attack(
         space=space,
         method=method,
         seed=seed,
+        conspicuousness=conspicuousness(candidates[0].pattern, space.site or site),
     )
 
 
@@ -142,8 +149,9 @@ def kept_attack(
         for values in (drive.frames, drive.frame_number, drive.image_from_canvas):
             frames.update(np.ascontiguousarray(values).tobytes())
     made_of = {
-        "space": plain(space),
+        "space": space.stated,
         "objective": objective.name,
+        "variation": plain(variation_of(objective)),
         "method": stored(method),
         "groups": groups and list(map(str, groups)),
         "seed": seed,

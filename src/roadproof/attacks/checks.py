@@ -57,7 +57,7 @@ def check_search(
 
 
 def check_world(measure: DeviationMeasure, pattern: Pattern) -> tuple[Check, ...]:
-    """Look whether a recorded world may be believed: on the bare road, and over the pattern found.
+    """Look whether recorded worlds may be believed: on the bare road, and over the pattern found.
 
     Args:
         measure: what was searched on.
@@ -67,10 +67,11 @@ def check_world(measure: DeviationMeasure, pattern: Pattern) -> tuple[Check, ...
         pattern.shapes, pattern.boxes[None].to(measure.device), pattern.colours[None].to(measure.device)
     )
     with torch.no_grad():
-        bare = measure.world.roll(measure.controller)
-        painted = measure.world.roll(measure.controller, on_device)
-    strays_m = float(bare.right_m.abs().max())
-    aside_m, turned_rad = float(painted.left_m.abs().max()), float(painted.turned_rad.abs().max())
+        bare = [world.roll(measure.controller) for world in measure.worlds]
+        painted = [world.roll(measure.controller, on_device) for world in measure.worlds]
+    strays_m = max(float(each.right_m.abs().max()) for each in bare)
+    aside_m = max(float(each.left_m.abs().max()) for each in painted)
+    turned_rad = max(float(each.turned_rad.abs().max()) for each in painted)
     keeps, near = strays_m <= STRAYS_M, aside_m <= ASIDE_M and turned_rad <= TURNED_RAD
     return (
         Check(

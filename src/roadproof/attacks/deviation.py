@@ -1,7 +1,7 @@
 """How far a pattern takes the car aside in the recorded world: the measure of a search in metres, with gradients.
 
-Patterns × starts are driven side by side (`recorded.world`). The value of a pattern for a side is the mean, over starts
-and over the instants at which the canvas is in view, of
+Patterns × starts are driven side by side (`recorded.world`), in each weather that was recorded. The value of a pattern
+for a side is the mean, over weathers, starts and the instants at which the canvas is in view, of
 
     s tanh(d / s)
 
@@ -14,13 +14,16 @@ import copy
 import hashlib
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.groups import Direction, Group
-from roadproof.attacks.surrogate import Surrogate
+from roadproof.attacks.surrogate import FIXED, Surrogate
+from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
+from roadproof.patterns import Pattern
 from roadproof.recorded.world import UNSURE, RecordedWorld, Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -33,13 +36,14 @@ class DeviationMeasure:
     """Predicted offset of patterns in a recorded world, for every group at once.
 
     Args:
-        recordings: with canvas and tracks.
+        recordings: with canvas and tracks; the drives of each weather are a world of their own.
         controller: on `device`.
         groups: give the sides; all drives of the set are driven in, whatever group they belong to.
         starts: of the drives over each pattern.
         every: steps from one picture to the next.
         saturation_m: s.
         device: where to drive.
+        variation: looks over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
         RecordingError: poses are not known, or the vehicle cannot be identified.
@@ -56,22 +60,30 @@ class DeviationMeasure:
         every: int = 2,
         saturation_m: float = 3.0,
         device: torch.device | str = "cpu",
+        variation: Variation | None = None,
     ) -> None:
         # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
-        self._open_loop = Surrogate(recordings, controller, groups, device=device)
+        self._open_loop = Surrogate(recordings, controller, groups, device=device, variation=variation)
         self.groups = tuple(groups)
         self.controller = controller
-        self.world = RecordedWorld(recordings, device=device)
-        self.world.fit(controller)
-        self.device = self.world.device
+        self.worlds = tuple(RecordedWorld(each, device=device) for each in recordings.by_weather())
+        for world in self.worlds:
+            world.fit(controller)
+        self.device = torch.device(device)
         self.frames_evaluated = 0
         self._starts, self.every, self._saturation_m = starts, every, saturation_m
+        self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
 
     def thinned(self, every: int) -> DeviationMeasure:
         """The same world with a picture every n steps: it chooses among many starts for less."""
         thin = copy.copy(self)
         thin.every, thin.frames_evaluated = every, 0
         return thin
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over other looks from now on; nothing without a variation."""
+        if self.variation is not None:
+            self._looks = self.variation.draw(seed, self.device)
 
     def open_loop(self) -> Surrogate:
         """The steering shift on the recorded frames."""
@@ -105,28 +117,49 @@ class DeviationMeasure:
     def readings(
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
-        """Steering shift on the recorded frames, and the paper's deviation as predicted, with small steering errors."""
-        predicted = self.world.deviations_m(self.controller, space.pattern(unit.flatten(0, 1)), UNSURE)
+        """Steering shift on the recorded frames, and the paper's deviation as predicted, with small steering errors.
+
+        The predictions of all weathers stand one after another.
+        """
+        patterns = space.pattern(unit.flatten(0, 1))
+        looks = self.variation and self.variation.draw(FIXED, self.device, len(UNSURE))
+        self._open_loop.redraw(FIXED)
+        predicted = np.concatenate(
+            [world.deviations_m(self.controller, patterns, UNSURE, looks) for world in self.worlds], 1
+        )
         return self._open_loop.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
 
     def fingerprint(self) -> str:
         """Tells this measure from another: drives, calibration, controller, starts."""
-        more = repr((self._starts, self.every, self._saturation_m, self.world.vehicle))
+        # The variation is in the fingerprint of the steering shift.
+        more = repr((self._starts, self.every, self._saturation_m, [each.vehicle for each in self.worlds]))
         return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
 
     def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
-        pictures = len(self.groups) * len(self._starts) * -(-self.world.course.count // self.every)
+        pictures = len(self.groups) * sum(self._pictures(world) for world in self.worlds)
         at_once = max(1, MAX_PICTURES // pictures)
         yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
 
     def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         patterns = space.pattern(unit.flatten(0, 1))
-        rolled = self.world.roll(self.controller, patterns, starts=self._starts, every=self.every)
-        self.frames_evaluated += len(rolled.right_m) * -(-self.world.course.count // self.every)
-        soft = self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)
-        right = soft.mean(1).view(*unit.shape[:2], -1)
+        right = torch.cat([self._right(world, patterns).view(*unit.shape[:2], -1) for world in self.worlds], -1)
         sides = [_to_side(part, group.direction) for group, part in zip(self.groups, right, strict=True)]
         return torch.stack(sides).mean(-1).float()
+
+    def _right(self, world: RecordedWorld, patterns: Pattern) -> Float[Tensor, " r"]:
+        """The mean offset of each drive in one world, start after start, each of them once with every look."""
+        starts = tuple(start for start in self._starts for _ in range(self._times))
+        rolled = world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
+        self.frames_evaluated += len(patterns.boxes) * self._pictures(world)
+        return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
+
+    def _pictures(self, world: RecordedWorld) -> int:
+        """How many all drives over one pattern take."""
+        return len(self._starts) * self._times * -(-world.course.count // self.every)
+
+    @property
+    def _times(self) -> int:
+        return 1 if self._looks is None else len(self._looks)
 
 
 def _to_side(right_m: Tensor, direction: Direction) -> Tensor:

@@ -21,7 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
-from roadproof.attacks.objective import Measure
+from roadproof.attacks.objective import Measure, Varied
+from roadproof.attacks.surrogate import FIXED
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
@@ -142,6 +143,8 @@ def gradopt(
             state = _next_rung(state, space, rungs[number - 1], rung, derived_seed(seed, number))
         climbed, done = rung.view(measure), sum(before.iterations for before in rungs[:number])
         while int(state["done"]) < rung.iterations:
+            if isinstance(climbed, Varied):
+                climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
             state = _step(climbed, space, rung.learning_rate, momentum, state)
             on_step(done + int(state["done"]), float(state["best"].max()))
             if checkpoint:
@@ -150,7 +153,12 @@ def gradopt(
                 save_checkpoint(checkpoint, identity, whole)
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
-    return Search(state["best_unit"], state["best"], state["history"].cpu())
+    best = state["best"]
+    if isinstance(measure, Varied) and measure.variation is not None:
+        # Every step had looks of its own; results are compared in the same ones.
+        measure.redraw(FIXED)
+        best = measure.values(space, state["best_unit"])
+    return Search(state["best_unit"], best, state["history"].cpu())
 
 
 def _starts(

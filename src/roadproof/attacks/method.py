@@ -49,6 +49,14 @@ class Method:
         """
         return objective.measure(recordings, controller, groups, device=device)
 
+    def check_space(self, space: SearchSpace) -> None:
+        """See that it can search these patterns; called before any work begins.
+
+        Raises:
+            RoadproofError: it cannot; the message says what to change.
+        """
+        del space
+
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
         """Make an objective's measure large for all of its groups."""
         raise NotImplementedError

@@ -22,7 +22,7 @@ from roadproof.attacks.method import Method
 from roadproof.attacks.objective import Measure, Objective, SteeringShift
 from roadproof.attacks.published import MASKS, PublishedMeasure
 from roadproof.controllers import Controller
-from roadproof.errors import RoadproofError
+from roadproof.errors import PatternError, RoadproofError
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -145,9 +145,21 @@ class Published(Method):
         Raises:
             RoadproofError: another objective is asked for.
         """
-        if not isinstance(objective, SteeringShift):
+        if not isinstance(objective, SteeringShift) or objective.variation is not None:
             raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
         return PublishedMeasure(recordings, controller, groups, masks=self.masks, device=device)
+
+    def check_space(self, space: SearchSpace) -> None:
+        """See that all of it was published.
+
+        Raises:
+            PatternError: it has limits, or another family.
+        """
+        if not space.family.startswith("published") or space.max_painted_share is not None or space.limits is not None:
+            raise PatternError(
+                "the published search knows the published families alone, without limits on paint; change them, or "
+                "search with method gradopt"
+            )
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
         """Climb as published."""

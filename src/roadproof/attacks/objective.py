@@ -8,7 +8,7 @@ An objective is a description; `measure` makes of it what values patterns on a s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.groups import Group
 from roadproof.attacks.surrogate import Surrogate
+from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.recorded.world import Start
@@ -69,6 +70,17 @@ class Measure(Protocol):
 
 
 @runtime_checkable
+class Varied(Protocol):
+    """A measure that may take the mean over other looks at every step."""
+
+    variation: Variation | None
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over the looks of a seed from now on."""
+        ...
+
+
+@runtime_checkable
 class Objective(Protocol):
     """What a search makes large."""
 
@@ -90,18 +102,25 @@ class Objective(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SteeringShift:
-    """How far steering moves on recorded frames, open loop, as published; its value is steer units a frame."""
+    """How far steering moves on recorded frames, open loop, as published; its value is steer units a frame.
+
+    Args:
+        variation: looks over which its mean is taken; None for paint and camera as recorded.
+    """
+
+    # Runs know their objective by its repr, which is older than variations; those are told beside it.
+    variation: Variation | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
         """In words, for results and reports."""
-        return "steering shift"
+        return "steering shift" + _over(self.variation)
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
     ) -> Surrogate:
         """The surrogate on the groups' frames."""
-        return Surrogate(recordings, controller, groups, device=device)
+        return Surrogate(recordings, controller, groups, device=device, variation=self.variation)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -112,6 +131,7 @@ class PathDeviation:
         starts: of the drives over each pattern; several make what is found less particular to one way.
         every: steps from one picture to the next while searching; a prediction looks at every step.
         saturation_m: an offset of so many metres counts hardly less than a larger one.
+        variation: looks over which its mean is taken; None for paint and camera as recorded.
 
     Raises:
         RoadproofError: there is no start, or a number is not positive.
@@ -120,6 +140,7 @@ class PathDeviation:
     starts: tuple[Start, ...] = (Start(),)
     every: int = 2
     saturation_m: float = 3.0
+    variation: Variation | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not self.starts or self.every < 1 or not self.saturation_m > 0:
@@ -131,7 +152,7 @@ class PathDeviation:
     @property
     def name(self) -> str:
         """In words, for results and reports."""
-        return "path deviation"
+        return "path deviation" + _over(self.variation)
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
@@ -145,7 +166,30 @@ class PathDeviation:
             every=self.every,
             saturation_m=self.saturation_m,
             device=device,
+            variation=self.variation,
         )
+
+
+def _over(variation: Variation | None) -> str:
+    return "" if variation is None else " over variations"
+
+
+def varied(objective: Objective, variation: Variation | None) -> Objective:
+    """An objective in expectation over a variation; itself where there is none.
+
+    Raises:
+        RoadproofError: it is one of the user's own, which has to take the mean itself.
+    """
+    if variation is None:
+        return objective
+    if isinstance(objective, SteeringShift | PathDeviation):
+        return replace(objective, variation=variation)
+    raise RoadproofError(f"the objective {objective.name} knows no variation; take its mean in its own measure")
+
+
+def variation_of(objective: Objective) -> Variation | None:
+    """The variation of an objective; None where it has none, or is the user's own."""
+    return objective.variation if isinstance(objective, SteeringShift | PathDeviation) else None
 
 
 OBJECTIVES: dict[str, Objective] = {"deviation": PathDeviation(), "steering": SteeringShift()}

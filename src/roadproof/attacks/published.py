@@ -14,7 +14,6 @@ from roadproof.attacks.groups import Group, divergence
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.published import AntialiasedView, MaskedView, pasted, view_canvas_published
 from roadproof.controllers import Controller
-from roadproof.errors import PatternError
 from roadproof.patterns import visibilities
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -102,8 +101,6 @@ class PublishedMeasure:
         self, space: SearchSpace, group: int, point: Float[Tensor, "k n"]
     ) -> tuple[Float[Tensor, ""], MaskedView, Tensor, Tensor, Tensor]:
         """δ of one point, its view, masks and colours, and the pixels that the controller saw."""
-        if not space.family.startswith("published") or space.max_painted_share is not None:
-            raise PatternError("the published search knows the published families alone, without a limit of the area")
         exact, view = self._exact, self._view(group, coloured=space.colour)
         pattern = space.pattern(point.detach())
         masks, colours = view.masks(pattern.boxes), pattern.colours.requires_grad_()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,7 +14,9 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import Form, RecordFile
+from roadproof.paint import Conspicuousness
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
 
@@ -41,9 +42,9 @@ class Candidate:
         pattern: its best.
         group: the drives it was found on.
         surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames.
-        predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where nothing
-            was driven there.
-        predicted_range_m: least and most of it over those errors.
+        predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
+            steering; None where nothing was driven there.
+        predicted_range_m: least and most of it over those.
     """
 
     pattern: Pattern
@@ -65,9 +66,9 @@ class AttackResult:
         group: the group it was found for, e.g. "clean+right".
         objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
         surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
-        predicted_m: the paper's deviation in the recorded world, mean over small errors of steering; None where the
-            search did not drive there.
-        predicted_range_m: least and most of it over those errors.
+        predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
+            steering; None where the search did not drive there.
+        predicted_range_m: least and most of it over those.
         by_group: the best value of every group, in the objective's unit: steer a frame, or metres; the published
             method's is a sum over frames.
         candidates: every start's best, the strongest first: by the least predicted deviation where there is one. The
@@ -79,6 +80,7 @@ class AttackResult:
         space: where it looked.
         method: how it searched.
         seed: of everything random.
+        conspicuousness: of the strongest pattern, on this road; None in results older than the word.
     """
 
     pattern: Pattern
@@ -95,8 +97,9 @@ class AttackResult:
     objective: str = "steering shift"
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+    conspicuousness: Conspicuousness | None = None
 
-    def save(self, folder: Path, made_of: Mapping[str, object] | None = None) -> None:
+    def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
 
         Args:
@@ -106,6 +109,7 @@ class AttackResult:
         Raises:
             OutputError: the folder cannot be written.
         """
+        folder = as_path(folder)
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")
@@ -119,12 +123,13 @@ class AttackResult:
         )
 
     @staticmethod
-    def load(folder: Path) -> AttackResult:
+    def load(folder: AnyPath) -> AttackResult:
         """Read what `save` wrote.
 
         Raises:
             RoadproofError: a file is missing, damaged or of another format.
         """
+        folder = as_path(folder)
         path = folder / "result.json"
         content = RESULT_FILE.content(path)
         if "method" not in content:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from roadproof.attacks.groups import Group, divergence
 from roadproof.compositing import CanvasView, Compositor, view_canvas
+from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.errors import ControllerError
@@ -24,6 +25,9 @@ from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
 from roadproof.recordings import Recording, RecordingSet
 from roadproof.search_space import SearchSpace
+
+FIXED = 0
+"""The seed of the looks in which patterns are compared, whatever step of a search they come from."""
 
 MAX_FRAMES = 256
 """Frames the controller sees at once: bounds memory, and more make no CPU faster."""
@@ -37,6 +41,7 @@ class Surrogate:
         controller: on `device`; it is given float32 frames, whatever it computes in.
         groups: drives attacked together; each has patterns of its own.
         device: where frames are composited.
+        variation: looks over which the shift's mean is taken; None for paint and camera as recorded.
 
     Raises:
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
@@ -50,6 +55,7 @@ class Surrogate:
         groups: Sequence[Group],
         *,
         device: torch.device | str = "cpu",
+        variation: Variation | None = None,
     ) -> None:
         height, width = recordings.view.height_px, recordings.view.width_px
         if controller.input_size not in (None, (height, width)):
@@ -62,6 +68,8 @@ class Surrogate:
         self.recordings = recordings
         self.controller = controller
         self.frames_evaluated = 0
+        self.variation = variation
+        self._looks: Looks | None = None
         self._kept: tuple[int, Compositor] | None = None
         drives = [group.select(recordings) for group in groups]
         self.lengths = [[len(drive.frames) for drive in members] for members in drives]
@@ -73,6 +81,9 @@ class Surrogate:
                 self._steer(view.clean_frames, speed, command)
                 for view, speed, command in zip(self.views, self._speed, self._command, strict=True)
             ]
+        self._clean_looked = self.clean_steer
+        if variation is not None:
+            self.redraw(FIXED)
 
     @property
     def device(self) -> torch.device:
@@ -82,7 +93,22 @@ class Surrogate:
     def thinned(self, every: int) -> Surrogate:
         """The same on every n-th frame of each drive."""
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
-        return type(self)(few, self.controller, self.groups, device=self.device)
+        return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over other looks from now on; nothing without a variation."""
+        if self.variation is None:
+            return
+        self._looks = looks = self.variation.draw(seed, self.device)
+        with torch.no_grad():
+            self._clean_looked = [
+                self._steer(
+                    looks.seen(view.clean_frames.repeat(len(looks), 1, 1, 1), len(looks)),
+                    speed.repeat(len(looks)),
+                    command.repeat(len(looks)),
+                ).view(len(looks), -1)
+                for view, speed, command in zip(self.views, self._speed, self._command, strict=True)
+            ]
 
     def open_loop(self) -> Surrogate:
         """Itself."""
@@ -104,13 +130,24 @@ class Surrogate:
 
     def shifts(self, patterns: Sequence[Pattern]) -> list[Float[Tensor, "r f"]]:
         """Steer on composited minus steer on clean frames, for every group, pattern and frame."""
+        looks = self._looks
+        if looks is not None:
+            patterns = [looks.placed(_repeated(each, len(looks)), self.recordings.canvas) for each in patterns]
         copies = len(patterns[0].boxes)
-        frames = self._compositor(copies)(patterns)
+        frames = self._compositor(copies)(patterns, looks)
+        if looks is not None:
+            parts = cast("tuple[Tensor, ...]", frames.split([copies * len(view.frames) for view in self.views]))
+            frames = torch.cat([looks.seen(part, copies) for part in parts])
         speed = torch.cat([part.repeat(copies) for part in self._speed])
         command = torch.cat([part.repeat(copies) for part in self._command])
         steer = self._steer(frames, speed, command)
         parts = cast("tuple[Tensor, ...]", steer.split([copies * len(view.frames) for view in self.views]))
-        return [part.view(copies, -1) - clean for part, clean in zip(parts, self.clean_steer, strict=True)]
+        if looks is None:
+            return [part.view(copies, -1) - clean for part, clean in zip(parts, self.clean_steer, strict=True)]
+        return [
+            (part.view(-1, len(looks), len(view.frames)) - clean).mean(1)
+            for part, clean, view in zip(parts, self._clean_looked, self.views, strict=True)
+        ]
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         """δ per frame at points of a search space, without gradients, a bounded number of frames at a time."""
@@ -137,7 +174,8 @@ class Surrogate:
 
     def fingerprint(self) -> str:
         """Tells this surrogate from another: drives, calibration, controller (by its clean answers)."""
-        digest = hashlib.sha256(repr((self.groups, self.lengths)).encode())
+        told = (self.groups, self.lengths) if self.variation is None else (self.groups, self.lengths, self.variation)
+        digest = hashlib.sha256(repr(told).encode())
         for view, steer in zip(self.views, self.clean_steer, strict=True):
             for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer):
                 digest.update(tensor.cpu().numpy().tobytes())
@@ -145,7 +183,8 @@ class Surrogate:
 
     def _batches(self, unit: Float[Tensor, "g r k n"]) -> tuple[Tensor, ...]:
         """Parts of at most MAX_FRAMES frames, as even as can be; at least one pattern a group each."""
-        at_once = max(1, MAX_FRAMES // sum(len(view.frames) for view in self.views))
+        looks = 1 if self._looks is None else len(self._looks)
+        at_once = max(1, MAX_FRAMES // (looks * sum(len(view.frames) for view in self.views)))
         return unit.chunk(-(-unit.shape[1] // at_once), dim=1)
 
     def _compositor(self, copies: int) -> Compositor:
@@ -161,6 +200,13 @@ class Surrogate:
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
         self.frames_evaluated += len(frames)
         return steer_of(self.controller, frames, speed, command).float()
+
+
+def _repeated(pattern: Pattern, times: int) -> Pattern:
+    """Each pattern of a batch so many times, one after another."""
+    return Pattern(
+        pattern.shapes, pattern.boxes.repeat_interleave(times, 0), pattern.colours.repeat_interleave(times, 0)
+    )
 
 
 def _patterns(space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> list[Pattern]:

@@ -15,12 +15,15 @@ from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, h
 from roadproof.calibration.replays import Replays, drive_digest
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
 from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
+from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import Homography, homography_from_pose
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
+from roadproof.roads.marks import marks_of
 from roadproof.simulators.protocol import Simulator
 
 WORST_PX = 3.0
@@ -112,7 +115,7 @@ def calibrate(
     drives: Drives,
     method: Method = Method.TWO_PAINT,
     *,
-    folder: Path | None = None,
+    folder: AnyPath | None = None,
     on_call: Callable[[int], object] = lambda _done: None,
 ) -> Calibrated:
     """Find out where the canvas is in every frame of recorded drives, and how paint looks there.
@@ -129,6 +132,7 @@ def calibrate(
         SimulatorError, ScenarioError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
+    folder = None if folder is None else as_path(folder)
     settings = drives.settings
     if (simulator.camera, simulator.input, simulator.dt_s) != (settings.camera, settings.view, settings.dt_s):
         raise CalibrationError(
@@ -161,10 +165,12 @@ def calibrate(
         view=settings.view,
         colour=colour,
         recordings=tuple(
-            _recording(drive, g, shading) for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
+            _recording(drive, g, shading, settings.weather)
+            for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
         ),
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
         canvas=settings.scenario.canvas,
+        marks=marks_of(simulator, settings.scenario),
     )
     return Calibrated(recordings, report, _parts(drives, method))
 
@@ -218,7 +224,7 @@ def _report(replays: Replays, drives: Drives, drive: Drive, geometry: _Geometry)
     )
 
 
-def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None) -> Recording:
+def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None, weather: Weather) -> Recording:
     kept = list(geometry.found)
     steps = drive.frame_number[kept]
     return Recording(
@@ -232,4 +238,5 @@ def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None) -> Rec
         steer=drive.steer[kept],
         maps=maps,
         track=drive.track,
+        weather=str(weather),
     )

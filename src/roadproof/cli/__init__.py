@@ -6,9 +6,10 @@ A `RoadproofError` is one line on standard error and exit code 2, a traceback on
 from __future__ import annotations
 
 import math
+import os
 import sys
 import traceback
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -31,6 +32,7 @@ from roadproof.cli.scenarios import scenarios
 from roadproof.cli.select import select
 from roadproof.cli.study import study
 from roadproof.cli.train import train
+from roadproof.cli.verbs import verb
 from roadproof.errors import RoadproofError
 from roadproof.foreign import LIMIT_S, end_calls_after
 from roadproof.memory import keep_freed_memory
@@ -42,29 +44,31 @@ app = typer.Typer(
     help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
 VERBS = (
-    demo,
-    record,
-    calibrate,
-    attack,
-    select,
-    evaluate,
+    verb(demo, estimates=True),
+    verb(record, estimates=True),
+    verb(calibrate),
+    verb(attack, estimates=True),
+    verb(select),
+    verb(evaluate, estimates=True),
     report,
-    check,
-    drive,
+    verb(check, estimates=True),
+    verb(drive),
     scenarios,
     controllers,
-    check_controller,
+    verb(check_controller),
     convert_cil,
-    train,
-    harden,
+    verb(train),
+    verb(harden, estimates=True),
 )
-for verb in VERBS:
-    app.command()(verb)
+for each in VERBS:
+    app.command()(each)
 app.add_typer(carla, name="carla")
 app.add_typer(study, name="study")
 
 
 _debug = False
+_INTERRUPTED = 130
+_UsageError: Any = typer.BadParameter.__base__  # typer brings click along, in a place that changes
 
 
 def _version(wanted: bool | None) -> None:
@@ -92,14 +96,37 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 def main() -> None:
     """Entry point of the `roadproof` command."""
     keep_freed_memory()
-    complain = Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print
     try:
-        app()
-    except RoadproofError as error:
-        if _debug:
-            traceback.print_exc()
-        complain(f"roadproof: {error!s:.1000}")  # what a message quotes may be long
+        code = app(prog_name="roadproof", standalone_mode=False)
+    except _UsageError as error:
+        # Where no words were given, the help was shown instead, and there is nothing to say.
+        if said := error.format_message().rstrip("."):
+            _complain(f"{said}; see: {error.ctx.command_path if error.ctx else 'roadproof'} --help")
         sys.exit(2)
-    except KeyboardInterrupt:
-        complain("roadproof: interrupted; give the same command again to go on")
-        sys.exit(130)
+    except RoadproofError as error:
+        _fail(str(error))
+    except OSError as error:
+        # The system's own words: of a path that no file can have, or a disk that fails.
+        _fail(f"{str(error.filename)[:200]!r}: {error.strerror}; check the path" if error.strerror else str(error))
+    except typer.Abort:
+        code = _INTERRUPTED
+    if code == _INTERRUPTED:
+        _complain("interrupted; give the same command again to go on")
+        # At once: what works beside this process ends with it, and would be waited for.
+        sys.stdout.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def _fail(message: str) -> NoReturn:
+    """End with a line on the exception that is being handled."""
+    if _debug:
+        traceback.print_exc()
+    _complain(message)
+    sys.exit(2)
+
+
+def _complain(message: str) -> None:
+    """One line on standard error; what a message quotes may be long, or hold line ends and a terminal's commands."""
+    plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in message)
+    Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"roadproof: {plain:.1000}")

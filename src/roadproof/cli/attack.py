@@ -10,12 +10,15 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import say
+from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.verbs import begin
 from roadproof.limits import MANY, MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult
 
 
+@with_paint
 def attack(
     recordings: Annotated[Path, argument("Folder with a set of recorded drives.")],
     controller: options.ControllerSpec,
@@ -25,7 +28,7 @@ def attack(
     ] = "published",
     shape: Annotated[str, typer.Option(help="rectangle, ellipse, triangle or diamond.")] = "rectangle",
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
-    albedo: Annotated[tuple[float, float], typer.Option(help="Darkest and brightest paint, 0 to 1.")] = (0.0, 1.0),
+    albedo: Annotated[tuple[float, float], number("Darkest and brightest paint.", 0.0, 1.0)] = (0.0, 1.0),
     max_painted_share: Annotated[
         float | None, number("Largest share of the canvas that may be painted.", 0.0, 1.0, show_default=False)
     ] = None,
@@ -67,21 +70,28 @@ def attack(
     random_patterns: Annotated[
         int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
     ] = 100,
+    cheapest: options.CheapestFor = None,
     seed: Annotated[int, number("Of the random starts.", 0, MAX_SEED)] = 0,
     device: options.Device = "cpu",
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/attack"),
+    *,
+    paint: Paint,
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern
+    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern, site_of
     from roadproof.attacks import attack as run
+    from roadproof.attacks import cheapest as fewest
+    from roadproof.attacks.cheapest import in_words
+    from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
-    from roadproof.io.locks import hold
+    from roadproof.errors import RecordingError
+    from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
@@ -93,26 +103,33 @@ def attack(
         colour=not black,
         albedo=albedo,
         max_painted_share=max_painted_share,
+        limits=paint.limits,
     )
     given = {"iterations": iterations, "restarts": restarts, "masks": masks, "calls": calls}
     searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
-    hold(out)
+    searched.check_space(space)
     drives = load_recordings(recordings)
     driven_in = method != "published" and drives.is_placed and drives.has_both_sides
     word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
+    goal = varied(OBJECTIVES[word], paint.variation)
+    space = space.on(site_of(drives))
+    if cheapest is not None and not drives.is_placed:
+        raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
     chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
     size = (drives.view.height_px, drives.view.width_px)
     require_usable(attacked, size=size, device=device, drives=False, gradients=searched.by_gradient)
+    frames = sum(len(each.frames) for each in drives.recordings)
+    begin(of_search(searched, OBJECTIVES[word], frames, attacked, groups=len(chosen)), out)
     checkpoint = out / "search.safetensors"
-    with progress("Searching", searched.steps(OBJECTIVES[word])) as on_step:
+    with progress("Searching", searched.steps(goal)) as on_step:
         result = run(
             drives,
             attacked,
             space,
-            objective=OBJECTIVES[word],
+            objective=goal,
             method=searched,
             groups=chosen,
             seed=seed,
@@ -126,6 +143,14 @@ def attack(
     draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, out)
+    if cheapest is not None:
+        with progress("Looking for less paint", 14) as on_step:
+            less = fewest(
+                drives, attacked, result, cheapest, groups=chosen, objective=goal, device=device, on_level=on_step
+            )
+        if less is not None:
+            less.save(out / "cheapest")
+        say(in_words(less, cheapest))
 
 
 def _summarise(result: AttackResult, out: Path) -> None:
@@ -133,9 +158,10 @@ def _summarise(result: AttackResult, out: Path) -> None:
     shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
     if result.predicted_m is not None:
         least, most = result.predicted_range_m or (result.predicted_m, result.predicted_m)
+        looks = " and variations" if result.objective.endswith("variations") else ""
         shift = (
             f"{result.predicted_m:.2f} m of deviation predicted ({least:.2f} to {most:.2f} over small errors of "
-            f"steering), nothing was driven for real; {shift}"
+            f"steering{looks}), nothing was driven for real; {shift}"
         )
     say(
         f"Strongest for {result.group}: {shift}",
@@ -143,6 +169,8 @@ def _summarise(result: AttackResult, out: Path) -> None:
         f"{result.space.figures} figures, {result.method.word}: {result.history.shape[2]} × {len(result.history)} last "
         f"steps; {result.cost.controller_frames} frames in {result.cost.seconds:.0f} s",
     )
+    if result.conspicuousness is not None:
+        say(f"How conspicuous it is: {result.conspicuousness.sentence}")
     for check in result.checks:
         say(f"  {'ok ' if check.passed else 'BAD'} {check.name}: {check.finding}{check.advice and '; ' + check.advice}")
     say(f"Results in {out}: pattern.json, pattern.png, result.json, search.png, film-*.png")

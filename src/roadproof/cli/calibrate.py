@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import argument, choice
+from roadproof.cli.options import argument, check_simulator, choice
 from roadproof.cli.output import say
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def calibrate(
     from roadproof.io.locks import hold
     from roadproof.simulators.loading import open_simulator
 
+    check_simulator(simulator)
     how = choice(method, "method", METHODS)
     runs = [folder] if (folder / "record").is_dir() else sorted(path.parent for path in folder.glob("*/record"))
     if not runs:

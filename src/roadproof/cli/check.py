@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import Device, Processes, check_processes, choice
+from roadproof.cli.options import Device, Processes, check_simulator, choice
+from roadproof.cli.verbs import begin, is_dry_run
 
 if TYPE_CHECKING:
+    from roadproof.controllers import Controller
+    from roadproof.gate.plan import CheckPlan
     from roadproof.gate.result import CheckResult
+    from roadproof.pipeline.estimate import Estimate
 
 
 def check(
@@ -48,14 +53,16 @@ def check(
     from roadproof.io.locks import hold
 
     asked = None if budget is None else choice(budget, "budget", BUDGETS)
-    hold(out)
-    clear(out)
+    if not is_dry_run():
+        hold(out)
+        clear(out)
     chosen = load_check(plan, budget=asked, trust=trust)
     if accept and chosen.reference is None:
         raise CheckError(f"--accept makes a reference, but {plan} names none; add [change] with reference")
     if chosen.budget == "full":
-        check_processes(processes, chosen.simulator)
+        check_simulator(chosen.simulator, processes)
     who = load_controller(chosen.controller, device=device)
+    begin(_estimate(chosen, who, processes))
     with stages() as show:
         result = run_check(chosen, who, out, compare=not accept, device=device, processes=processes, on_progress=show)
     _summarise(result, out)
@@ -67,6 +74,22 @@ def check(
         content = (out / FILE).read_bytes()
         write_atomically(chosen.reference, lambda part: part.write_bytes(content))
         typer.echo(f"From now on the reference is {chosen.reference}; keep it beside the plan")
+
+
+def _estimate(plan: CheckPlan, who: Controller, processes: int) -> Estimate:
+    """Of all cases; a fresh attack is a whole stress test but for its evaluation."""
+    from roadproof.pipeline.budget import QUICK
+    from roadproof.pipeline.estimate import of_drives, of_run
+
+    seeds, full = len(plan.seeds), plan.budget == "full"
+    stored = sum(map(len, plan.stored.values()))
+    each_start = len(plan.scenarios) * (1 + full) + stored
+    drives = len(plan.weathers) * seeds * (each_start * plan.starts.count + len(plan.scenarios) * plan.random)
+    driven = of_drives(drives, processes=processes)
+    if not full:
+        return replace(driven, drives=0)
+    attack = replace(QUICK, weathers=plan.weathers[:1], starts=0)
+    return of_run(attack, who).times(len(plan.scenarios) * seeds) + driven
 
 
 def _summarise(result: CheckResult, out: Path) -> None:

@@ -13,12 +13,15 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import number
 from roadproof.cli.output import say
+from roadproof.cli.paint import Paint, with_paint, words
+from roadproof.cli.verbs import begin
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.pipeline.stress_test import StressTest
 
 
+@with_paint
 def demo(
     scenario: options.ScenarioName = "left-03",
     scenarios: options.ScenarioFile = None,
@@ -29,6 +32,7 @@ def demo(
         str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
     ] = "clear-noon",
     figures: options.Figures = 5,
+    cheapest: options.CheapestFor = None,
     seed: Annotated[int, number("Of recording, search and traffic.", 0, MAX_SEED)] = 0,
     simulator: options.SimulatorSpec = "town",
     device: options.Device = "cpu",
@@ -36,25 +40,30 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
         "out/demo"
     ),
+    *,
+    paint: Paint,
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
+    from roadproof.attacks.cheapest import in_words
+    from roadproof.attacks.objective import varied
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.io.files import write_atomically
-    from roadproof.io.locks import hold
     from roadproof.pipeline.budget import BUDGETS
+    from roadproof.pipeline.estimate import of_run
     from roadproof.pipeline.stress_test import stress_test
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
     tested = options.scenario_of(scenario, scenarios)
-    options.check_processes(processes, simulator)
+    options.check_simulator(simulator, processes)
     spent = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
     spent = replace(spent, rounds=rounds, attack_weathers=options.weathers_of(attack_weathers, "attack-weathers"))
-    space = SearchSpace(figures=figures)
-    hold(out)
+    spent = replace(spent, objective=varied(spent.objective, paint.variation))
+    space = SearchSpace(figures=figures, limits=paint.limits)
     who = load_controller(controller, device=device)
+    begin(of_run(spent, who, processes=processes), out)
     with open_simulator(simulator) as world, stages() as show:
         result = stress_test(
             world,
@@ -68,6 +77,7 @@ def demo(
             device=device,
             another=partial(open_simulator, simulator),
             processes=processes,
+            cheapest_m=cheapest,
             on_progress=show,
         )
     given = {
@@ -80,12 +90,17 @@ def demo(
         "seed": seed,
         "simulator": simulator,
         **({"scenarios": scenarios} if scenarios else {}),
+        **({"cheapest": cheapest} if cheapest else {}),
+        **paint.given,
         "out": out,
     }
-    words = [word for option, value in given.items() for word in (f"--{option}", str(value))]
-    command = shlex.join(["roadproof", "demo", *words])
+    command = shlex.join(["roadproof", "demo", *words(given)])
     write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))
     _report(result, out)
+    if cheapest is not None:
+        less = result.cheapest
+        driven = "" if less is None else f"; driven {less[1].deviation_m:.2f} m"
+        say(in_words(less and less[0], cheapest) + driven)
 
 
 def _report(result: StressTest, out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,7 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import say, table
+from roadproof.cli.verbs import begin
 from roadproof.cli.worlds import open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD, MAX_SEED
@@ -34,7 +36,9 @@ def evaluate(
     ] = 5,
     start_range: Annotated[
         tuple[float, float, float],
-        typer.Option(help="Those starts: at most so many metres aside, radians turned and m/s faster."),
+        typer.Option(
+            help="Those starts: at most so many metres aside, radians turned and m/s faster.  [0 to 1, 0.3 and 5]"
+        ),
     ] = (0.3, 0.05, 2.0),
     runs: Annotated[
         int | None,
@@ -60,15 +64,16 @@ def evaluate(
 ) -> None:
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.cli.progress import progress
+    from roadproof.cli.progress import stages
     from roadproof.controllers import Controller
     from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange
-    from roadproof.io.locks import hold
     from roadproof.patterns import load_pattern, read_paint
+    from roadproof.pipeline.estimate import of_evaluation
     from roadproof.pipeline.fidelity import measure_fidelity
     from roadproof.pipeline.film import film_trial
+    from roadproof.recorded.simulator import check_canvas
     from roadproof.recordings import load_recordings
 
     where = world_asked(simulator, device, controller, scenario, scenarios)
@@ -78,17 +83,24 @@ def evaluate(
     if where.recorded is not None:
         _check_recorded(runs, recordings)
         runs = cars = pedestrians = 0
-    options.check_processes(processes, simulator)
+    else:
+        options.check_simulator(simulator, processes)
     begun = StartRange(**dict(zip(StartRange.__slots__, start_range, strict=True)))
     figures = load_pattern(pattern) if pattern.suffix == ".json" else None
     paint = read_paint(pattern)
     if figures is None and (random or recordings):
         raise PatternError(f"{pattern} is a picture; --random and --recordings need the pattern.json of an attack")
     recorded = None if recordings is None else load_recordings(recordings)
-    hold(out)
+    if recorded is not None and recorded.canvas is not None and where.scenario is not None:
+        check_canvas(where.scenario.canvas, recorded.canvas)
     who = options.driver_of(controller, device)
+    runs = 10 if runs is None else runs
+    if runs and not cars + pedestrians:
+        raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
+    spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
+    begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
     with where.open() as (world, driven):
-        with progress(f"Driving {driven.name}", 100, "%, {:.0f} drives") as show:
+        with stages() as show:
             evaluation = run(
                 partial(open_world, simulator, device) if processes > 1 else world,
                 who,
@@ -99,13 +111,13 @@ def evaluate(
                 weathers=skies,
                 starts=starts,
                 start_range=begun,
-                runs=10 if runs is None else runs,
+                runs=runs,
                 cars=cars,
                 pedestrians=pedestrians,
                 seed=seed,
                 baseline=random_patterns(figures, random, seed=seed) if figures is not None and random else (),
                 processes=processes,
-                on_drive=lambda done, total: show(100 * done // total, done),
+                on_drive=lambda done, total: show(f"Driving {driven.name}", done, total, "drives"),
             )
         if film:
             film_trial(world, evaluation, paint, out)

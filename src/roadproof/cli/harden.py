@@ -7,14 +7,20 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, choice, number
+from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, check_simulator, choice, number
+from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.verbs import begin
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
+    from roadproof.controllers import Controller
+    from roadproof.hardening.budget import HardeningBudget
     from roadproof.hardening.tuning import TrainingStep
+    from roadproof.pipeline.estimate import Estimate
     from roadproof.scenarios import Scenario
 
 
+@with_paint
 def harden(
     controller: Annotated[str, typer.Argument(help=f"A torch.nn.Module: {CONTROLLERS}", show_default=False)],
     scenarios: Annotated[str, typer.Option(help="Scenarios to train on, with commas between.", show_default=False)],
@@ -40,6 +46,8 @@ def harden(
     simulator: SimulatorSpec = "town",
     device: Annotated[str, typer.Option(help="cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
     out: Annotated[Path, typer.Option(help="Folder; the same folder goes on where it was.")] = Path("out/harden"),
+    *,
+    paint: Paint,
 ) -> None:
     """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on streets not trained on."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
@@ -47,12 +55,11 @@ def harden(
     from rich.console import Console
 
     from roadproof.cli.progress import stages
-    from roadproof.controllers.loading import imported, load_trainable
+    from roadproof.controllers.loading import imported, load_controller, load_trainable
     from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
     from roadproof.hardening.harden import harden as run
     from roadproof.hardening.page import write_hardening
     from roadproof.hardening.tuning import training_step as usual_step
-    from roadproof.io.locks import hold
     from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -62,17 +69,19 @@ def harden(
     def named(names: str) -> list[Scenario]:
         return [find_scenario(name.strip(), known) for name in names.split(",") if name.strip()]
 
-    spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))]
+    spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))].varied(paint.variation)
     training, judging = named(scenarios), named(judge_on)
     step = (
         usual_step
         if training_step is None
         else cast("TrainingStep", imported(training_step, "a function of model and batch that gives the loss"))
     )
+    check_simulator(simulator)
     check_streets(training, judging)
     load_trainable(controller)
+    on = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    begin(_estimate(spent, load_controller(controller, device=on), rounds, len(training), len(judging)), out)
     with open_simulator(simulator) as world, stages() as show:
-        hold(out)
         found = run(
             world,
             controller,
@@ -82,10 +91,10 @@ def harden(
             clean_on=known if clean_on == "all" else named(clean_on),
             rounds=rounds,
             budget=spent,
-            space=SearchSpace(figures=figures),
+            space=SearchSpace(figures=figures, limits=paint.limits),
             training_step=step,
             seed=seed,
-            device=("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device,
+            device=on,
             on_progress=show,
         )
     page = write_hardening(found, out)
@@ -96,3 +105,19 @@ def harden(
     if found.judgement is not None:
         say(found.judgement.verdict().sentence)
     say(f"The hardened controller is {found.hardened}, the page {page}")
+
+
+def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int) -> Estimate:
+    """Of attacks and tuning, and of judging before and after; streets of training and judging are driven clean."""
+    from roadproof.pipeline.estimate import Estimate, frame_seconds, of_drives, of_run, of_search
+
+    tuning = budget.tuning
+    learnt = Estimate(seconds=tuning.steps * tuning.batch * frame_seconds(who))
+    whole = of_run(budget.attack, who, film=False).times((rounds + 1) * training) + learnt.times(rounds)
+    whole += of_drives(budget.town_drives)
+    if judging:
+        found = of_search(budget.unseen, budget.judge.objective, 0, who)
+        again = of_search(budget.judge.method, budget.judge.objective, budget.judge.window.frames, who)
+        whole += (of_run(budget.judge, who, film=False) + found + again).times(2 * judging)
+        whole += of_drives(2 * len(budget.clean_weathers) * (training + judging))
+    return whole

@@ -23,7 +23,7 @@ Word = TypeVar("Word", bound=str)
 
 
 def number(about: str, least: int | float, most: int | float, *, show_default: bool = True) -> Any:  # noqa: ANN401
-    """An option that is a number in a range, which its help states; of a list, each is.
+    """An option that is a number in a range, which its help states; of several numbers, each is.
 
     Args:
         about: what the number is, for the help.
@@ -34,8 +34,8 @@ def number(about: str, least: int | float, most: int | float, *, show_default: b
 
     # Typer tells parameters of its own types apart by annotation, and hands over others.
     def check(_context: Any, parameter: Any, value: Any) -> Any:  # noqa: ANN401
-        given = cast("list[float]", value if isinstance(value, list) else [] if value is None else [value])
-        for each in given:
+        several = isinstance(value, (list, tuple))
+        for each in cast("list[float]", value if several else [] if value is None else [value]):
             if not least <= each <= most:
                 raise RoadproofError(f"{parameter.opts[0]} is {each}, expected {least:,} to {most:,}")
         return cast("Any", value)
@@ -84,21 +84,28 @@ WorldSpec: TypeAlias = Annotated[
 ]
 Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
 
+CheapestFor: TypeAlias = Annotated[
+    float | None,
+    number(
+        "Also find the fewest square metres of paint for so many metres of deviation.", 0.05, 100.0, show_default=False
+    ),
+]
 Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, MAX_FIGURES)]
 Cars: TypeAlias = Annotated[int, number("Other cars on the road.", 0, MAX_CROWD)]
 Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]
 Processes: TypeAlias = Annotated[int, number("Drives of the evaluation made at once.", 1, MAX_PROCESSES)]
 
 
-def check_processes(processes: int, simulator: str) -> None:
-    """See that several processes have a simulator each.
+def check_simulator(simulator: str, processes: int = 1) -> None:
+    """See that a simulator is named, and that several processes have one each.
 
     Raises:
-        RoadproofError: they would share one server.
+        RoadproofError: there is none of this name, or they would share one server.
     """
     # The road map comes with it; `--help` is spared.
-    from roadproof.simulators.loading import is_server
+    from roadproof.simulators.loading import check_spec, is_server
 
+    check_spec(simulator)
     if processes > 1 and is_server(simulator):
         raise RoadproofError(
             f"--processes is {processes}, but all of them would step the one server of {simulator}; expected 1"
@@ -156,9 +163,13 @@ def weathers_of(names: str, option: str) -> tuple[Weather, ...]:
     """The weathers of a list with commas between.
 
     Raises:
-        RoadproofError: one of them is none; the message names the nearest.
+        RoadproofError: one of them is none, where the message names the nearest, or is there twice.
     """
-    return tuple(weather_of(name.strip(), option) for name in names.split(","))
+    found = tuple(weather_of(name.strip(), option) for name in names.split(","))
+    for weather in found:
+        if found.count(weather) > 1:
+            raise RoadproofError(f"--{option} has {weather} twice, expected each once")
+    return found
 
 
 def driver_of(spec: str, device: str) -> Controller | Callable[[MappedSimulator], Policy]:

@@ -1,9 +1,16 @@
-"""Progress with time left; quiet where nobody looks."""
+"""What long work says while it goes on, on standard error.
+
+On a terminal bars with the time left. Elsewhere, in a log, a line where a stage ends and at least one a minute. With
+`--verbose` a line for every step, with `--quiet` nothing.
+"""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from enum import Enum
 
 from rich.console import Console
 from rich.progress import (
@@ -17,49 +24,141 @@ from rich.progress import (
 )
 
 _SECONDS_S, HOURS_S = 30.0, 6 * 3600.0
+EVERY_S = 60.0
+"""After so long without a line there is one."""
+
+Show = Callable[[str, int, int, str], None]
+
+
+class Loudness(Enum):
+    """How much is said."""
+
+    QUIET = 0
+    USUAL = 1
+    VERBOSE = 2
+
+
+_loudness = Loudness.USUAL  # one command a process
+
+
+def speak(loudness: Loudness) -> None:
+    """Say so much from now on."""
+    global _loudness
+    _loudness = loudness
+
+
+def is_quiet() -> bool:
+    """Whether nothing is to be said but results and errors."""
+    return _loudness is Loudness.QUIET
 
 
 @contextmanager
 def progress(
     title: str, total: int, value: str = "best {:.3f}", *, begun: int = 0, remember_s: float = _SECONDS_S
 ) -> Generator[Callable[[int, float], None]]:
-    """A bar on standard error, and the function that moves it.
+    """Show one stage, and give the function that says how far it is.
 
     Args:
         title: what is going on.
         total: steps there are.
-        value: how the number beside the bar is shown.
+        value: how the number beside them is shown.
         begun: how many of them were done before; they say nothing on the time left.
         remember_s: how far back the steps go from which the time left is told; `HOURS_S` where each takes minutes.
 
     Yields:
         What to call with the steps done and that number.
     """
-    with _bars(remember_s) as bar:
-        task = bar.add_task(title, total=total, completed=begun, value=value.format(0.0))
-        yield lambda done, number: bar.update(task, completed=done, value=value.format(number))
+    with _shown(remember_s) as show:
+        show(title, begun, total, value.format(0.0))
+        yield lambda done, number: show(title, done, total, value.format(number))
 
 
 @contextmanager
-def stages() -> Generator[Callable[[str, int, int, str], None]]:
-    """A bar for each of several stages, and the function that moves them.
+def stages() -> Generator[Show]:
+    """Show each of several stages, and give the function that says how far they are.
 
     Yields:
-        What to call with a stage's name, the steps done, how many there are, and what to show beside the bar.
+        What to call with a stage's name, the steps done, how many there are, and what to show beside them.
     """
-    with _bars() as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def show(title: str, done: int, total: int, value: str) -> None:
-            if title not in tasks:
-                tasks[title] = bar.add_task(title, total=total, value=value)
-            bar.update(tasks[title], completed=done, total=total, value=value)
-
+    with _shown(_SECONDS_S) as show:
         yield show
 
 
-def _bars(remember_s: float = _SECONDS_S) -> Progress:
+@contextmanager
+def _shown(remember_s: float) -> Generator[Show]:
     console = Console(stderr=True)
+    if _loudness is Loudness.QUIET:
+        yield lambda _title, _done, _total, _value: None
+    elif _loudness is Loudness.USUAL and console.is_terminal:
+        with _bars(console, remember_s) as bar:
+            yield _Bars(bar).show
+    else:
+        lines = _Lines()
+        ended = threading.Event()
+        watch = threading.Thread(target=lines.break_silence, args=(ended,), daemon=True)
+        watch.start()
+        try:
+            yield lines.show
+        finally:
+            ended.set()
+            watch.join()
+
+
+class _Bars:
+    """A bar for each stage."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._tasks: dict[str, TaskID] = {}
+
+    def show(self, title: str, done: int, total: int, value: str) -> None:
+        if title not in self._tasks:
+            self._tasks[title] = self._bar.add_task(title, total=total, completed=done, value=value)
+        self._bar.update(self._tasks[title], completed=done, total=total, value=value)
+
+
+class _Lines:
+    """Lines in a log."""
+
+    def __init__(self) -> None:
+        self._stage, self._first, self._since_s = "", 0, 0.0
+        self._now, self._ended = ("", 0, 0, ""), False
+        self._told_s = time.monotonic()
+
+    def show(self, title: str, done: int, total: int, value: str) -> None:
+        self._now = (title, done, total, value)
+        if title != self._stage:
+            self._stage, self._first, self._since_s, self._ended = title, done, time.monotonic(), False
+        ends = done >= total and not self._ended
+        self._ended = self._ended or ends
+        if ends or _loudness is Loudness.VERBOSE:
+            self._tell()
+
+    def break_silence(self, ended: threading.Event) -> None:
+        """Say where the work is, so often, until it is done."""
+        while not ended.wait(max(self._told_s + EVERY_S - time.monotonic(), 0.01)):
+            if time.monotonic() - self._told_s >= EVERY_S:
+                self._tell()
+
+    def _tell(self) -> None:
+        self._told_s = time.monotonic()
+        title, done, total, value = self._now
+        said = " ".join(filter(None, (title or "Beginning", f"{done}/{total}" if total else "", value)))
+        if title and (seconds := self._told_s - self._since_s) >= 1:
+            said += f", {in_words(seconds)}"
+            if self._first < done < total:
+                said += f", about {in_words(seconds * (total - done) / (done - self._first))} left"
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(said)
+
+
+def in_words(seconds: float) -> str:
+    """A time as people say it: "40 s", "12 min", "3.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def _bars(console: Console, remember_s: float) -> Progress:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -69,6 +168,4 @@ def _bars(remember_s: float = _SECONDS_S) -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    return Progress(
-        *columns, console=console, disable=not console.is_terminal, transient=True, speed_estimate_period=remember_s
-    )
+    return Progress(*columns, console=console, transient=True, speed_estimate_period=remember_s)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli import options
-from roadproof.cli.options import argument, number, unset
+from roadproof.cli.options import argument, number
 from roadproof.cli.output import say
+from roadproof.cli.verbs import begin
 from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
@@ -22,16 +23,29 @@ def record(
     driver: options.DriverSpec = "expert",
     weather: options.WeatherName = "clear-noon",
     budget: options.BudgetName = "quick",
-    trajectories: Annotated[int | None, unset("T, how many drives: 1, 3, 5 or 7.  [default: the budget's]")] = None,
+    trajectories: Annotated[
+        int | None, number("T, how many drives, an odd number.  [default: the budget's]", 1, 7, show_default=False)
+    ] = None,
     scheme: Annotated[
         str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
     ] = "group",
     deviation_m: Annotated[
         list[float] | None,
-        unset("How far drives are pushed aside; several are taken in turn.  [default: the budget's]"),
+        number(
+            "How far drives are pushed aside; several are taken in turn.  [default: the budget's]",
+            0.1,
+            5.0,
+            show_default=False,
+        ),
     ] = None,
     noise_deg: Annotated[
-        tuple[int, int] | None, unset("Push by noise on the steering instead, least and most, as published.")
+        tuple[int, int] | None,
+        number(
+            "Push by noise on the steering instead, least and most, as published.",
+            0,
+            57,
+            show_default=False,
+        ),
     ] = None,
     horizon_m: Annotated[float, number("Keep frames from so far before the canvas.", 1.0, 1000.0)] = 25.0,
     frames: Annotated[
@@ -51,8 +65,8 @@ def record(
     from roadproof.drives import record as run
     from roadproof.errors import RecordingError, ScenarioError
     from roadproof.io.files import inside
-    from roadproof.io.locks import hold
     from roadproof.pipeline.budget import BUDGETS
+    from roadproof.pipeline.estimate import RECORDED_DRIVE
     from roadproof.simulators.loading import open_simulator
 
     chosen = [options.scenario_of(name, scenarios) for name in dict.fromkeys(names)]
@@ -73,9 +87,9 @@ def record(
     kept = usual.window.frames if frames is None else frames
     window = replace(usual.window, horizon_m=horizon_m, frames=kept)
     places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
-    for place in places.values():
-        hold(place)
+    options.check_simulator(simulator)
     who = options.driver_of(driver, device)
+    begin(RECORDED_DRIVE.times(wanted.count * len(chosen)), *places.values())
 
     with open_simulator(simulator) as world:
         for scenario in chosen:

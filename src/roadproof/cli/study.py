@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from roadproof.cli.options import number
+from roadproof.cli.verbs import begin, verb
 from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
-    from roadproof.study.plan import Job
+    from roadproof.controllers import Controller
+    from roadproof.pipeline.estimate import Estimate
+    from roadproof.study.plan import Job, Study
     from roadproof.study.rows import JobResult
 
 _TRUST = typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
@@ -19,7 +23,6 @@ _TRUST = typer.Option("--trust", help="Follow a plan that runs code or calls ano
 study = typer.Typer(no_args_is_help=True, add_completion=False, help="Compare methods over many scenarios.")
 
 
-@study.command()
 def run(
     plan: Annotated[Path, typer.Argument(help="TOML file that says what is compared.", show_default=False)],
     out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
@@ -50,7 +53,7 @@ def run(
     begun = sum(is_done(job, out) for job in chosen.jobs)
     if begun < len(chosen.jobs):
         # One that is not there is refused at once, not job by job.
-        load_controller(chosen.controller)
+        begin(_estimate(chosen, load_controller(chosen.controller), workers))
     failed = 0
     with progress("Jobs", len(chosen.jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
 
@@ -72,7 +75,22 @@ def run(
         raise typer.Exit(1)
 
 
-@study.command()
+def _estimate(study: Study, who: Controller, workers: int) -> Estimate:
+    """Of all jobs, those that are done too."""
+    from roadproof.pipeline.estimate import Estimate, of_drives, of_evaluation, of_run
+    from roadproof.study.methods import BlackBoxPlan, budget_of
+
+    traffic, whole = study.traffic, Estimate()
+    judged = of_evaluation(len(study.weathers), study.starts.count, traffic.runs if traffic else 0, film=False)
+    for method in study.methods:
+        budget = replace(budget_of(method, study.weathers[0]), starts=0, runs=0)
+        if isinstance(method, BlackBoxPlan) and method.where == "simulator":
+            whole += of_drives(method.calls + 1) + judged
+        else:
+            whole += of_run(budget, who, film=False) + judged
+    return whole.times(len(study.scenarios) * len(study.figures) * len(study.seeds), at_once=workers)
+
+
 def transfer(
     plan: Annotated[Path, typer.Argument(help="The study's TOML file.", show_default=False)],
     controllers: Annotated[str, typer.Option(help="Whom to try, with commas: cil,pilotnet.", show_default=False)],
@@ -97,7 +115,6 @@ def transfer(
     say(f"Rows in {out / 'transfer.parquet'}")
 
 
-@study.command()
 def tables(
     folder: Annotated[Path, typer.Argument(help="Of the study, with its rows.parquet.", show_default=False)],
     out: Annotated[
@@ -116,3 +133,8 @@ def tables(
     page = write_tables(rows, folder, out or folder / "tables", driven)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     console.print(f"The tables are {page}, as Markdown and LaTeX beside it; figures in {page.parent / 'figures'}")
+
+
+study.command()(verb(run, estimates=True))
+study.command()(verb(transfer))
+study.command()(tables)

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.rectangles import PaintedRectangles
+from roadproof.compositing.variation import Looks
 from roadproof.compositing.view import CanvasView, OwnViews
 from roadproof.coverage import Shape
 from roadproof.patterns import Pattern, coverages, visibilities
@@ -58,13 +59,19 @@ class Compositor:
         self._copies = copies
         self._frames = torch.cat([view.frames.repeat(copies, 1, 1, 1) for view in views])
 
-    def __call__(self, patterns: Sequence[Pattern]) -> Float[Tensor, "n 3 h w"]:
+    def __call__(self, patterns: Sequence[Pattern], looks: Looks | None = None) -> Float[Tensor, "n 3 h w"]:
         """The frames, view after view, pattern after pattern.
 
         Args:
             patterns: for each view a batch of `copies` patterns.
+            looks: how worn they are, in turn; None for fresh paint.
         """
         colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
+        if looks is not None:
+            colours = [
+                _worn(colour, view.clean, looks.left(view.footprints.centre[None], self._copies))
+                for colour, view in zip(colours, self._views, strict=True)
+            ]
         return cast("Tensor", _Pasted.apply(self, *colours))
 
     def slots(self, frames: Tensor) -> list[Float[Tensor, "c p 3"]]:
@@ -96,18 +103,28 @@ class _Pasted(torch.autograd.Function):
         return (None, *ctx.compositor.pick(grad_outputs[0]))
 
 
-def composite_own(pattern: Pattern, frames: Float[Tensor, "b 3 h w"], views: OwnViews) -> Float[Tensor, "b 3 h w"]:
+def composite_own(
+    pattern: Pattern, frames: Float[Tensor, "b 3 h w"], views: OwnViews, looks: Looks | None = None
+) -> Float[Tensor, "b 3 h w"]:
     """B pictures with a pattern of its own painted into each, differentiable in the patterns.
 
     Args:
         pattern: a batch of B patterns.
         frames: the bare pictures, in [0, 1].
         views: their view of the canvas.
+        looks: how worn they are, in turn; None for fresh paint.
     """
     colours = canvas_colours(pattern, views)
+    if looks is not None:
+        colours = _worn(colours, views.clean, looks.left(views.footprints.centre[:, 0], len(frames)))
     # A copy is written where its pixel is, with the same colour; the gradient goes to the pixel alone.
     colours = torch.where(views.valid[..., None], colours, colours.detach())
     return views.pasted(frames, colours)
+
+
+def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
+    """Colours of the canvas' pixels where the bare road shows through."""
+    return torch.lerp(clean.expand_as(colours), colours, left[..., None].to(colours))
 
 
 def canvas_colours(pattern: Pattern, view: CanvasView | OwnViews) -> Float[Tensor, "*b p 3"]:

@@ -21,7 +21,7 @@ from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Traject
 from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.io.files import write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, write_folder_atomically
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Push, Track
@@ -192,13 +192,14 @@ def read_drive(name: str, folder: Path) -> Drive | None:
     return _DRIVE.read(path, name=name, episode=Episode.load(path.with_name("episode.npz")))
 
 
-def load_drives(folder: Path) -> Drives:
+def load_drives(folder: AnyPath) -> Drives:
     """Read a finished recording.
 
     Raises:
         RecordingError: the folder is missing, damaged, or not finished; the message says what to do.
         EpisodeError: an episode in it is damaged.
     """
+    folder = as_path(folder)
     if not (folder / "record.json").is_file():
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
     settings = _SETTINGS.read(folder / "record.json")

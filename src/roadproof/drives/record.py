@@ -23,6 +23,7 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, homography_from_pose
+from roadproof.io.files import AnyPath, as_path
 from roadproof.recordings import Push
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
@@ -43,7 +44,7 @@ def record(
     window: Window | None = None,
     seed: int = 0,
     driver_name: str = "",
-    folder: Path | None = None,
+    folder: AnyPath | None = None,
     on_drive: Callable[[int], object] = lambda _done: None,
 ) -> Drives:
     """Record a driver past a bare canvas: one clean drive, and drives pushed aside.
@@ -69,6 +70,7 @@ def record(
         SimulatorError, ScenarioError, ControllerError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
+    folder = None if folder is None else as_path(folder)
     settings = Settings(
         scenario=scenario,
         weather=Weather(weather),

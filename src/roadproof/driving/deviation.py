@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
+from roadproof.datatypes import Ending
+from roadproof.driving.episode import Episode
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
 
@@ -104,3 +108,34 @@ def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[n
 def _check_path(path: np.ndarray, name: str) -> None:
     if not len(path) or not np.isfinite(path).all():
         raise EpisodeError(f"the {name} path is empty or has NaN or infinite values, expected world x, y in metres")
+
+
+def path_of(episode: Episode) -> Path2D:
+    """World x, y of the car at each observation."""
+    return np.column_stack([episode.x_m, episode.y_m])
+
+
+def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> float:
+    """The paper's deviation between two drives, over the instants at which the clean one has the canvas in view.
+
+    Predicted drives begin where the first frame was recorded, nearer to the canvas. The way up to there is the same for
+    both, straight and at one speed, so that predicted and driven deviations are means over equal stretches.
+    """
+    bare, driven = path_of(clean), path_of(painted)
+    if clean.paint.predicted:
+        before = _approach(clean, HORIZON_M + canvas.length_m)
+        bare, driven = np.concatenate([before, bare]), np.concatenate([before, driven])
+    seen = passage(bare, canvas)
+    if painted.ending in (Ending.STANDS, Ending.BLOCKED):
+        # Whoever stands goes on standing there.
+        driven = np.concatenate([driven, np.repeat(driven[-1:], max(seen.stop - len(driven), 0), 0)])
+    # A painted drive that ended before has its last position left.
+    return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
+
+
+def _approach(episode: Episode, length_m: float) -> Path2D:
+    """Positions straight behind the first one, as far apart as the first speed says, in the order of driving."""
+    apart_m = max(float(episode.speed_mps[0]), 1.0) * episode.dt_s
+    back_m = apart_m * np.arange(math.ceil(length_m / apart_m), 0, -1)
+    yaw_rad = float(episode.yaw_rad[0])
+    return path_of(episode)[0] - back_m[:, None] * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])

@@ -19,9 +19,9 @@ from roadproof.controllers import Controller
 from roadproof.controllers.identity import answers_of
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Trial, judge
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.driving.starts import NOMINAL, StartOffset
+from roadproof.driving.trial import Trial, judge
 from roadproof.errors import EpisodeError
 from roadproof.io.files import inside
 from roadproof.io.identity import ANSWERS, digest, stated

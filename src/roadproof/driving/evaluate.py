@@ -12,7 +12,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from itertools import cycle
-from pathlib import Path
 from typing import TypeAlias
 
 import torch
@@ -22,6 +21,7 @@ from roadproof.driving.drive_store import CLEAN, AnyDriver, Conditions, Episodes
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.errors import EpisodeError, PatternError, SimulatorError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.patterns import Pattern, raster
 from roadproof.processes import DIED, processes_beside, require_picklable
 from roadproof.scenarios import Scenario
@@ -41,7 +41,7 @@ def evaluate(
     scenario: Scenario,
     pattern: Pattern | PatternImage,
     *,
-    folder: Path,
+    folder: AnyPath,
     driver_name: str = "",
     weathers: Sequence[Weather] = PAPER_WEATHERS,
     starts: int = 5,
@@ -85,6 +85,7 @@ def evaluate(
         SimulatorError: the simulator refuses the conditions, or a process died.
         OutputError: the folder cannot be written.
     """
+    folder = as_path(folder)
     if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
         raise EpisodeError(
             f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "

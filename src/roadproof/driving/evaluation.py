@@ -13,7 +13,6 @@ Nothing is pickled, and no path in a file leaves the folder.
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +21,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from roadproof.datatypes import Ending, Event, Weather
-from roadproof.driving.deviation import HORIZON_M, LEAVES_LANE_M, Path2D, deviation_m, lateral_m, passage
-from roadproof.driving.episode import Episode
-from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
+from roadproof.datatypes import Weather
 from roadproof.driving.intervals import Mean, mean_95
-from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
+from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
+from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import check_name, write_atomically
+from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
 from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
@@ -44,64 +40,6 @@ _UNITS = {
     "leaderboard": "product of today's CARLA Leaderboard's factors, 1 = no infraction, as clean_leaderboard",
     "first_event_s": "seconds since the start of the drive; null where nothing happened",
 }
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Trial:
-    """One drive over a pattern against the same drive without it. All numbers are of driving, or all predicted.
-
-    Args:
-        pattern: "attack", or "random-N".
-        weather: of both drives.
-        traffic: whether there were other cars and people.
-        seed: of cars and people.
-        clean: file of the drive without paint, in the episodes' folder.
-        painted: file of the drive with it.
-        deviation_m: between them (`driving.deviation`).
-        lateral_m: largest offset from the clean path, left positive.
-        points: infraction points with paint; None where nothing is known of them, as for the next three.
-        clean_points: without.
-        leaderboard: the Leaderboard's factor with paint.
-        clean_leaderboard: without.
-        first_event_s: when something first went wrong; None where nothing did, or nothing is known of it.
-        clean_first_event_s: the same without paint.
-        ending: why the painted drive ended.
-        events: of the painted drive, those that count (`infractions.counted`), so that anyone can count again.
-        clean_events: of the clean one.
-        start: how both drives begin.
-
-    Raises:
-        EpisodeError: the name of an episode's file is not a plain one.
-    """
-
-    pattern: str
-    weather: Weather
-    traffic: bool
-    seed: int
-    clean: str
-    painted: str
-    deviation_m: float
-    lateral_m: float
-    points: float | None
-    clean_points: float | None
-    leaderboard: float | None
-    clean_leaderboard: float | None
-    first_event_s: float | None
-    clean_first_event_s: float | None
-    ending: str
-    events: tuple[Event, ...] = ()
-    clean_events: tuple[Event, ...] = ()
-    start: StartOffset = NOMINAL
-
-    @property
-    def leaves_lane(self) -> bool:
-        """Whether part of the car gets over its lane's edge, or it commits more infractions than without paint."""
-        return abs(self.lateral_m) >= LEAVES_LANE_M or (self.points or 0.0) > (self.clean_points or 0.0)
-
-    def __post_init__(self) -> None:
-        for name in filter(None, (self.clean, self.painted)):  # drives that were not kept have none
-            if not check_name(name, "episode", EpisodeError).endswith(".npz"):
-                raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -212,13 +150,14 @@ class Evaluation:
         """The trial that stands for all in pictures: the first weather's, without traffic."""
         return self.of(traffic=False)[0]
 
-    def save(self, folder: Path, paint: PatternImage) -> None:
+    def save(self, folder: AnyPath, paint: PatternImage) -> None:
         """Write everything but the episodes, which are there already.
 
         Raises:
             OutputError: the folder cannot be written.
             ScenarioError: the scenario's map cannot be written beside it.
         """
+        folder = as_path(folder)
         _save_scenario(self.scenario, folder)
         picture = Image.fromarray(paint)
         write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))
@@ -230,12 +169,13 @@ class Evaluation:
         )
 
     @staticmethod
-    def load(folder: Path) -> Evaluation:
+    def load(folder: AnyPath) -> Evaluation:
         """Read what `save` wrote.
 
         Raises:
             EpisodeError: a file is missing, damaged or of another format.
         """
+        folder = as_path(folder)
         path = folder / "evaluation.json"
         content = EVALUATION_FILE.content(path)
         try:
@@ -258,76 +198,6 @@ EVALUATION_FILE = RecordFile(
 def kind_of(paint: PaintKind) -> str:
     """What numbers over such paint are called in files."""
     return "predicted" if paint.predicted else "closed loop"
-
-
-def path_of(episode: Episode) -> Path2D:
-    """World x, y of the car at each observation."""
-    return np.column_stack([episode.x_m, episode.y_m])
-
-
-def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> float:
-    """The paper's deviation between two drives, over the instants at which the clean one has the canvas in view.
-
-    Predicted drives begin where the first frame was recorded, nearer to the canvas. The way up to there is the same for
-    both, straight and at one speed, so that predicted and driven deviations are means over equal stretches.
-    """
-    bare, driven = path_of(clean), path_of(painted)
-    if clean.paint.predicted:
-        before = _approach(clean, HORIZON_M + canvas.length_m)
-        bare, driven = np.concatenate([before, bare]), np.concatenate([before, driven])
-    seen = passage(bare, canvas)
-    if painted.ending in (Ending.STANDS, Ending.BLOCKED):
-        # Whoever stands goes on standing there.
-        driven = np.concatenate([driven, np.repeat(driven[-1:], max(seen.stop - len(driven), 0), 0)])
-    # A painted drive that ended before has its last position left.
-    return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
-
-
-def _approach(episode: Episode, length_m: float) -> Path2D:
-    """Positions straight behind the first one, as far apart as the first speed says, in the order of driving."""
-    apart_m = max(float(episode.speed_mps[0]), 1.0) * episode.dt_s
-    back_m = apart_m * np.arange(math.ceil(length_m / apart_m), 0, -1)
-    yaw_rad = float(episode.yaw_rad[0])
-    return path_of(episode)[0] - back_m[:, None] * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
-
-
-def judge(
-    clean: Episode,
-    painted: Episode,
-    canvas: CanvasPlacement,
-    *,
-    pattern: str,
-    clean_file: str,
-    painted_file: str,
-    start: StartOffset = NOMINAL,
-) -> Trial:
-    """The trial of two drives that differ in the paint alone.
-
-    Deviation is taken over the instants at which the clean drive has the canvas in view, the largest offset over the
-    whole painted drive.
-    """
-    beside = lateral_m(path_of(clean), path_of(painted))
-    known = not painted.paint.predicted
-    return Trial(
-        pattern=pattern,
-        weather=painted.weather,
-        traffic=painted.cars + painted.pedestrians > 0,
-        seed=painted.seed,
-        clean=clean_file,
-        painted=painted_file,
-        deviation_m=passage_deviation_m(clean, painted, canvas),
-        lateral_m=float(beside[np.abs(beside).argmax()]),
-        points=infraction_points(painted.events) if known else None,
-        clean_points=infraction_points(clean.events) if known else None,
-        leaderboard=leaderboard_factor(painted.events) if known else None,
-        clean_leaderboard=leaderboard_factor(clean.events) if known else None,
-        first_event_s=first_event_s(painted.events),
-        clean_first_event_s=first_event_s(clean.events),
-        ending=str(painted.ending),
-        events=counted(painted.events),
-        clean_events=counted(clean.events),
-        start=start,
-    )
 
 
 def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:

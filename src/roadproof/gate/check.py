@@ -22,13 +22,15 @@ from pathlib import Path
 from torch import nn
 
 import roadproof
+from roadproof.attacks import site_of
+from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
 from roadproof.driving.drive_store import Episodes, load_episodes
 from roadproof.driving.evaluation import ATTACK, Evaluation
-from roadproof.driving.evaluation import judge as judge_pair
 from roadproof.driving.starts import NOMINAL
+from roadproof.driving.trial import judge as judge_pair
 from roadproof.errors import CheckError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
@@ -42,6 +44,8 @@ from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.film import FILM, STRIP, film_trial
 from roadproof.pipeline.stress_test import OnProgress, stress_test
 from roadproof.processes import require_picklable
+from roadproof.recorded.simulator import RecordedSimulator
+from roadproof.roads.marks import site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
@@ -136,7 +140,8 @@ class _Run:
             fresh = plan.budget == "full"
             require_usable(self.controller, size=size, device=self.device, gradients=fresh)
             scenario = place.begun_in(world)
-            paints = known_paints(plan, scenario, self.folder / "patterns" / scenario.name)
+            site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
+            paints = known_paints(plan, scenario, site, self.folder / "patterns" / scenario.name)
             if fresh:
                 paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
             images = {paint.name: raster(paint.pattern) for paint in paints}
@@ -196,8 +201,10 @@ class _Run:
             scenario,
             self.folder / "fresh" / f"{scenario.name}-{seed}-{who[:8]}",
             # Its own evaluation is one drive; the cases' drives judge it.
-            budget=replace(QUICK, weathers=plan.weathers[:1], starts=0),
-            space=SearchSpace(figures=plan.figures),
+            budget=replace(
+                QUICK, weathers=plan.weathers[:1], starts=0, objective=varied(QUICK.objective, plan.variation)
+            ),
+            space=SearchSpace(figures=plan.figures, limits=plan.paint),
             seed=seed,
             controller_name=plan.controller,
             device=self.device,

@@ -8,17 +8,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
+from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, each_once, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
-from roadproof.io.files import read_toml
+from roadproof.io.files import AnyPath, as_path, read_toml
 from roadproof.limits import MAX_FIGURES, MAX_SEED
+from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
 from roadproof.study.plan import StartPlan
-from roadproof.study.reading import build, refuse_untrusted
+from roadproof.study.reading import build, paint_of, refuse_untrusted
 
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
@@ -46,6 +48,8 @@ class CheckPlan:
         starts: drives of each seed in each case.
         random: patterns drawn for each seed, each driven once.
         figures: of random patterns and fresh attacks.
+        paint: limits on those; None limits nothing.
+        variation: looks over which fresh attacks take the mean; None for paint and camera as recorded.
         stored: patterns by name of the scenario that they are driven in.
         recordings: run of each scenario and weather; of a smoke check.
         simulator: its spec; of a full check.
@@ -63,6 +67,8 @@ class CheckPlan:
     starts: StartPlan
     random: int
     figures: int
+    paint: PaintLimits | None
+    variation: Variation | None
     stored: Mapping[str, tuple[Stored, ...]]
     recordings: Mapping[tuple[str, Weather], Path]
     simulator: str
@@ -117,12 +123,14 @@ class _Stated:
     figures: int = 5
     seeds: tuple[int, ...] = (0, 1)
     starts: dict[str, Any] = field(default_factory=dict[str, Any])
+    paint: dict[str, Any] | None = None
+    variation: dict[str, Any] | None = None
     smoke: dict[str, Any] | None = None
     full: dict[str, Any] = field(default_factory=dict[str, Any])
     change: dict[str, str | dict[str, Any]] = field(default_factory=dict[str, str | dict[str, Any]])
 
 
-def load_check(path: Path, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
+def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
     """Read a plan for one budget, with everything that it names; see the head of this module.
 
     Args:
@@ -134,6 +142,7 @@ def load_check(path: Path, *, budget: str | None = None, trust: bool = False) ->
         CheckError: the file or something that it names is missing, damaged or unknown, a number is out of its range,
             the drives are too few for the limits, or it is not trusted with what it asks for; the message says which.
     """
+    path = as_path(path)
     content = read_toml(path, CheckError)
     try:
         if content.pop("format", None) != FORMAT:
@@ -170,6 +179,8 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
     weathers = full.weathers if chosen == "full" or smoke is None else smoke.weathers
     each_once(weathers, "weathers")
     change, reference = _change(stated.change, folder)
+    tables = {"paint": stated.paint, "variation": stated.variation}
+    paint, variation = paint_of({name: table for name, table in tables.items() if table is not None}, "the check")
     plan = CheckPlan(
         controller=stated.controller,
         scenarios=scenarios,
@@ -180,6 +191,8 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         starts=build(StartPlan, stated.starts, "starts"),
         random=stated.random,
         figures=stated.figures,
+        paint=paint,
+        variation=variation,
         stored=stored_patterns(stated.patterns, folder, scenarios, known),
         recordings=recordings_of(folder, smoke.recordings, scenarios, weathers, stated.controller)
         if smoke is not None and chosen == "smoke"

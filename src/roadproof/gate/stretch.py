@@ -12,15 +12,15 @@ import numpy as np
 import torch
 
 from roadproof.datatypes import Ending, Weather
-from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m
+from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import Opening, make_together
-from roadproof.driving.evaluation import path_of
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
 from roadproof.gate.verdict import Kind, Measures, median_95, share_95
+from roadproof.paint import Site
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.formatting import in_words
@@ -50,10 +50,11 @@ class Paint:
     drives: tuple[tuple[int, int], ...]
 
 
-def known_paints(plan: CheckPlan, scenario: Scenario, folder: Path) -> tuple[Paint, ...]:
+def known_paints(plan: CheckPlan, scenario: Scenario, site: Site, folder: Path) -> tuple[Paint, ...]:
     """The stored and the random patterns of a scenario; random ones are written to a folder.
 
     Raises:
+        PatternError: the plan's limits on paint leave none there.
         OutputError: it cannot be written.
     """
     every = tuple((seed, k) for seed in plan.seeds for k in range(plan.starts.count))
@@ -61,7 +62,9 @@ def known_paints(plan: CheckPlan, scenario: Scenario, folder: Path) -> tuple[Pai
         Paint(f"stored-{each.name}", Kind.STORED, each.name, each.pattern, each.path, every)
         for each in plan.stored.get(scenario.name, ())
     ]
-    space = SearchSpace(figures=plan.figures)
+    space = SearchSpace(figures=plan.figures, limits=plan.paint)
+    if plan.random:
+        space = space.on(site)
     for seed in plan.seeds if plan.random else ():
         drawn = space.pattern(space.random((plan.random,), torch.Generator().manual_seed(seed)))
         for k in range(plan.random):
@@ -177,6 +180,8 @@ class Stretch:
             kind,
             images,
             plan.figures,
+            *([plan.paint] if plan.paint else []),
+            *([plan.variation] if plan.variation else []),
             plan.seeds,
             asdict(plan.starts),
             world,

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 
 from roadproof.attacks import TPE, GradOpt, Method
 from roadproof.attacks.blackbox import BlackBox
+from roadproof.attacks.objective import varied
+from roadproof.compositing import Variation
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluate import PAPER_WEATHERS
@@ -58,6 +60,15 @@ class HardeningBudget:
                 "expected 0 or more, and at least one"
             )
 
+    def varied(self, variation: Variation | None) -> HardeningBudget:
+        """The same, with all searches in expectation over a variation; itself where there is none."""
+        if variation is None:
+            return self
+        attack, judge = (
+            replace(each, objective=varied(each.objective, variation)) for each in (self.attack, self.judge)
+        )
+        return replace(self, attack=attack, judge=judge)
+
     def require_libraries(self, space: SearchSpace) -> None:
         """See that what judging needs is installed.
 
@@ -69,7 +80,7 @@ class HardeningBudget:
 
     def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
         """What judging searches besides `judge`, by name."""
-        shapes = SearchSpace(figures=space.figures, family="free", shape=self.unseen_shape)
+        shapes = SearchSpace(figures=space.figures, family="free", shape=self.unseen_shape, limits=space.limits)
         return {
             f"{self.unseen.word}, {self._calls} patterns tried": (self.unseen, space),
             f"{self.unseen_shape}s by gradient": (self.judge.method, shapes),

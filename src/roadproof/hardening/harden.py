@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from roadproof.attacks.objective import variation_of
 from roadproof.controllers import CIL, ConditionalPilotNet, Controller, SteeringController, load_controller
 from roadproof.controllers.identity import identity_of
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
@@ -39,7 +40,7 @@ from roadproof.hardening.judgement import Clean, Judge, Judged, Judgement, clean
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
-from roadproof.io.files import read_json, write_atomically, write_json, write_tensors
+from roadproof.io.files import AnyPath, as_path, read_json, write_atomically, write_json, write_tensors
 from roadproof.io.identity import ANSWERS, require_same, stated
 from roadproof.io.locks import working_in
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
@@ -101,7 +102,7 @@ def harden(
     simulator: Simulator,
     controller: str,
     scenarios: Sequence[Scenario],
-    folder: Path,
+    folder: AnyPath,
     *,
     judge_on: Sequence[Scenario] = (),
     clean_on: Sequence[Scenario] = (),
@@ -137,6 +138,7 @@ def harden(
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: a stage refuses.
     """
+    folder = as_path(folder)
     check_streets(scenarios, judge_on)
     if rounds < 1:
         raise TrainingError(f"rounds is {rounds}, expected 1 or more")
@@ -257,13 +259,15 @@ def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> Non
     network = load_trainable(run.spec_of(number - 1))
     streets: list[Street] = []
     found: list[torch.Tensor] = []
+    # It learns from paint of all kinds, also where attacks are limited.
+    space = run.space.unlimited
     for past, attacked in enumerate(tests):
         driver = run.controller(past)
         for scenario, test in zip(run.scenarios, attacked, strict=True):
             recordings = load_recordings(run.folder / f"round-{past}" / scenario.name / "recordings")
-            points = torch.stack([run.space.point(each.pattern) for each in test.attack.candidates])
+            points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
             street = Street(recordings, run.teacher, device=run.device)
-            street.add_ways(driver, run.space.pattern(points.to(run.device)))
+            street.add_ways(driver, space.pattern(points.to(run.device)))
             streets.append(street)
             found.append(points)
     tuning = run.budget.tuning
@@ -271,7 +275,7 @@ def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> Non
         network,
         run.teacher,
         streets,
-        run.space,
+        space,
         torch.cat(found),
         town,
         tuning,
@@ -358,6 +362,7 @@ def _claim(run: _Run) -> None:
         "scenarios": [identity(each) for each in run.scenarios],
         "budget": repr(replace(run.budget, judge=run.budget.attack)),
         "space": repr(run.space),
+        "variation": repr(variation_of(run.budget.attack.objective)),
         "seed": run.seed,
         "training step": f"{run.step.__module__}:{run.step.__qualname__}",
     }

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from roadproof.errors import OutputError, RoadproofError
 
@@ -19,10 +19,28 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+AnyPath: TypeAlias = str | os.PathLike[str]
+"""What public functions take as a path."""
+
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
+_LONGEST_TEXT = 1000
 _MOST_DIGITS = 20
 _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
+
+
+def as_path(path: Any) -> Path:  # noqa: ANN401  # users without a type checker give anything
+    """A path as users of the library give it.
+
+    Raises:
+        OutputError: it is no path at all; the message says what came.
+    """
+    try:
+        if os.fspath(path):
+            return Path(path)
+    except TypeError:
+        pass
+    raise OutputError(f"{path!r:.60} is no path, expected a text or a pathlib.Path")
 
 
 def is_plain_name(name: object) -> bool:
@@ -88,6 +106,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         try:
             write(part)
             part.chmod(0o644)
+            _settle(part)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
@@ -108,9 +127,18 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], object]) -> No
         try:
             write(part)
             part.chmod(0o755)
+            for each in part.rglob("*"):
+                if each.is_file():
+                    _settle(each)
             part.replace(folder)
         finally:
             shutil.rmtree(part, ignore_errors=True)
+
+
+def _settle(path: Path) -> None:
+    """Wait until the disk has a file, so that a power cut cannot leave its name with half of it."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -229,14 +257,32 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
         error: what is raised.
 
     Raises:
-        error: the file cannot be read, or is not valid TOML; the message names it.
+        error: the file cannot be read, is not valid TOML, or has a text that can name nothing: of more than 1,000
+            characters, or with a NUL; the message names it.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
     except (ValueError, RecursionError) as reason:
         raise error(f"{path} is not valid TOML ({reason})") from None
+    for text in _texts(content):
+        if len(text) > _LONGEST_TEXT or "\0" in text:
+            told = f"{text!r:.40} of {len(text)} characters"
+            raise error(f"{path} has the text {told}, expected at most {_LONGEST_TEXT} and no NUL")
+    return content
+
+
+def _texts(value: object) -> Generator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, each in cast("dict[str, object]", value).items():
+            yield key
+            yield from _texts(each)
+    elif isinstance(value, list):
+        for each in cast("list[object]", value):
+            yield from _texts(each)
 
 
 def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from jaxtyping import AbstractArray, Float, Int
 
 from roadproof.errors import RoadproofError
 from roadproof.io.arrays import HEADER, MOST_BYTES, read_record, write_archive
-from roadproof.io.files import one_line, read_json, write_json
+from roadproof.io.files import AnyPath, as_path, one_line, read_json, write_json
 
 T = TypeVar("T")
 SavedT = TypeVar("SavedT", bound="Saved")
@@ -170,22 +170,24 @@ class Saved:
     __slots__ = ()
     FILE: ClassVar[RecordFile[Any]]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write it to one file, all or nothing.
 
         Raises:
             OutputError: the file cannot be written.
         """
+        path = as_path(path)
         self.FILE.write(path, self)
 
     @classmethod
-    def load(cls: type[SavedT], path: Path) -> SavedT:
+    def load(cls: type[SavedT], path: AnyPath) -> SavedT:
         """Read what `save` wrote.
 
         Raises:
             RoadproofError: the file is missing, damaged, of another format or a newer version; of the kind that its
                 values raise.
         """
+        path = as_path(path)
         return cls.FILE.read(path)
 
 

@@ -66,16 +66,18 @@ class Budget:
             self._check_published()
         if self.rounds and not self.select:
             raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
+        if len(set(self.recorded_in)) < len(self.recorded_in):
+            raise RoadproofError(f"attack_weathers are {', '.join(self.recorded_in)}; expected each once")
         if len(self.recorded_in) > 1 and self.calibration is Calibration.PUBLISHED:
             raise RoadproofError(
                 f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "
                 f"choose {Calibration.TWO_PAINT}"
             )
         at_random = self.trajectories.scheme is Scheme.RANDOM
-        if self.is_predicted and (len(self.recorded_in) > 1 or self.pooled or at_random):
+        if self.is_predicted and (self.pooled or at_random):
             raise RoadproofError(
-                "a path deviation is searched in one weather for each side apart; attack several weathers, or drives "
-                "pooled or pushed at random, by their steering shift: objective=SteeringShift()"
+                "a path deviation is searched for each side apart; attack drives pooled or pushed at random by their "
+                "steering shift: objective=SteeringShift()"
             )
 
     def _check_published(self) -> None:

@@ -21,9 +21,8 @@ from torch import Tensor
 
 from roadproof.controllers import Controller
 from roadproof.datatypes import Observation, Weather
-from roadproof.driving.deviation import passage
+from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement

@@ -14,10 +14,10 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from roadproof.datatypes import Control, Observation
-from roadproof.driving.deviation import lateral_m, passage
+from roadproof.driving.deviation import lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Evaluation, path_of
+from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.rollout import replay, rollout
 from roadproof.io.arrays import write_archive
 from roadproof.io.files import write_atomically

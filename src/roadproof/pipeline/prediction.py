@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float
 
 from roadproof.controllers import Controller
-from roadproof.driving.deviation import passage
+from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import passage_deviation_m, path_of
 from roadproof.errors import EpisodeError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
@@ -75,7 +74,7 @@ def predict(
     """Drive over a pattern in the recorded world, and compare with a drive over it in the simulator.
 
     Args:
-        recordings: with canvas and tracks.
+        recordings: with canvas and tracks; the drives' weather is the first.
         controller: on `device`; the one that drove.
         pattern: one pattern.
         clean: the simulator's drive over the bare road, the recorded one.
@@ -85,7 +84,7 @@ def predict(
     Raises:
         RecordingError: the set cannot be driven in.
     """
-    world = RecordedWorld(recordings, device=device)
+    world = RecordedWorld(recordings.by_weather()[0], device=device)
     world.fit(controller)
     on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
     with torch.no_grad():

@@ -17,8 +17,9 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Trial
+from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.io.records import RecordFile, plain
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
@@ -73,22 +74,24 @@ class Selection:
         """The paper's deviation of the drive over the chosen pattern, in metres."""
         return self.driven[self.chosen].trial.deviation_m
 
-    def save(self, folder: Path) -> None:
+    def save(self, folder: AnyPath) -> None:
         """Write the choice beside the drives.
 
         Raises:
             OutputError: the folder cannot be written.
         """
+        folder = as_path(folder)
         save_pattern(self.pattern, folder / "pattern.json")
         SELECTION_FILE.write(folder / "selection.json", self, kind="predicted" if self.predicted else "closed loop")
 
     @staticmethod
-    def load(folder: Path) -> Selection:
+    def load(folder: AnyPath) -> Selection:
         """Read what `save` wrote.
 
         Raises:
             RoadproofError: a file is missing or damaged.
         """
+        folder = as_path(folder)
         path = folder / "selection.json"
         content = SELECTION_FILE.content(path)
         return SELECTION_FILE.made(

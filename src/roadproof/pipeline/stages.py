@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
-from roadproof.attacks import AttackResult, kept_attack, parse_groups
+from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, parse_groups
+from roadproof.attacks.cheapest import FILE
 from roadproof.attacks.groups import Group
+from roadproof.attacks.objective import variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import identity_of
@@ -16,8 +18,8 @@ from roadproof.drives import Drives, record
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import Opening, evaluate
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import EpisodeError
-from roadproof.io.identity import ANSWERS
+from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.io.identity import ANSWERS, digest, require_same
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
@@ -26,9 +28,13 @@ from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recordings import RecordingSet
+from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
+
+CHEAPEST = "cheapest"
+"""The folder of a run with the least paint for a deviation."""
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
 """Called with the name of a stage, how many of its steps are done, how many there are, and a word on the last one."""
@@ -58,7 +64,8 @@ class Stages:
         return {
             "scenario": self.scenario,
             "budget": repr(self.budget),
-            "space": self.space,
+            "space": self.space.stated,
+            "variation": variation_of(self.budget.objective),
             "seed": self.seed,
             "controller": self.controller_name,
             ANSWERS: identity_of(self.controller, size),
@@ -95,7 +102,22 @@ class Stages:
                 on_call=lambda made: self.on_progress("Calibrating", number * each + made, total, ""),
             )
             done.save(place)
+        if done.recordings.marks is None:
+            # Of a calibration that is older than marks, or by a simulator without a map.
+            return replace(done.recordings, marks=marks_of(self.simulator, self.scenario))
         return done.recordings
+
+    def check_paint(self) -> None:
+        """See, before anything is driven, that the method knows the patterns and the limits on paint leave some.
+
+        Raises:
+            PatternError: it does not, or they leave none.
+        """
+        space = self.space
+        self.budget.method.check_space(space)
+        if space.limits is not None:
+            site = space.limits.site(site_at(self.simulator, self.scenario))
+            space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
         """The method's own groups, or all drives pooled where the budget says so."""
@@ -152,6 +174,42 @@ class Stages:
             device=self.device,
             on_step=lambda done, total, word: self.on_progress("Searching on", done, total, word),
         )
+
+    def cheapest(
+        self, recordings: RecordingSet, found: AttackResult, wanted_m: float, drives: Drives
+    ) -> tuple[Cheapest, Selection] | None:
+        """The least paint for a deviation, and the drive over it; None where nothing found reaches that."""
+        folder, total = self.folder / CHEAPEST, 15
+        made_of = {"wanted_m": wanted_m, "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]}
+        if (folder / "cheapest.json").exists():
+            require_same(folder, "a search", FILE.content(folder / "cheapest.json")["made_of"], made_of, RoadproofError)
+            less = Cheapest.load(folder)
+        else:
+            less = cheapest(
+                recordings,
+                self.controller,
+                found,
+                wanted_m,
+                groups=self.groups(recordings),
+                objective=self.budget.objective,
+                device=self.device,
+                on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
+            )
+            if less is None:
+                return None
+            less.save(folder, made_of)
+        driven = select_by_driving(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            [less.candidate],
+            best=1,
+            weather=self.budget.recorded_in[0],
+            folder=folder / "selection",
+            clean=drives.drives[0].episode,
+            on_drive=lambda _done, _best: self.on_progress("Looking for less paint", total, total, ""),
+        )
+        return less, driven
 
     def predict(
         self, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None

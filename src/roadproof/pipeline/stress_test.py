@@ -7,6 +7,7 @@
     RUN/selection/     which of it was strongest when driven (`pipeline.selection`)
     RUN/prediction.npz the chosen pattern's predicted path beside the driven one (`pipeline.prediction`)
     RUN/round-1/       searching on where the attacked car went (`pipeline.rerecording`), where rounds are asked for
+    RUN/cheapest/      the least paint for a deviation and the drive over it, where one is asked for
     RUN/pattern.json   the pattern that was chosen in the end
     RUN/evaluation/    how bad that is, by weather, alone and in traffic (`driving.evaluate`), with the film of two
                        drives (`pipeline.film`) and composites beside renders (`pipeline.fidelity`)
@@ -19,15 +20,16 @@ weather but the first in RUN/WEATHER/, as those of the first are in RUN.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-from roadproof.attacks import AttackResult
+from roadproof.attacks import AttackResult, Cheapest
+from roadproof.attacks.cheapest import check_wanted
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.driving.evaluate import Opening
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.locks import working_in
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
@@ -43,7 +45,7 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
 
-STAGES = ("record", "calibrate", "attack", "select", "rounds", "evaluate")
+STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "evaluate")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -60,6 +62,8 @@ class StressTest:
         fidelity: composited frames of the clean drive beside rendered ones; None without `film`, or where no frame
             shows any paint.
         cost: what each stage took since the run began.
+        cheapest: the least paint for the deviation that was asked for, and the drive over it; None where none was
+            asked for, or nothing found reaches it.
     """
 
     attack: AttackResult
@@ -69,6 +73,7 @@ class StressTest:
     evaluation: Evaluation
     fidelity: Fidelity | None
     cost: dict[str, StageCost]
+    cheapest: tuple[Cheapest, Selection] | None = None
 
     @property
     def pattern(self) -> Pattern:
@@ -80,7 +85,7 @@ def stress_test(
     simulator: Simulator,
     controller: Controller,
     scenario: Scenario,
-    folder: Path,
+    folder: AnyPath,
     *,
     budget: Budget = QUICK,
     space: SearchSpace | None = None,
@@ -90,6 +95,7 @@ def stress_test(
     another: Opening | None = None,
     processes: int = 1,
     film: bool = True,
+    cheapest_m: float | None = None,
     on_progress: OnProgress = lambda _stage, _done, _total, _word: None,
 ) -> StressTest:
     """Find the paint that makes a controller leave its lane in one scenario, and say how bad it is.
@@ -108,13 +114,17 @@ def stress_test(
         processes: how many drives of the evaluation are made at once; the controller must be picklable for several.
         film: whether to film the two drives that the report shows, and to render the recorded frames over the paint,
             which takes three drives more.
+        cheapest_m: the deviation, in metres, for which the least paint is looked for and driven over once; None for
+            no such search.
         on_progress: called after every step of every stage.
 
     Raises:
         RoadproofError: the folder holds a run of something else, another process works in it, or a stage refuses; the
             message says why.
+        PatternError: the limits on paint leave no pattern, or the search knows none.
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
+    folder = as_path(folder)
     if processes < 1 or (processes > 1 and another is None):
         raise RoadproofError(
             f"{processes} processes; expected 1, or more with a function that opens another simulator for each"
@@ -133,15 +143,20 @@ def stress_test(
         processes=processes,
         on_progress=on_progress,
     )
+    stages.check_paint()
+    if cheapest_m is not None:
+        check_wanted(cheapest_m)
+        if not budget.is_predicted:
+            raise RoadproofError("the cheapest pattern is looked for in the recorded world; search a path deviation")
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
     require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
     with working_in(folder):
-        return _all_of(stages, film=film)
+        return _all_of(stages, film=film, cheapest_m=cheapest_m)
 
 
-def _all_of(run: Stages, *, film: bool) -> StressTest:
+def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
     """All stages, one after another."""
     budget, on_progress = run.budget, run.on_progress
     ledger = Ledger(run.folder, run.made_of, STAGES)
@@ -171,6 +186,11 @@ def _all_of(run: Stages, *, film: bool) -> StressTest:
             ledger.calls("rounds", rounds.simulator_calls)
     pattern = _chosen(found, selection, rounds)
     save_pattern(pattern, run.folder / "pattern.json")
+    less = None
+    if cheapest_m is not None:
+        with ledger.stage("cheapest"):
+            less = run.cheapest(recordings, found, cheapest_m, drives[0])
+            ledger.calls("cheapest", 0 if less is None else less[1].simulator_calls)
     prediction = run.predict(recordings, pattern, selection, rounds)
     with ledger.stage("evaluate"):
         evaluation = run.evaluate(pattern)
@@ -184,6 +204,7 @@ def _all_of(run: Stages, *, film: bool) -> StressTest:
         evaluation=evaluation,
         fidelity=fidelity,
         cost=ledger.cost,
+        cheapest=less,
     )
 
 

@@ -117,6 +117,11 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         self._weather = Weather(weather)
 
     @property
+    def recordings(self) -> RecordingSet:
+        """What it drives in."""
+        return self._world.recordings
+
+    @property
     def paint(self) -> PaintKind:
         """How patterns are put on the road: composited into the pictures."""
         return PaintKind.COMPOSITED
@@ -191,7 +196,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
                 f"{request.cars} cars and {request.pedestrians} pedestrians are asked for, but recordings hold no "
                 "others on the road; expected 0 of both"
             )
-        _check_canvas(scenario.canvas, self._world.bank.canvas)
+        check_canvas(scenario.canvas, self._world.bank.canvas)
         drive = _Drive(request, self.dt_s)
         drive.pattern = request.pattern
         self._put(drive, self._world.begin((self._start(scenario.start),)))
@@ -262,7 +267,16 @@ def _gap_of(gap: Gap) -> RecordedGap:
     return RecordedGap(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
 
 
-def _check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
+def check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
+    """See that recordings are of the stretch of road that is to be driven.
+
+    Args:
+        asked: the scenario's canvas.
+        recorded: the canvas of the recordings.
+
+    Raises:
+        SimulatorError: they lie elsewhere, or have other sizes; the message says by how much.
+    """
     turned = math.remainder(asked.yaw_rad - recorded.yaw_rad, 2 * math.pi)
     same = replace(asked, yaw_rad=recorded.yaw_rad + turned)
     # Radians count as metres do: so far is what lies a metre from the middle moved by a turn.

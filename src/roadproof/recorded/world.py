@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.composite import composite_own
+from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller, PedalController
 from roadproof.controllers.asking import controls_of, steer_of
 from roadproof.driving.deviation import deviation_m
@@ -91,12 +92,18 @@ class RecordedWorld:
         device: where pictures are made and shown.
 
     Raises:
-        RecordingError: there is no clean drive, poses are not known, or the vehicle cannot be identified.
+        RecordingError: there is no clean drive, the drives are of several weathers, poses are not known, or the vehicle
+            cannot be identified.
     """
 
     def __init__(
         self, recordings: RecordingSet, *, vehicle: Vehicle | None = None, device: torch.device | str = "cpu"
     ) -> None:
+        weathers = sorted({drive.weather for drive in recordings.recordings})
+        if len(weathers) > 1:
+            raise RecordingError(
+                f"the set has drives in {', '.join(weathers)}, a recorded world has one light; take one of by_weather()"
+            )
         clean = next((drive for drive in recordings.recordings if drive.push is Push.CLEAN), None)
         if clean is None:
             raise RecordingError("the set has no clean drive, which a recorded world begins with; record one")
@@ -132,6 +139,7 @@ class RecordedWorld:
         *,
         starts: tuple[Start, ...] = (Start(),),
         every: int = 1,
+        looks: Looks | None = None,
     ) -> Rolled:
         """Drive past the canvas, closed loop.
 
@@ -141,6 +149,7 @@ class RecordedWorld:
                 None leaves the road bare.
             starts: of the drives.
             every: steps from one picture to the next; controls are held between.
+            looks: how paint and camera differ from drive to drive, in turn; None for paint and camera as recorded.
         """
         count = len(starts) * (1 if pattern is None else len(pattern.boxes))
         if pattern is not None:
@@ -149,6 +158,7 @@ class RecordedWorld:
                 pattern.boxes.repeat_interleave(len(starts), 0),
                 pattern.colours.repeat_interleave(len(starts), 0),
             )
+            pattern = pattern if looks is None else looks.placed(pattern, self.recordings.canvas)
         car = self.begin(starts, count // len(starts))
         course = self.course
         rows: list[tuple[Tensor, ...]] = []
@@ -161,7 +171,7 @@ class RecordedWorld:
             place = course.locate(poses)
             if step % every == 0:
                 gap = self.bank.nearest(poses.detached())
-                answer = self._answer(controller, pattern, poses, car, gap)
+                answer = self._answer(controller, pattern, poses, car, gap, looks, step)
                 past = place.s_m > self._shown_m
                 steer = torch.where(past, course.law(place), answer[:, 0] + off + course.feedback(place))
                 steer = steer.clamp(-1.0, 1.0)
@@ -186,18 +196,29 @@ class RecordedWorld:
         return np.concatenate([clean, rolled.path(index)])
 
     def deviations_m(
-        self, controller: Controller, patterns: Pattern, starts: tuple[Start, ...] = (Start(),)
+        self,
+        controller: Controller,
+        patterns: Pattern,
+        starts: tuple[Start, ...] = (Start(),),
+        looks: Looks | None = None,
     ) -> Float[np.ndarray, "r s"]:
-        """The paper's deviation that each pattern of a batch is predicted to cause, from each start."""
+        """The paper's deviation that each pattern of a batch is predicted to cause, from each start.
+
+        Args:
+            controller: as `roll` takes it.
+            patterns: a batch of R.
+            starts: S of them.
+            looks: one for each start, of both drives; None for paint and camera as recorded.
+        """
         at_once = max(1, AT_ONCE // len(starts))
         with torch.no_grad():
-            rolled = self.roll(controller, starts=starts)
+            rolled = self.roll(controller, starts=starts, looks=looks)
             bare = [self.whole_path(rolled, k) for k in range(len(starts))]
             found: list[float] = []
             for first in range(0, len(patterns.boxes), at_once):
                 part = slice(first, first + at_once)
                 some = Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part])
-                rolled = self.roll(controller, some, starts=starts)
+                rolled = self.roll(controller, some, starts=starts, looks=looks)
                 found += [
                     deviation_m(bare[k % len(starts)], self.whole_path(rolled, k)) for k in range(len(rolled.x_m))
                 ]
@@ -223,13 +244,22 @@ class RecordedWorld:
         )
 
     def _answer(
-        self, controller: Controller, pattern: Pattern | None, poses: Poses, car: Motion, gap: Gap
+        self,
+        controller: Controller,
+        pattern: Pattern | None,
+        poses: Poses,
+        car: Motion,
+        gap: Gap,
+        looks: Looks | None,
+        step: int,
     ) -> Float[Tensor, "r c"]:
         with torch.no_grad():
             views = self.bank.show(poses.detached(), gap)
         frames = views.frames
         if pattern is not None and views.canvas is not None:
-            frames = composite_own(pattern, frames, views.canvas)
+            frames = composite_own(pattern, frames, views.canvas, looks)
+        if looks is not None:
+            frames = looks.seen(frames, len(frames), step)
         speed, command = car.speed_mps.float(), self.bank.command[gap.frame]
         if isinstance(controller, PedalController):
             return controls_of(controller, frames, speed, command).double()

@@ -1,7 +1,7 @@
 """Recorded drives on disk: folders that explain themselves, checked when they are read.
 
     SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, the
-                               canvas' place (null where it is not known), drives
+                               canvas' place and the lane marks on it (null where they are not known), drives
     SET/DRIVE/drive.npz        per frame: frame number, homography, speed, command, steer
     SET/DRIVE/frames/N.png     the controller's input, unpainted; or all of them in SET/DRIVE/frames.npy
     SET/DRIVE/shading.npz      optional: gain, offset and visibility of every pixel (see `photometry.PixelMaps`)
@@ -24,9 +24,10 @@ from PIL import Image
 from roadproof.errors import ColourError, OutputError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_archive, read_array, write_archive
-from roadproof.io.files import inside, write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, inside, write_folder_atomically
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import Form, RecordFile
+from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 from roadproof.recordings.recording import Push, Recording, RecordingSet
 from roadproof.recordings.track import Track
@@ -38,6 +39,7 @@ _UNITS = {
     "command": "2 follow, 3 left, 4 right, 5 straight",
     "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
     "canvas": "its middle and extents in m, yaw in rad: direction of travel, in a right-handed world with z up",
+    "marks": "middle lines in m on the canvas, x from its left edge, y from its far edge; width in m, paint as #rrggbb",
     "track": "steps numbered as frames, dt_s apart; x_m, y_m, yaw_rad (left positive) of the vehicle's origin in that "
     "world, speed in m/s; steer, throttle and brake as given at each step and held until the next",
 }
@@ -55,6 +57,7 @@ class _Drive:
     name: str
     push: Push
     frames: int = 0
+    weather: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -67,6 +70,7 @@ class _Manifest:
     crop_resize: CropResize
     colour: ColourTransform
     canvas: CanvasPlacement | None = None
+    marks: tuple[LaneMark, ...] | None = None
     drives: tuple[_Drive, ...]
 
     def __post_init__(self) -> None:
@@ -98,13 +102,13 @@ _PER_FRAME = RecordFile(
     kind=Recording,
     error=RecordingError,
     remedy=_AGAIN,
-    elsewhere=("name", "push", "frames", "maps", "track"),
+    elsewhere=("name", "push", "frames", "maps", "track", "weather"),
     header=None,
 )
 _TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
 
 
-def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = False) -> None:
+def save_recordings(recordings: RecordingSet, folder: AnyPath, *, compact: bool = False) -> None:
     """Write a set to a new folder, all or nothing.
 
     Args:
@@ -115,6 +119,7 @@ def save_recordings(recordings: RecordingSet, folder: Path, *, compact: bool = F
     Raises:
         OutputError: the folder is there already, or cannot be written.
     """
+    folder = as_path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder} exists already; choose a new folder for the recordings")
 
@@ -133,7 +138,11 @@ def _manifest(recordings: RecordingSet) -> _Manifest:
         crop_resize=recordings.view,
         colour=recordings.colour,
         canvas=recordings.canvas,
-        drives=tuple(_Drive(name=each.name, push=each.push, frames=len(each.frames)) for each in recordings.recordings),
+        marks=recordings.marks,
+        drives=tuple(
+            _Drive(name=each.name, push=each.push, frames=len(each.frames), weather=each.weather)
+            for each in recordings.recordings
+        ),
     )
 
 
@@ -156,12 +165,13 @@ def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
         Image.fromarray(frame).save(folder / "frames" / f"{number}.png")
 
 
-def load_recordings(folder: Path) -> RecordingSet:
+def load_recordings(folder: AnyPath) -> RecordingSet:
     """Read and check a set of recorded drives.
 
     Raises:
         RecordingError: the folder or a part of it is missing, damaged or inconsistent; the message names it.
     """
+    folder = as_path(folder)
     if not folder.is_dir():
         raise RecordingError(f"no folder {folder}; expected a set of recordings with a recordings.json")
     if not (folder / "recordings.json").is_file():
@@ -174,6 +184,7 @@ def load_recordings(folder: Path) -> RecordingSet:
         recordings=tuple(_read_drive(folder, drive, manifest.colour.response) for drive in manifest.drives),
         origin=manifest.origin,
         canvas=manifest.canvas,
+        marks=manifest.marks,
     )
 
 
@@ -190,6 +201,7 @@ def _read_drive(root: Path, drive: _Drive, response: Response) -> Recording:
         frames=_read_frames(folder, content["frame_number"]),
         maps=_read_maps(folder / "shading.npz", response),
         track=_read_track(folder / "track.npz", content["frame_number"]),
+        weather=drive.weather,
     )
 
 

@@ -13,6 +13,7 @@ from roadproof.datatypes import Command
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
 from roadproof.io.files import check_name
+from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps
 from roadproof.recordings.track import FASTEST_MPS, Track
 
@@ -44,6 +45,7 @@ class Recording:
         steer: what the recorded controller answered to each frame, in [−1, 1]; for information.
         maps: per-pixel gain and offset of the paint, where they were calibrated; to the response of the set's colour.
         track: poses and controls of the whole drive, where they are known; its steps are numbered as the frames are.
+        weather: what the light is called that it was recorded in; empty where that is not known.
 
     Raises:
         RecordingError: a frame has no pose in the track, lengths differ, a value is not finite or outside its range,
@@ -60,6 +62,7 @@ class Recording:
     steer: Float[np.ndarray, "..."]
     maps: PixelMaps | None = None
     track: Track | None = None
+    weather: str = ""
 
     def __post_init__(self) -> None:
         check_name(self.name, "drive", RecordingError)
@@ -129,6 +132,7 @@ class RecordingSet:
         recordings: the drives.
         origin: where they come from, in words.
         canvas: where it lies in the world of the tracks, where that is known.
+        marks: the lane marks on the canvas and near it; None where they are not known.
 
     Raises:
         RecordingError: no drive, two of one name, or frames of another size than the controller's input.
@@ -140,6 +144,7 @@ class RecordingSet:
     recordings: tuple[Recording, ...]
     origin: str = ""
     canvas: CanvasPlacement | None = None
+    marks: tuple[LaneMark, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.recordings:
@@ -165,22 +170,30 @@ class RecordingSet:
         """Whether the set can be driven in: its canvas and the poses of all drives are known."""
         return self.canvas is not None and all(recording.track is not None for recording in self.recordings)
 
+    def by_weather(self) -> tuple[RecordingSet, ...]:
+        """The drives of each weather as a set of their own, in the order of their first drives."""
+        found: dict[str, list[Recording]] = {}
+        for recording in self.recordings:
+            found.setdefault(recording.weather, []).append(recording)
+        return tuple(replace(self, recordings=tuple(some)) for some in found.values())
+
 
 def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
     """The drives of several sets as one, such as the same drives in several weathers.
 
     Args:
-        sets: by name; drives of all but the first are named after theirs.
+        sets: by name, such as the weather; drives of all but the first are named after theirs, and those that do not
+            know their weather are given it.
 
     Raises:
         RecordingError: there is none, or one differs in camera, crop, colour transform or the place of the canvas;
             per-pixel maps may differ.
     """
-    first, *others = sets.values() or (None,)
+    first = next(iter(sets.values()), None)
     if first is None:
         raise RecordingError("there are no recordings to pool, expected at least one set")
-    drives = list(first.recordings)
-    for name, each in list(sets.items())[1:]:
+    drives: list[Recording] = []
+    for number, (name, each) in enumerate(sets.items()):
         if (each.camera, each.view, each.colour.to_dict()) != (first.camera, first.view, first.colour.to_dict()):
             raise RecordingError(f"the recordings {name} have another camera, crop or colour transform than the first")
         if each.canvas != first.canvas:
@@ -188,6 +201,7 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
                 f"the recordings {name} place the canvas at {each.canvas}, but the first at {first.canvas}; "
                 "expected one place for all"
             )
-        drives += [replace(drive, name=f"{name}-{drive.name}") for drive in each.recordings]
-    origin = "; ".join(each.origin for each in (first, *others))
+        before = f"{name}-" if number else ""
+        drives += [replace(drive, name=before + drive.name, weather=drive.weather or name) for drive in each.recordings]
+    origin = "; ".join(each.origin for each in sets.values())
     return replace(first, recordings=tuple(drives), origin=origin)

@@ -18,9 +18,8 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from roadproof.driving.deviation import HORIZON_M, lateral_m
+from roadproof.driving.deviation import HORIZON_M, lateral_m, path_of
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import path_of
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction

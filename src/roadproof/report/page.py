@@ -13,9 +13,11 @@ from typing import Any, cast
 import numpy as np
 
 import roadproof
+from roadproof.attacks import site_of
 from roadproof.drives import Drive
 from roadproof.driving.infractions import counted
-from roadproof.io.files import write_atomically
+from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording
 from roadproof.report import charts
@@ -44,7 +46,7 @@ PAINTED = {
 Fields = dict[str, Any]
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: AnyPath) -> Path:
     """Write report.html and result.json of a run folder.
 
     Args:
@@ -57,6 +59,7 @@ def write_report(folder: Path) -> Path:
         RoadproofError: there is nothing to report, or a stage is damaged.
         OutputError: the folder cannot be written.
     """
+    folder = as_path(folder)
     run = read_run(folder)
     result = json.dumps(result_of(run), indent=1, ensure_ascii=False) + "\n"
     page = render(run)
@@ -112,6 +115,14 @@ def result_of(run: Run) -> Fields:
         content["search"] = {"objective": run.attack.objective, "by_group": run.attack.by_group}
     if run.judged is not None and run.judged.fidelity is not None:
         surrogate |= {"agreement": asdict(run.judged.fidelity.agreement)}
+    if run.cheapest is not None:
+        content["cheapest"] = {
+            "wanted_m": run.cheapest.wanted_m,
+            "predicted_m": run.cheapest.predicted_m,
+            "driven_m": run.cheapest_driven and run.cheapest_driven.deviation_m,
+            "levels": [asdict(level) for level in run.cheapest.levels],
+        }
+    content["conspicuousness"] = {name: asdict(told) for name, told in _conspicuous(run)}
     calibration = None if run.calibration is None else asdict(run.calibration)
     return content | {"surrogate": surrogate or None, "calibration": calibration, "cost": run.costs}
 
@@ -150,7 +161,25 @@ def _pattern(run: Run) -> Fields | None:
         "size": f"{size[0]:.1f} × {size[1]:.1f} m" if size else "400 × 400 canvas pixels",
         "share": f"{(paint[..., 3] / 255).mean():.0%}",
         "figures": [] if pattern is None else _figures(pattern, size),
+        "conspicuous": _conspicuous(run),
+        "cheapest": None
+        if run.cheapest is None
+        else encoded(on_asphalt(raster(run.cheapest.pattern), 480, size or (1.0, 1.0)), "PNG"),
     }
+
+
+def _conspicuous(run: Run) -> list[tuple[str, Conspicuousness]]:
+    """How conspicuous the pattern of the run is, and the cheapest one."""
+    known: list[tuple[str, Conspicuousness]] = []
+    if run.pattern is not None and run.recordings is not None:
+        limits = None if run.attack is None else run.attack.space.limits
+        site = site_of(run.recordings)
+        known.append(("the pattern", conspicuousness(run.pattern, site if limits is None else limits.site(site))))
+    elif run.attack is not None and run.attack.conspicuousness is not None:
+        known.append(("the pattern", run.attack.conspicuousness))
+    if run.cheapest is not None:
+        known.append((f"the least paint for {run.cheapest.wanted_m:g} m", run.cheapest.conspicuousness))
+    return known
 
 
 def _figures(pattern: Pattern, size: tuple[float, float] | None) -> list[Fields]:

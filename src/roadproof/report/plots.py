@@ -66,7 +66,7 @@ def draw_search(
 
 def in_units(objective: str) -> str:
     """The name of an objective with its unit, as an axis shows it."""
-    return f"{objective}, {_UNITS.get(objective, 'its own unit')}"
+    return f"{objective}, {_UNITS.get(objective.removesuffix(' over variations'), 'its own unit')}"
 
 
 def _film_strip(drive: ShownDrive, columns: int = 6) -> Figure:

@@ -7,6 +7,7 @@ RUN/selection/                 optional: its candidates, driven (`pipeline.selec
 RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.pipeline.rerecording`)
 RUN/evaluation/                what driving over it showed (`driving.evaluation`)
 RUN/prediction.npz             optional: the predicted path beside the driven one (`pipeline.prediction`)
+RUN/cheapest/                  optional: the least paint for a deviation, driven over (`attacks.cheapest`)
 RUN/pattern.json               optional: the pattern that was chosen in the end
 RUN/run.json                   optional: what the stages took (`roadproof.pipeline.stage_costs`)
 RUN/commands.txt               optional: the commands that made it, one a line
@@ -19,13 +20,14 @@ from itertools import chain, count, takewhile
 from pathlib import Path
 from typing import Any
 
-from roadproof.attacks import AttackResult
+from roadproof.attacks import AttackResult, Cheapest
 from roadproof.calibration.report import CalibrationReport
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, load_drives
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Evaluation, Trial, load_paint
+from roadproof.driving.evaluation import Evaluation, load_paint
+from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.arrays import read_archive
 from roadproof.patterns import Pattern, load_pattern
@@ -34,6 +36,7 @@ from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import StageCost, read_cost
+from roadproof.pipeline.stages import CHEAPEST
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.simulators.protocol import PatternImage
 
@@ -83,6 +86,8 @@ class Run:
         pattern: the pattern that was chosen in the end; the attack's own where the run says nothing else.
         cost: what each stage took since the run began; empty where the run keeps no account of it.
         commands: the commands that made the run, where they were kept.
+        cheapest: the least paint for a deviation, where it was looked for.
+        cheapest_driven: the drive over it.
     """
 
     folder: Path
@@ -96,6 +101,8 @@ class Run:
     pattern: Pattern | None
     cost: dict[str, StageCost]
     commands: tuple[str, ...]
+    cheapest: Cheapest | None
+    cheapest_driven: Selection | None
 
     @property
     def name(self) -> str:
@@ -156,6 +163,10 @@ def read_run(folder: Path) -> Run:
         pattern=chosen,
         cost=read_cost(folder),
         commands=_commands(folder / "commands.txt"),
+        cheapest=_cheapest(folder),
+        cheapest_driven=Selection.load(path)
+        if ((path := folder / CHEAPEST / "selection") / "selection.json").exists()
+        else None,
     )
     if run.drives is None and run.recordings is None and run.attack is None and run.judged is None:
         raise RoadproofError(
@@ -168,6 +179,12 @@ def _selections(folder: Path) -> tuple[Selection, ...]:
     places = chain((folder,), (folder / f"round-{number}" for number in count(1)))
     chosen = (place / "selection" for place in places)
     return tuple(map(Selection.load, takewhile(lambda place: (place / "selection.json").exists(), chosen)))
+
+
+def _cheapest(folder: Path) -> Cheapest | None:
+    # A search alone leaves it beside its own result.
+    places = (folder / CHEAPEST, folder / "attack" / CHEAPEST)
+    return next((Cheapest.load(place) for place in places if (place / "cheapest.json").exists()), None)
 
 
 def _commands(path: Path) -> tuple[str, ...]:

@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
-from roadproof.driving.deviation import passage
+from roadproof.driving.deviation import passage, path_of
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import path_of
 from roadproof.driving.infractions import counted
 from roadproof.errors import ScenarioError
 from roadproof.report.charts import CLEAN, INK, PAINTED, VARIABLES, WIDTH_IN, Chart, svg_of

@@ -15,7 +15,7 @@ from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
 SPECS = "town or carla://HOST:PORT"
-CARLA_PORT = 2000
+CARLA_PORT, LAST_PORT = 2000, 65534  # sensor data goes through the next
 
 
 class MappedSimulator(Simulator, OpenWorld, Protocol):
@@ -45,6 +45,20 @@ def is_elsewhere(spec: str) -> bool:
     return is_server(spec) and _address(spec)[0] not in ("localhost", "127.0.0.1", "::1")
 
 
+def check_spec(spec: str) -> None:
+    """See that a spec names a simulator, before any work; whether it is there shows when it is opened.
+
+    Raises:
+        SimulatorError: there is none of this name, or it is no address.
+    """
+    if spec.startswith("recorded:"):
+        raise SimulatorError(f"simulator {spec!r} is a recorded world, which evaluate, select and drive alone drive in")
+    if is_server(spec):
+        _address(spec)
+    elif spec != "town":
+        raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")
+
+
 @contextmanager
 def open_simulator(spec: str) -> Generator[MappedSimulator]:
     """Open the simulator of a spec for a with-block; leaving frees everything it holds.
@@ -52,6 +66,7 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
     Raises:
         SimulatorError: there is none of this name, or what it needs is not installed.
     """
+    check_spec(spec)
     if spec == "town":
         # Panda3D is an extra.
         from roadproof.simulators.town.simulator import TownSimulator
@@ -59,17 +74,12 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
         with TownSimulator() as town:
             yield town
         return
-    if is_server(spec):
-        host, port, paint = _address(spec)
-        # CARLA's client is an extra.
-        from roadproof.simulators.carla.simulator import CarlaSimulator
+    host, port, paint = _address(spec)
+    # CARLA's client is an extra.
+    from roadproof.simulators.carla.simulator import CarlaSimulator
 
-        with CarlaSimulator(host, port, paint=paint) as server:
-            yield server
-        return
-    if spec.startswith("recorded:"):
-        raise SimulatorError(f"simulator {spec!r} is a recorded world, which evaluate, select and drive alone drive in")
-    raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")
+    with CarlaSimulator(host, port, paint=paint) as server:
+        yield server
 
 
 def _address(spec: str) -> tuple[str, int, PaintChoice]:
@@ -79,6 +89,8 @@ def _address(spec: str) -> tuple[str, int, PaintChoice]:
         host, port = parts.hostname, parts.port
     except ValueError as error:
         raise SimulatorError(f"simulator {spec!r} is no address ({error}), expected carla://HOST:PORT") from None
+    if port is not None and not 1 <= port <= LAST_PORT:
+        raise SimulatorError(f"simulator {spec!r} has port {port}, expected 1 to {LAST_PORT:,}")
     if not host or parts.path or parts.fragment or parts.username:
         raise SimulatorError(f"simulator {spec!r} is no address, expected carla://HOST:PORT")
     match parts.query:

@@ -5,7 +5,7 @@ jobs/KEY/job.json           what was asked for; KEY is a hash of it
 jobs/KEY/rows.json          its rows; there when the job is finished, or has failed
 jobs/KEY/pattern.json       what it found, and pattern.png
 jobs/KEY/paths.npz          clean_xy, painted_xy: world x, y in metres of both drives alone in the first weather
-jobs/KEY/view-WEATHER.jpg   what the car's camera sees of the pattern (`study.snapshots`)
+jobs/KEY/passage-*.jpg      what the car's camera sees while it passes the pattern (`study.passages`)
 jobs/KEY/history.json       how the search went (`study.history`)
 work/KEY/                   what a job keeps while it runs, to go on from
 rows.parquet                every row of every job (`study.rows`)
@@ -55,9 +55,11 @@ def read_rows(job: Job, folder: Path) -> tuple[Row, ...] | None:
     path = folder / "jobs" / job.key / "rows.json"
     if not path.exists():
         return None
-    rows: list[dict[str, Any]] = read_json(path, *ROWS, StudyError)["rows"]
+    rows: object = read_json(path, *ROWS, StudyError).get("rows")
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in cast("list[object]", rows)):
+        raise StudyError(f"{path} is damaged (it has no list of rows); remove it, and the job is done again")
     # Rows of an older roadproof have no key of their own.
-    return tuple(cast("Row", {"job": job.key, **row}) for row in rows)
+    return tuple(cast("Row", {"job": job.key, **row}) for row in cast("list[dict[str, Any]]", rows))
 
 
 def is_done(job: Job, folder: Path) -> bool:

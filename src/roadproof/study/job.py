@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -9,26 +10,31 @@ from typing import cast
 import numpy as np
 import torch
 
-from roadproof.attacks import BayesianOptimisation
+from roadproof.attacks import BayesianOptimisation, site_of
 from roadproof.attacks.blackbox import blackbox_search
+from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller, load_controller
+from roadproof.driving.deviation import path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
-from roadproof.driving.evaluation import Evaluation, path_of
+from roadproof.driving.evaluation import Evaluation
 from roadproof.io.arrays import packed
-from roadproof.patterns import Pattern, save_pattern
+from roadproof.paint import Site, conspicuousness
+from roadproof.patterns import Pattern, raster, save_pattern
 from roadproof.pipeline.budget import STEERING, Budget
 from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.pipeline.selection import first_of_each_group
 from roadproof.pipeline.stress_test import StressTest, stress_test
+from roadproof.recordings import load_recordings
+from roadproof.roads.marks import site_at
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.history import Course, History
 from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
+from roadproof.study.passages import passages
 from roadproof.study.plan import BLACK, Job
-from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns
-from roadproof.study.snapshots import snapshots
+from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns, paint_columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +47,7 @@ class _Found:
         seconds: that it took.
         evaluation_s: seconds of drives made already that belong to the evaluation.
         history: how it went.
+        site: the road under it.
     """
 
     pattern: Pattern
@@ -48,6 +55,11 @@ class _Found:
     seconds: float
     evaluation_s: float
     history: History
+    site: Site
+
+
+PARTS = ("evaluation", "evaluation-alone")
+"""Folders of a job's evaluations."""
 
 
 def run_job(job: Job, scratch: Path) -> JobResult:
@@ -66,16 +78,17 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         found = (_by_driving if drives else _in_recordings)(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
         shown = parts[0].shown()
-        clean, painted = load_episodes(scratch / "evaluation", [shown.clean, shown.painted])
-        pictures = snapshots(world, job.scenario, found.pattern, clean, job.weathers)
+        clean, painted = load_episodes(scratch / PARTS[0], [shown.clean, shown.painted])
+        pictures = _pictures(world, parts, scratch, found.pattern)
     costs: CostColumns = {
         "search_calls": found.calls,
         "search_seconds": found.seconds,
         "evaluation_calls": sum(part.simulator_calls for part in parts),
         "seconds": found.seconds + found.evaluation_s + sum(part.seconds for part in parts),
     }
+    paint = paint_columns(conspicuousness(found.pattern, found.site))
     rows = tuple(
-        Row(**job_columns(job), controller=job.controller, **drive_columns(trial), **costs)
+        Row(**job_columns(job), controller=job.controller, **drive_columns(trial), **paint, **costs)
         for part in parts
         for trial in part.trials
     )
@@ -86,17 +99,25 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     return JobResult(rows, files | pictures)
 
 
+def _pictures(world: Simulator, parts: Sequence[Evaluation], scratch: Path, pattern: Pattern) -> dict[str, bytes]:
+    paint, files = raster(pattern), dict[str, bytes]()
+    for name, part in zip(PARTS, parts, strict=False):
+        files |= passages(world, part, scratch / name, paint)
+    return files
+
+
 def space_of(job: Job) -> SearchSpace:
     """The patterns a job searches: published rectangles, in its own bounds for the published baseline."""
     family = BayesianOptimisation.family if job.method.search == BayesianOptimisation.word else "published"
     if job.figures == BLACK:
-        return SearchSpace(figures=1, family=family, colour=False)
-    return SearchSpace(figures=int(job.figures), family=family)
+        return SearchSpace(figures=1, family=family, colour=False, limits=job.paint)
+    return SearchSpace(figures=int(job.figures), family=family, limits=job.paint)
 
 
 def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Found:
     # Its own evaluation is a part of the study's conditions and kept where those are.
     budget = replace(budget_of(job.method, job.weathers[0]), starts=job.starts.count, start_range=job.starts.range)
+    budget = replace(budget, objective=varied(budget.objective, job.variation))
     found, calls, seconds = _searched(job, world, controller, folder, budget)
     strongest = found.attack.history.max((1, 2))
     before = [found.cost[stage] for stage in ("record", "calibrate")]
@@ -113,7 +134,8 @@ def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: P
         if chosen is None
         else Course(calls=(calls,), seconds=(seconds,), best=(chosen.deviation_m,)),
     )
-    return _Found(found.pattern, calls, seconds, found.cost["evaluate"].seconds, history)
+    site = site_of(load_recordings(folder / "recordings"))
+    return _Found(found.pattern, calls, seconds, found.cost["evaluate"].seconds, history, _said(job, site))
 
 
 def _searched(
@@ -136,7 +158,7 @@ def _searched(
 
 
 def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path) -> _Found:
-    plan, space = cast("BlackBoxPlan", job.method), space_of(job)
+    plan, space = cast("BlackBoxPlan", job.method), space_of(job).on(site_at(world, job.scenario))
     first, calls_before, seconds_before = None, 0, 0.0
     if plan.start:
         # Record, calibrate and search the steering shift; the candidates are for the black box to drive.
@@ -172,7 +194,13 @@ def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path
         measure=plan.objective,
         deviation_m=tuple(objective.effect(patterns[index]).deviation for index in best),
     )
-    return _Found(patterns[trials.best], history.calls[-1], history.seconds[-1], 0.0, history)
+    site = _said(job, site_at(world, job.scenario))
+    return _Found(patterns[trials.best], history.calls[-1], history.seconds[-1], 0.0, history, site)
+
+
+def _said(job: Job, site: Site) -> Site:
+    """A site with what the plan's limits say of it."""
+    return site if job.paint is None else job.paint.site(site)
 
 
 def _evaluate(
@@ -181,9 +209,9 @@ def _evaluate(
     """All the study's conditions; where traffic is for the first weather alone, the others are a part of their own."""
     traffic = job.traffic
     split = traffic is not None and traffic.weathers == "first" and len(job.weathers) > 1
-    parts = [("evaluation", job.weathers[:1] if split else job.weathers, traffic)]
+    parts = [(PARTS[0], job.weathers[:1] if split else job.weathers, traffic)]
     if split:
-        parts.append(("evaluation-alone", job.weathers[1:], None))
+        parts.append((PARTS[1], job.weathers[1:], None))
     return tuple(
         evaluate(
             world,

@@ -17,6 +17,7 @@ from roadproof.io.files import inside
 from roadproof.io.pictures import read_picture
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.study.history import Course, read_history
+from roadproof.study.passages import file_of
 from roadproof.study.rows import Frame, JobId
 
 _AGAIN = "remove its folder and run the study again"
@@ -96,13 +97,13 @@ class KeptJob(_Stated):
                 raise StudyError(f"{path} holds {each.shape}, expected finite x, y; {_AGAIN}")
         return clean, painted
 
-    def view(self, weather: str) -> UInt8[np.ndarray, "h w 3"] | None:
-        """What the car's camera sees of the pattern in a weather; None where the job kept no picture of it.
+    def passage(self, weather: str, *, traffic: bool) -> UInt8[np.ndarray, "h w 3"] | None:
+        """What the car's camera sees while it passes the pattern; None where the job kept no pictures of that.
 
         Raises:
             StudyError: the file is damaged.
         """
-        path = self.folder / f"view-{weather}.jpg"
+        path = self.folder / file_of(weather, traffic=traffic)
         if path.parent != self.folder or not path.exists():
             return None
         return read_picture(path, StudyError, _AGAIN)

@@ -51,6 +51,7 @@ class GradOptPlan:
     halving: bool = True  # whether many starts compete first
     select: Thousand = 1  # candidates driven, of which the strongest is kept; 0 believes the first
     rounds: Hundred = 0  # of searching on along the way that the attacked car took
+    attack_weathers: tuple[Weather, ...] = ()  # recorded in each, searched for their mean; empty: the study's first
 
     def __post_init__(self) -> None:
         if self.objective == "deviation" and (self.scheme != "group" or self.trajectories == 1):
@@ -147,6 +148,7 @@ def budget_of(method: MethodPlan, weather: Weather) -> Budget:
                 calibration=Calibration(method.calibration),
                 select=method.select,
                 rounds=method.rounds,
+                attack_weathers=method.attack_weathers,
             )
         case PublishedPlan():
             return replace(

@@ -20,7 +20,7 @@ from roadproof.study.charts import Picture, by_figures, progress
 from roadproof.study.folder import reference_of
 from roadproof.study.kept_jobs import KeptJob, StatedMethod, read_jobs
 from roadproof.study.paper_tables import GAPS, paper_tables
-from roadproof.study.pictures import gallery, in_weathers, trajectories
+from roadproof.study.pictures import gallery, passages, trajectories
 from roadproof.study.plan import BLACK
 from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, results_of
 from roadproof.study.rows import Frame
@@ -50,7 +50,7 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder))
     driven = [] if transfer is None else [(transfer, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))
-    shown = (*drawn, gallery(results, jobs), in_weathers(results, jobs), *(transfer_map(*each) for each in driven))
+    shown = (*drawn, gallery(results, jobs), *passages(results, jobs), *(transfer_map(*each) for each in driven))
     pictures = [picture for picture in shown if picture is not None]
     for picture in pictures:
         save(picture.figure, out / "figures" / f"{picture.name}.png")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -21,12 +21,12 @@ from roadproof.roads.maps import load_map
 from roadproof.scenarios import KINDS
 from roadproof.study.charts import INK, MUTED, Picture, legend, plain, style
 from roadproof.study.kept_jobs import KeptJob
+from roadproof.study.passages import HORIZON_M
 from roadproof.study.results import Results
 from roadproof.study.rows import JobId
 
 PANELS = 6
 ROWS, COLUMNS = 8, 12
-VIEWS = 4
 BEFORE_M, AFTER_M, BESIDE_M = 12.0, 26.0, 10.5
 GROUND = Ground(sidewalk="#d8d4c9", asphalt="#b9bcc0", marking="#f6f4ee")
 GRASS = "#e4e9d9"
@@ -123,18 +123,8 @@ def gallery(results: Results, jobs: Jobs) -> Picture | None:
     shown = [results.figures[k] for k in kept]
     columns = [(figures, name) for figures in shown for name in names]
     titles = [f"K = {figures}\n{plain(name)}" for figures, name in columns]
-    rows = [[JobId(scenario, *column, seed) for column in columns] for scenario in scenarios]
-
-    def picture(job: JobId, _column: int) -> UInt8[np.ndarray, "h w 3"] | None:
-        kept = jobs.get(job)
-        pattern = None if kept is None else kept.pattern()
-        if kept is None or pattern is None:
-            return None
-        canvas = kept.scenario.canvas
-        return np.asarray(on_asphalt(raster(pattern, PICTURE_PX), PICTURE_PX, (canvas.width_m, canvas.length_m)))
-
-    size_in = (1.25 * len(columns) + 0.9, 1.95 * len(rows) + 0.6)
-    figure = _grid(results, rows, titles, [results.home] * len(columns), picture, size_in)
+    rows = [[_pattern(results, jobs, JobId(scenario, *column, seed)) for column in columns] for scenario in scenarios]
+    figure = _grid(scenarios, titles, rows, (1.25 * len(columns) + 0.9, 1.95 * len(rows) + 0.6))
     return figure and Picture(
         "patterns",
         f"The patterns found, as they lie on the road, seed {seed}; the far edge is above. Under each the deviation it "
@@ -143,63 +133,85 @@ def gallery(results: Results, jobs: Jobs) -> Picture | None:
     )
 
 
-def in_weathers(results: Results, jobs: Jobs) -> Picture | None:
-    """What the car's camera sees of the reference method's patterns, a row a scenario and a column each weather."""
-    figures, seed, method = results.figures[-1], results.seeds[0], results.reference.name
-    wanted = [JobId(name, figures, method, seed) for name in examples(results, VIEWS)]
-    seen = {job: [jobs[job].view(weather) for weather in results.weathers] for job in wanted if job in jobs}
-    rows = [[job] * len(views) for job, views in seen.items() if any(view is not None for view in views)]
-    titles = [plain(in_words(weather)) for weather in results.weathers]
-    size_in = (2.6 * len(titles) + 0.4, 2.25 * len(rows) + 0.4)
-    figure = _grid(results, rows, titles, results.weathers, lambda job, column: seen[job][column], size_in)
-    return figure and Picture(
-        "weathers",
-        f"What the car’s camera sees of {method}’s patterns, K = {figures}, seed {seed}, a few metres before them. "
-        "Under each the deviation in that weather, driven alone.",
-        figure,
-    )
+def passages(results: Results, jobs: Jobs) -> list[Picture]:
+    """What the car's camera sees while it passes a pattern, a row a condition and a column a method.
+
+    One scenario of each kind is shown, the one where the reference method's patterns deviate most, at the largest K; a
+    straight one at K = 4 where the study has that, as the paper's supplement shows it.
+    """
+    return [picture for kind in KINDS for picture in _passages(results, jobs, kind)]
+
+
+def _passages(results: Results, jobs: Jobs, kind: str) -> Iterator[Picture]:
+    of_kind = [name for name in examples(results, PANELS) if results.kinds[name] == kind][:1]
+    figures = "4" if kind == "straight" and "4" in results.figures else results.figures[-1]
+    conditions = [(weather, traffic) for traffic in (False, True) for weather in results.weathers]
+    for scenario in of_kind:
+        ids = [JobId(scenario, figures, method, results.seeds[0]) for method in results.compared]
+        rows = {where: [_strip(results, jobs, job, *where) for job in ids] for where in conditions}
+        kept = {where: row for where, row in rows.items() if any(cell.picture is not None for cell in row)}
+        labels = [f"{in_words(weather)}{', traffic' * traffic}" for weather, traffic in kept]
+        titles = list(map(plain, results.compared))
+        figure = _grid(labels, titles, list(kept.values()), (6.4 * len(ids) + 0.5, 1.15 * len(kept) + 0.4))
+        if figure is not None:
+            yield Picture(
+                f"passage-{kind}",
+                f"What the car’s camera sees on {plain(scenario)} as it passes each method’s pattern, K = {figures}, "
+                f"seed {results.seeds[0]}: one drive in each condition, from {HORIZON_M:.0f} m before the canvas to "
+                "its end. Under each the mean deviation of all drives in that condition.",
+                figure,
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cell:
+    """A picture of a grid and what stands under it."""
+
+    picture: UInt8[np.ndarray, "h w 3"] | None
+    note: str
+
+
+def _pattern(results: Results, jobs: Jobs, job: JobId) -> _Cell:
+    kept = jobs.get(job)
+    pattern = None if kept is None else kept.pattern()
+    if kept is None or pattern is None:
+        return _Cell(None, "")
+    canvas = kept.scenario.canvas
+    picture = np.asarray(on_asphalt(raster(pattern, PICTURE_PX), PICTURE_PX, (canvas.width_m, canvas.length_m)))
+    return _Cell(picture, _driven(results, job, results.home, traffic=results.overall[0].traffic))
+
+
+def _strip(results: Results, jobs: Jobs, job: JobId, weather: str, traffic: bool) -> _Cell:
+    kept = jobs.get(job)
+    picture = None if kept is None else kept.passage(weather, traffic=traffic)
+    return _Cell(picture, _driven(results, job, weather, traffic=traffic))
+
+
+def _driven(results: Results, job: JobId, weather: str, *, traffic: bool) -> str:
+    block = replace(results.overall[0], weather=weather, traffic=traffic)
+    reached = results.values(block, job.method, job.figures).get((job.scenario, job.seed))
+    return "not driven" if reached is None else f"{reached:.2f} m"
 
 
 def _grid(
-    results: Results,
-    rows: Sequence[Sequence[JobId]],
-    titles: Sequence[str],
-    weathers: Sequence[str],
-    picture: Callable[[JobId, int], UInt8[np.ndarray, "h w 3"] | None],
-    size_in: tuple[float, float],
+    labels: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[_Cell]], size_in: tuple[float, float]
 ) -> Figure | None:
-    """Pictures of jobs side by side, with the deviation under each; None where there is none.
-
-    Args:
-        results: of the study.
-        rows: jobs, each row of one scenario.
-        titles: over the columns.
-        weathers: of each column's deviations.
-        picture: gives that of a job in a column.
-        size_in: width and height of the whole, inches.
-    """
-    pictures = [[picture(job, column) for column, job in enumerate(row)] for row in rows]
-    if not any(one is not None for row in pictures for one in row):
+    """Pictures side by side, with a label to each row and a title over each column; None where there is none."""
+    if not any(cell.picture is not None for row in rows for cell in row):
         return None
     figure = Figure(figsize=size_in, layout="constrained")
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False)
     for row, column in product(range(len(rows)), range(len(titles))):
-        axes, job, shown = grid[row, column], rows[row][column], pictures[row][column]
+        axes, cell = grid[row, column], rows[row][column]
         axes.set(xticks=[], yticks=[])
         axes.spines[:].set_visible(False)
         if row == 0:
             axes.set_title(titles[column], fontsize=9.5, color=INK)
         if column == 0:
-            axes.set_ylabel(plain(job.scenario), fontsize=9.5, color=INK)
-        if shown is None:
+            axes.set_ylabel(labels[row], fontsize=9.5, color=INK)
+        if cell.picture is None:
             axes.text(0.5, 0.5, "none", ha="center", va="center", color=MUTED, fontsize=9)
             continue
-        axes.imshow(shown)
-        reached = _deviation_m(results, job, weathers[column])
-        axes.set_xlabel("not driven" if reached is None else f"{reached:.2f} m", fontsize=9, color=INK, labelpad=2)
+        axes.imshow(cell.picture)
+        axes.set_xlabel(cell.note, fontsize=9, color=INK, labelpad=2)
     return figure
-
-
-def _deviation_m(results: Results, job: JobId, weather: str) -> float | None:
-    values = results.values(replace(results.overall[0], weather=weather), job.method, job.figures)
-    return values.get((job.scenario, job.seed))

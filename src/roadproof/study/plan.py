@@ -13,15 +13,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
-from roadproof.io.files import read_toml
+from roadproof.io.files import AnyPath, as_path, read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
+from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
-from roadproof.study.methods import MethodPlan, method_plan
-from roadproof.study.reading import build, refuse_untrusted
+from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
+from roadproof.study.reading import build, paint_of, refuse_untrusted
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -97,6 +99,8 @@ class Conditions:
         traffic: cars and people beside those drives; None for drives alone.
         starts: where those drives begin.
         simulator: spec of the simulator (`simulators.loading`).
+        paint: limits on the patterns; None limits nothing.
+        variation: looks over which searches in recordings take the mean; None for paint and camera as recorded.
     """
 
     controller: str
@@ -104,6 +108,8 @@ class Conditions:
     traffic: TrafficPlan | None = None
     starts: StartPlan = StartPlan()
     simulator: str = "town"
+    paint: PaintLimits | None = None
+    variation: Variation | None = None
 
     @property
     def shared(self) -> dict[str, Any]:
@@ -134,8 +140,11 @@ class Job(Conditions):
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
         told = {"job_version": JOB_VERSION, **asdict(self)}
-        if not self.weights:
-            del told["weights"]
+        # Jobs are older than these words.
+        words = [(told, name) for name in ("weights", "paint", "variation")] + [(told["method"], "attack_weathers")]
+        for table, name in words:
+            if not table.get(name):
+                table.pop(name, None)
         content = json.dumps(told, sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
@@ -175,6 +184,7 @@ class Study(Conditions):
             raise StudyError(f"simulator is {self.simulator!r}, expected {SPECS}")
         for seed in self.seeds:
             _check_range("seeds", seed, 0, MAX_SEED)
+        self._check_paint()
         # What is asked for twice would be two jobs that write the same folder.
         named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": [m.name for m in self.methods]}
         for what in ("figures", "seeds", "weathers"):
@@ -185,6 +195,15 @@ class Study(Conditions):
                 raise StudyError(f"{what} has {twice[0]} twice, expected each once")
         if self.reference is not None and self.reference not in named["method"]:
             raise StudyError(f"reference is {self.reference!r}, expected one of {', '.join(named['method'])}")
+
+    def _check_paint(self) -> None:
+        """See that every method can keep to the limits and the variation."""
+        for method in self.methods:
+            driven = isinstance(method, BlackBoxPlan) and method.where == "simulator"
+            if isinstance(method, PublishedPlan) and (self.paint or self.variation):
+                raise StudyError(f"method {method.name} is as published, without [paint] and [variation]; leave it out")
+            if driven and self.variation:
+                raise StudyError(f"method {method.name} drives in the simulator, which varies nothing; leave it out")
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -197,7 +216,7 @@ class Study(Conditions):
         )
 
 
-def load_study(path: Path, *, trust: bool = False) -> Study:
+def load_study(path: AnyPath, *, trust: bool = False) -> Study:
     """Read a study.
 
     Args:
@@ -208,6 +227,7 @@ def load_study(path: Path, *, trust: bool = False) -> Study:
         StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or it is not trusted with
             what it asks for; says which.
     """
+    path = as_path(path)
     content = read_toml(path, StudyError)
     try:
         study = _study(content, path.parent)
@@ -239,6 +259,8 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
         )
     tables = {"traffic": TrafficPlan, "starts": StartPlan}
     built = {name: build(tables[name], content[name], name) for name in tables if isinstance(content.get(name), dict)}
+    named = {name: content[name] for name in ("paint", "variation") if name in content}
+    built |= dict(zip(("paint", "variation"), paint_of(named, "the study"), strict=True))
     stated = build(_Stated, content | built, "the study")
     listed = stated.scenario_file
     own = BUILTIN_FILE if listed is None else folder / listed

@@ -6,12 +6,14 @@ import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from roadproof.compositing import Variation
 from roadproof.controllers.loading import runs_code
 from roadproof.errors import RoadproofError, StudyError
+from roadproof.paint import LaneMark, PaintLimits
 from roadproof.simulators.loading import is_elsewhere
 
 T = TypeVar("T")
@@ -43,6 +45,24 @@ def build(kind: type[T], values: Mapping[str, Any], what: str) -> T:
         if reason.startswith("Invalid enum value"):
             reason = f"expected one of {', '.join(_choices(get_type_hints(kind)[name]))}"
         raise StudyError(f"{what}: {where} is {values[name]!r:.60}, {reason[0].lower()}{reason[1:]}") from None
+
+
+def paint_of(content: Mapping[str, Any], what: str) -> tuple[PaintLimits | None, Variation | None]:
+    """Limits on paint and a variation from the tables [paint] and [variation], each None where it is not there.
+
+    Raises:
+        StudyError: there is another key, or a value makes no sense.
+    """
+    for key, table in content.items():
+        if key not in ("paint", "variation") or not isinstance(table, dict):
+            raise StudyError(f"{what}: {key!r:.60} is no table of it, expected [paint] and [variation]")
+    limits, variation = content.get("paint"), content.get("variation")
+    for mark in cast("list[Mapping[str, Any]]", (limits or {}).get("marks", [])):
+        build(LaneMark, mark, "paint.marks")
+    return (
+        None if limits is None else build(PaintLimits, limits, "paint"),
+        None if variation is None else build(Variation, variation, "variation"),
+    )
 
 
 def refuse_untrusted(controller: str, simulator: str | None) -> None:

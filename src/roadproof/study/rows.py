@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias, TypedDict
 
 from roadproof.datatypes import Event
-from roadproof.driving.evaluation import Trial
+from roadproof.driving.trial import Trial
+from roadproof.paint import Conspicuousness
 from roadproof.study.plan import Job
 
 Frame: TypeAlias = Any
@@ -46,10 +47,20 @@ class DriveColumns(TypedDict, total=False):
     leaderboard: float | None  # the CARLA Leaderboard's factor with paint, 1 where nothing happened
     clean_leaderboard: float | None  # the same without
     first_event_s: float | None  # seconds: when something first went wrong with paint; None where nothing did
-    left_lane: bool  # whether the car left its lane (`driving.evaluation.Trial`)
+    left_lane: bool  # whether the car left its lane (`driving.trial.Trial`)
     ending: str  # why the painted drive ended
     events: str  # of the painted drive, those that count, as JSON: kind, seconds, with what or where
     clean_events: str  # of the clean drive
+
+
+class PaintColumns(TypedDict, total=False):
+    """How conspicuous the pattern of a job is; the same in all its rows, None for what is not known of the road."""
+
+    painted_figures: int  # figures
+    area_m2: float | None  # square metres: the sum of the figures' areas
+    contrast: float | None  # to the asphalt, 0 none, 1 black on white
+    mark_distance_m: float | None  # metres from the nearest lane mark
+    mark_likeness: float | None  # how like a lane mark its most similar figure is, 0 to 1
 
 
 class CostColumns(TypedDict, total=False):
@@ -61,7 +72,7 @@ class CostColumns(TypedDict, total=False):
     seconds: float  # seconds of the whole job; of an evaluation that was interrupted, only of what was left
 
 
-class Row(JobColumns, DriveColumns, CostColumns, total=False):
+class Row(JobColumns, DriveColumns, PaintColumns, CostColumns, total=False):
     """A row of rows.parquet."""
 
     controller: str  # spec of who drove
@@ -114,6 +125,17 @@ def job_columns(job: Job) -> JobColumns:
         "figures": str(job.figures),
         "method": job.method.name,
         "seed": job.seed,
+    }
+
+
+def paint_columns(told: Conspicuousness) -> PaintColumns:
+    """The columns of a job's pattern."""
+    return {
+        "painted_figures": told.figures,
+        "area_m2": told.area_m2,
+        "contrast": told.contrast,
+        "mark_distance_m": told.mark_distance_m,
+        "mark_likeness": told.mark_likeness,
     }
 
 

@@ -26,11 +26,12 @@ from roadproof.calibration import CalibrationReport
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
-from roadproof.driving.deviation import lateral_m
+from roadproof.driving.deviation import lateral_m, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Evaluation, Trial, judge, path_of
+from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.rollout import rollout
+from roadproof.driving.trial import Trial, judge
 from roadproof.errors import RoadproofError
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, compare_with_rendered, rendered_frames

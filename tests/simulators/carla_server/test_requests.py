@@ -4,9 +4,10 @@ import pytest
 
 msgpack = pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from fuzzing import tries
 from roadproof.simulators.carla_server import limits
 from roadproof.simulators.carla_server.requests import NotARequestError, Requests
 
@@ -33,7 +34,7 @@ def taken(pieces):
     return found
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
+@tries(200)
 @given(st.lists(REQUESTS, max_size=5), st.lists(st.integers(1, 40), min_size=1))
 def test_requests_are_the_same_in_whatever_pieces_they_come(sent, sizes):
     data = b"".join(msgpack.packb([0, number, name, [[hurried], *args]]) for number, name, hurried, args in sent)
@@ -49,7 +50,7 @@ def test_requests_are_the_same_in_whatever_pieces_they_come(sent, sizes):
     ]
 
 
-@settings(derandomize=True, max_examples=500, deadline=None)
+@tries(500)
 @given(st.binary(max_size=200))
 def test_any_bytes_are_requests_or_refused_or_waited_for(data):
     requests = Requests()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import queue
-import time
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
@@ -13,6 +12,7 @@ from roadproof.simulators.carla.session import Session, carla
 
 FIRST_TICKS = 100
 FIRST_WAIT_S = 0.5
+LOOK_S = 1.0
 # As far as the server has them: a picture shows one moment.
 STILL = {"motion_blur_intensity": "0.0", "motion_blur_max_distortion": "0.0", "lens_flare_intensity": "0.0"}
 
@@ -77,12 +77,15 @@ class Camera:
         Raises:
             SimulatorError: it does not come in time.
         """
-        until = time.monotonic() + self._session.patience_s
-        while (left := until - time.monotonic()) > 0:
+        left_s = self._session.patience_s
+        while left_s > 0:
+            # In pieces, not until a time: while this process or its machine stood still, nothing could arrive.
+            look_s = min(left_s, LOOK_S)
             try:
-                image = self._arrived.get(timeout=left)
+                image = self._arrived.get(timeout=look_s)
             except queue.Empty:
-                break
+                left_s -= look_s
+                continue
             if image.frame == frame:
                 return image
             if image.frame > frame:

@@ -1,0 +1,249 @@
+"""The cheapest pattern that still takes the car so far aside: the fewest square metres of paint for some metres.
+
+From the strongest patterns found, in the recorded world:
+
+    1. leave out figures, one after another, as long as the deviation stays: each time the one that is missed least;
+    2. lower the limit of the area by a factor, search on from where the search is, and go on while the pattern that
+       comes of it still reaches the deviation; where it does not, try half of the step, some times.
+
+What counts as reached is the least deviation over small errors of steering, so that a drive over it should reach it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.gradopt import Rung, gradopt
+from roadproof.attacks.groups import Group
+from roadproof.attacks.objective import Objective, PathDeviation
+from roadproof.attacks.result import AttackResult, Candidate
+from roadproof.attacks.site import site_of
+from roadproof.controllers import Controller
+from roadproof.errors import RoadproofError
+from roadproof.io.records import RecordFile
+from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
+from roadproof.paint.limits import area_m2
+from roadproof.patterns import Pattern, load_pattern, save_pattern
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import SearchSpace
+
+_LOWER, _SMALLEST_STEP, _MOST_LEVELS = 0.7, 0.9, 14
+_NO_LIMIT_M2 = 1e4
+_RUNGS = (Rung(1, 8, 0.03),)
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One pattern on the way to the cheapest.
+
+    Args:
+        area_m2: the sum of its figures' areas.
+        figures: how many it has.
+        predicted_m: its deviation in the recorded world, the least over small errors of steering.
+    """
+
+    area_m2: float
+    figures: int
+    predicted_m: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Cheapest:
+    """The cheapest pattern that was found for a deviation.
+
+    Args:
+        pattern: the pattern.
+        group: the drives that it was found for.
+        wanted_m: the deviation that it was to reach.
+        predicted_m: the deviation that it is predicted to cause, the least over small errors of steering.
+        conspicuousness: how conspicuous it is.
+        levels: every pattern that still reached it, the strongest first.
+    """
+
+    pattern: Pattern
+    group: str
+    wanted_m: float
+    predicted_m: float
+    conspicuousness: Conspicuousness
+    levels: tuple[Level, ...]
+
+    @property
+    def candidate(self) -> Candidate:
+        """For driving over it."""
+        return Candidate(self.pattern, self.group, 0.0, self.predicted_m)
+
+    def save(self, folder: Path, made_of: object = None) -> None:
+        """Write pattern.json, pattern.png and cheapest.json.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        save_pattern(self.pattern, folder / "pattern.json")
+        FILE.write(folder / "cheapest.json", self, made_of=made_of or {})
+
+    @staticmethod
+    def load(folder: Path) -> Cheapest:
+        """Read what `save` wrote.
+
+        Raises:
+            RoadproofError: a file is missing or damaged.
+        """
+        return FILE.read(folder / "cheapest.json", pattern=load_pattern(folder / "pattern.json"))
+
+
+FILE = RecordFile(
+    kind=Cheapest,
+    name="roadproof-cheapest",
+    error=RoadproofError,
+    remedy="remove it to search again",
+    elsewhere=("pattern",),
+    notes={"kind": "predicted"},
+)
+
+
+def cheapest(
+    recordings: RecordingSet,
+    controller: Controller,
+    found: AttackResult,
+    wanted_m: float,
+    *,
+    groups: Sequence[Group],
+    objective: Objective | None = None,
+    device: torch.device | str = "cpu",
+    on_level: Callable[[int, float], object] = lambda _level, _area_m2: None,
+) -> Cheapest | None:
+    """The fewest square metres of paint that still take a controller so far aside.
+
+    Args:
+        recordings: as the search had them, with canvas and tracks.
+        controller: on `device`.
+        found: what the search found; its limits on paint hold here too.
+        wanted_m: the paper's deviation, metres, above 0.
+        groups: of the search.
+        objective: of the search where it drove in the recorded world; `PathDeviation()` by default.
+        device: where to search.
+        on_level: told after every limit of the area how many there were, and the least area so far.
+
+    Returns:
+        The cheapest pattern; None where the strongest one is not predicted to reach the deviation under all small
+        errors of steering.
+
+    Raises:
+        RoadproofError: the deviation is out of its range.
+        RecordingError: the recordings cannot be driven in.
+        PatternError: the recordings do not say how large the canvas is.
+    """
+    check_wanted(wanted_m)
+    group = next(each for each in groups if str(each) == found.group)
+    goal = objective if isinstance(objective, PathDeviation) else PathDeviation()
+    measure = goal.measure(recordings, controller, [group], device=device)
+    site = site_of(recordings)
+    # Any limit of the area that holds already makes the search know the size of the canvas.
+    area = found.space.limits or PaintLimits()
+    limits = replace(area, max_area_m2=area.max_area_m2 or _NO_LIMIT_M2)
+    space = replace(found.space, limits=limits, site=None).on(site)
+    run = _Run(measure, space, wanted_m, found.seed, space.point(found.pattern)[None, None].to(measure.device))
+    level = run.level()
+    if level.predicted_m < wanted_m:
+        return None
+    levels, factor = [level], _LOWER
+    for number in range(1, _MOST_LEVELS + 1):
+        while (fewer := run.without_a_figure()) is not None:
+            run, level = fewer, fewer.level()
+            levels.append(level)
+        on_level(number, levels[-1].area_m2)
+        lower = run.lowered(levels[-1].area_m2 * factor)
+        level = lower.level()
+        if level.predicted_m >= wanted_m:
+            run = lower
+            levels.append(level)
+        elif factor < _SMALLEST_STEP:
+            factor = factor**0.5
+        else:
+            break
+    pattern = run.pattern
+    return Cheapest(
+        pattern=pattern,
+        group=found.group,
+        wanted_m=wanted_m,
+        predicted_m=levels[-1].predicted_m,
+        conspicuousness=conspicuousness(pattern, run.space.site or site),
+        levels=tuple(levels),
+    )
+
+
+def in_words(found: Cheapest | None, wanted_m: float) -> str:
+    """What came of the search for less paint, as a sentence."""
+    if found is None:
+        return (
+            f"The strongest pattern is not predicted to deviate by {wanted_m:g} m under all small errors of steering, "
+            "so there is none with less paint"
+        )
+    return (
+        f"Least paint that is predicted to deviate by {wanted_m:g} m ({found.predicted_m:.2f} m): "
+        f"{found.conspicuousness.sentence}; the strongest pattern has {found.levels[0].area_m2:.2f} m²"
+    )
+
+
+def check_wanted(wanted_m: float) -> None:
+    """See that a deviation may be asked for.
+
+    Raises:
+        RoadproofError: it may not.
+    """
+    if not 0.0 < wanted_m <= 100.0:
+        raise RoadproofError(f"cheapest is {wanted_m} m, expected metres of deviation above 0, and 100 at most")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """A search space that becomes narrower, and where the search is in it."""
+
+    measure: DeviationMeasure
+    space: SearchSpace
+    wanted_m: float
+    seed: int
+    unit: Float[Tensor, "1 1 k n"]
+
+    @property
+    def pattern(self) -> Pattern:
+        """The pattern here."""
+        here = self.space.pattern(self.unit[0, 0].detach())
+        return Pattern(here.shapes, here.boxes.cpu(), here.colours.cpu())
+
+    def level(self) -> Level:
+        """What it comes to."""
+        site = self.space.site
+        assert site is not None
+        assert site.size_m is not None
+        least = self._least_m(self.space, self.unit)
+        return Level(float(area_m2(self.pattern, site.size_m)), self.space.figures, float(least[0]))
+
+    def without_a_figure(self) -> _Run | None:
+        """The same without the figure that is missed least; None where all are needed."""
+        count = self.space.figures
+        if count == 1:
+            return None
+        rest = torch.tensor([[k for k in range(count) if k != gone] for gone in range(count)])
+        unit, space = self.unit[0, 0][rest][None], replace(self.space, figures=count - 1)
+        least = self._least_m(space, unit)
+        best = int(least.argmax())
+        return replace(self, space=space, unit=unit[:, [best]]) if float(least[best]) >= self.wanted_m else None
+
+    def lowered(self, most_m2: float) -> _Run:
+        """What the search comes to with a lower limit of the area."""
+        assert self.space.limits is not None
+        space = replace(self.space, limits=replace(self.space.limits, max_area_m2=most_m2))
+        search = gradopt(self.measure, space, _RUNGS, seed=self.seed, starts=[self.unit[0].cpu()])
+        return replace(self, space=space, unit=search.best_unit)
+
+    def _least_m(self, space: SearchSpace, unit: Float[Tensor, "1 s k n"]) -> Float[Tensor, " s"]:
+        """The least deviation that each is predicted to cause."""
+        return self.measure.readings(space, unit)[1].amin(-1)[0]

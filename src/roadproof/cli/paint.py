@@ -1,0 +1,145 @@
+"""Options on paint that every searching verb shares: limits, and what the search takes the mean over."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
+
+import typer
+
+from roadproof.cli.options import number, unset
+
+if TYPE_CHECKING:
+    from roadproof.compositing import Variation
+    from roadproof.paint import PaintLimits
+
+GROUP = "Paint that could be real"
+
+
+@dataclass(frozen=True, slots=True)
+class Paint:
+    """What the options say.
+
+    Args:
+        limits: what paint may be; None where nothing is limited.
+        variation: what the search takes the mean over; None for paint and camera as recorded.
+        given: the options as words, to give the same command again.
+    """
+
+    limits: PaintLimits | None
+    variation: Variation | None
+    given: dict[str, Any]
+
+
+def _grouped(option: Any) -> Any:  # noqa: ANN401
+    option.rich_help_panel = GROUP
+    return option
+
+
+_OPTIONS: dict[str, Any] = {
+    "max_area": Annotated[
+        float | None, _grouped(number("Largest area of paint, m².", 0.01, 10_000.0, show_default=False))
+    ],
+    "colours": Annotated[str | None, _grouped(unset("The only paints there are, as #dededa, with commas between."))],
+    "printable": Annotated[bool, _grouped(typer.Option("--printable", help="Only colours that offset print can mix."))],
+    "contrast": Annotated[
+        tuple[float, float] | None, _grouped(unset("Least and most contrast to the asphalt; 0 none, 1 black on white."))
+    ],
+    "keep_out": Annotated[
+        float | None, _grouped(number("Least distance from lane marks, m.", 0.0, 10.0, show_default=False))
+    ],
+    "robust": Annotated[
+        bool,
+        _grouped(typer.Option("--robust", help="Search the mean over camera noise, light, blur, placement and wear.")),
+    ],
+    "paint": Annotated[
+        Path | None, _grouped(unset("TOML file with the same as tables, [paint] and [variation]; options come first."))
+    ],
+}
+
+
+def with_paint(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a verb the options on paint; it takes them as one argument, `paint`, of type `Paint`."""
+    signature = inspect.signature(command)
+    own = {name: hint for name, hint in get_type_hints(command, include_extras=True).items() if name != "paint"}
+    plain = [each for name, each in signature.parameters.items() if name != "paint"]
+    added = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=False if name in ("printable", "robust") else None,
+            annotation=hint,
+        )
+        for name, hint in _OPTIONS.items()
+    ]
+
+    @wraps(command)
+    def called(**values: Any) -> None:  # noqa: ANN401
+        asked = {name: values.pop(name) for name in _OPTIONS}
+        command(**values, paint=_paint(**asked))
+
+    keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=own[each.name]) for each in plain]
+    called.__signature__ = signature.replace(parameters=[*keyword, *added])  # type: ignore[attr-defined]
+    called.__annotations__ = own | _OPTIONS
+    return called
+
+
+def _paint(
+    *,
+    max_area: float | None,
+    colours: str | None,
+    printable: bool,
+    contrast: tuple[float, float] | None,
+    keep_out: float | None,
+    robust: bool,
+    paint: Path | None,
+) -> Paint:
+    """The limits and the variation of the options and the file.
+
+    Raises:
+        RoadproofError: the file is missing or damaged, or a value is out of its range.
+    """
+    given = {
+        "max-area": max_area,
+        "colours": colours,
+        "printable": printable,
+        "contrast": contrast,
+        "keep-out": keep_out,
+        "robust": robust,
+        "paint": paint,
+    }
+    given = {name: value for name, value in given.items() if value is not None and value is not False}
+    if not given:
+        # Torch takes seconds to import; commands without limits read their other options first.
+        return Paint(None, None, {})
+    from roadproof.compositing import Variation
+    from roadproof.errors import PatternError
+    from roadproof.io.files import read_toml
+    from roadproof.paint import PaintLimits
+    from roadproof.study.reading import paint_of
+
+    limits, variation = (None, None) if paint is None else paint_of(read_toml(paint, PatternError), str(paint))
+    said: dict[str, Any] = {
+        "max_area_m2": max_area,
+        "colours": tuple(each.strip() for each in colours.split(",")) if colours else None,
+        "printable": printable or None,
+        "contrast": contrast,
+        "keep_out_m": keep_out,
+    }
+    said = {name: value for name, value in said.items() if value is not None}
+    if said:
+        limits = replace(limits or PaintLimits(), **said)
+    return Paint(limits, variation or (Variation() if robust else None), given)
+
+
+def words(given: dict[str, Any]) -> list[str]:
+    """Options as a command line has them."""
+    told: list[str] = []
+    for name, value in given.items():
+        many = cast("tuple[object, ...]", value if isinstance(value, tuple) else () if value is True else (value,))
+        told += [f"--{name}", *map(str, many)]
+    return told

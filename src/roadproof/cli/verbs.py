@@ -1,0 +1,92 @@
+"""What every verb that works long can be told besides: how loud it is, and to say only what it would take."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+from rich.console import Console
+
+from roadproof.cli.output import say
+from roadproof.cli.progress import Loudness, in_words, is_quiet, speak
+from roadproof.errors import RoadproofError
+from roadproof.io.locks import hold
+
+if TYPE_CHECKING:
+    from roadproof.pipeline.estimate import Estimate
+
+SHORT_S = 180.0
+"""What takes longer is said before it begins."""
+
+_Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but results and errors.")]
+_Verbose = Annotated[bool, typer.Option("--verbose", help="A line for every step.")]
+_DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Only estimate drives, time and disk; nothing is driven or written.")
+]
+_dry_run = False  # one command a process
+
+
+def verb(function: Callable[..., None], *, estimates: bool = False) -> Callable[..., None]:
+    """A verb with --quiet and --verbose, and --dry-run where it calls `begin`.
+
+    Args:
+        function: the verb.
+        estimates: whether it does.
+    """
+
+    @functools.wraps(function)
+    def called(*, quiet: bool, verbose: bool, dry_run: bool = False, **given: Any) -> None:  # noqa: ANN401
+        global _dry_run
+        if quiet and verbose:
+            raise RoadproofError("both --quiet and --verbose are given; choose one")
+        speak(Loudness.QUIET if quiet else Loudness.VERBOSE if verbose else Loudness.USUAL)
+        _dry_run = dry_run
+        try:
+            function(**given)
+        finally:
+            _dry_run = False
+            speak(Loudness.USUAL)
+
+    more: dict[str, Any] = {"quiet": _Quiet, "verbose": _Verbose} | ({"dry_run": _DryRun} if estimates else {})
+    hints = get_type_hints(function, include_extras=True) | more
+    own = inspect.signature(function)
+    parameters = [each.replace(annotation=hints[name]) for name, each in own.parameters.items()]
+    parameters += [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for name, kind in more.items()
+    ]
+    called.__annotations__ = hints
+    called.__dict__["__signature__"] = own.replace(parameters=parameters)
+    return called
+
+
+def is_dry_run() -> bool:
+    """Whether nothing is to be driven or written."""
+    return _dry_run
+
+
+def begin(estimate: Estimate, *folders: Path) -> None:
+    """Work in folders until the command ends, and say what that takes where it takes long; a dry run ends here.
+
+    Args:
+        estimate: of all the work, also of what the folders may hold already.
+        folders: for results.
+
+    Raises:
+        OutputError: a folder cannot be written, or another process works in it.
+    """
+    parts = [f"{estimate.drives} drives"] if estimate.drives else []
+    told = f"{', '.join((*parts, f'about {in_words(estimate.seconds)}', f'{estimate.megabytes:.0f} MB on the disk'))}"
+    if _dry_run:
+        say(f"{told}; less where the folder holds some of it already ({estimate.basis})")
+        raise typer.Exit
+    for folder in folders:
+        hold(folder)
+    if estimate.seconds > SHORT_S and not is_quiet():
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(
+            f"This takes {told}; when it is interrupted, the same command goes on"
+        )

@@ -1,0 +1,180 @@
+"""How the same paint looks from one day to the next: camera, placement and wear, drawn from explicit seeds.
+
+Searches take the mean over some looks. A look is one draw of all that varies; the looks of one draw cover every range
+evenly (a Latin hypercube), and are the same for all patterns, so that patterns are compared under equal conditions.
+
+    seen = clip( blur_β( g ⊙ picture ) + noise ),   g = 2^(e / 2.2) · (1 + w, 1, 1 − w)
+
+on sRGB levels, which go with about the 2.2th root of light; e is the exposure in stops, w the white balance, and blur_β
+mixes a share β = 2 σ² of the picture blurred by (1, 2, 1) / 4, which has the variance σ² of a Gaussian blur. Paint is
+moved and turned about the middle of the canvas as a whole. Wear takes paint in patches of some decimetres: a sum of
+plane waves, above the level which a standard normal number exceeds with the share's probability.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
+
+from roadproof.errors import RoadproofError
+from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.patterns import Pattern
+
+_WAVES, _WAVELENGTH_PX, _SOFT = 12, (12.0, 60.0), 0.15
+_LEAST_WEAR = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Variation:
+    """The ranges that a search takes the mean over; 0 leaves one out.
+
+    Args:
+        noise: standard deviation of the noise of every pixel, as a share of full scale, 0 to 0.2.
+        exposure_stops: exposure, up to so many stops more or less, 0 to 2.
+        white_balance: red gains up to this share while blue loses it, or the other way round, 0 to 0.3.
+        blur_px: standard deviation of the blur, up to so many pixels of the controller's input, 0 to 0.7.
+        shift_m: the paint lies up to so far beside its place, across and along the road each, 0 to 1.
+        turn_deg: it is turned by up to so much either way, 0 to 20.
+        wear: up to this share of the paint is gone, 0 to 0.9.
+        draws: looks that every pattern is shown in at every step, 1 to 64.
+
+    Raises:
+        RoadproofError: a value is out of its range.
+    """
+
+    noise: float = 0.01
+    exposure_stops: float = 0.3
+    white_balance: float = 0.05
+    blur_px: float = 0.5
+    shift_m: float = 0.1
+    turn_deg: float = 2.0
+    wear: float = 0.3
+    draws: int = 4
+
+    def __post_init__(self) -> None:
+        for field, (least, most) in zip(fields(self), _RANGES, strict=True):
+            if not least <= (value := getattr(self, field.name)) <= most:
+                raise RoadproofError(f"variation: {field.name} is {value}, expected {least:g} to {most:g}")
+
+    def draw(self, seed: int, device: torch.device | str = "cpu", count: int | None = None) -> Looks:
+        """Looks of a seed, the same on every device.
+
+        Args:
+            seed: what they are drawn from.
+            device: where they are used.
+            count: how many; `draws` by default.
+        """
+        count = count or self.draws
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.rand(8, count, generator=generator).argsort(1)
+        even = (order + torch.rand(8, count, generator=generator)) / count
+        exposure, white, blur, x, y, turn, wear, _ = even
+        stops, balance = self.exposure_stops * (2 * exposure - 1), self.white_balance * (2 * white - 1)
+        gain = 2 ** (stops[:, None] / 2.2) * torch.stack([1 + balance, torch.ones_like(balance), 1 - balance], 1)
+        low, high = _WAVELENGTH_PX
+        length = low * (high / low) ** torch.rand(count, _WAVES, generator=generator)
+        angle = 2 * math.pi * torch.rand(count, _WAVES, generator=generator)
+        wave = 2 * math.pi / length[..., None] * torch.stack([angle.cos(), angle.sin()], -1)
+        parts = (
+            gain,
+            2 * (self.blur_px * blur).square(),
+            self.shift_m * (2 * torch.stack([x, y], 1) - 1),
+            self.turn_deg * (2 * turn - 1),
+            self.wear * wear,
+            wave,
+            2 * math.pi * torch.rand(count, _WAVES, generator=generator),
+        )
+        return Looks(*(part.to(device) for part in parts), noise=self.noise, seed=seed)
+
+
+_RANGES = ((0, 0.2), (0, 2), (0, 0.3), (0, 0.7), (0, 1), (0, 20), (0, 0.9), (1, 64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """D looks; rows of a batch have them in turn.
+
+    Args:
+        gain: g.
+        blur: β.
+        shift_m: of the paint, right and towards the car.
+        turn_deg: of the paint, clockwise on the picture.
+        wear: share of it that is gone.
+        wave: of the wear, radians a canvas px.
+        phase: of those waves.
+        noise: standard deviation.
+        seed: of the noise.
+    """
+
+    gain: Float[Tensor, "d 3"]
+    blur: Float[Tensor, " d"]
+    shift_m: Float[Tensor, "d 2"]
+    turn_deg: Float[Tensor, " d"]
+    wear: Float[Tensor, " d"]
+    wave: Float[Tensor, "d w 2"]
+    phase: Float[Tensor, "d w"]
+    noise: float
+    seed: int
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.gain)
+
+    def rows(self, count: int) -> Int[Tensor, " r"]:
+        """The look of each row."""
+        return torch.arange(count, device=self.gain.device) % len(self)
+
+    def placed(self, pattern: Pattern, canvas: CanvasPlacement | None) -> Pattern:
+        """A batch of R patterns, each where its look has it; the paper's canvas stands for one that is not known."""
+        canvas = canvas or CanvasPlacement(x_m=0.0, y_m=0.0)
+        which = self.rows(len(pattern.boxes))
+        scale = pattern.boxes.new_tensor([canvas.width_m, canvas.length_m]) / CANVAS_SIZE_PX
+        middle = (CANVAS_SIZE_PX - 1) / 2
+        at = (pattern.boxes[..., :2] - middle) * scale
+        turn = self.turn_deg.to(at)[which][:, None]
+        c, s = torch.cos(torch.deg2rad(turn)), torch.sin(torch.deg2rad(turn))
+        moved = torch.stack([c * at[..., 0] - s * at[..., 1], s * at[..., 0] + c * at[..., 1]], -1)
+        moved = (moved + self.shift_m.to(at)[which][:, None]) / scale + middle
+        turned = pattern.boxes[..., 4] + turn
+        boxes = torch.cat([moved, pattern.boxes[..., 2:4], turned[..., None]], -1)
+        return Pattern(pattern.shapes, boxes, pattern.colours)
+
+    def left(self, centre: Float[Tensor, "#r p 2"], count: int) -> Float[Tensor, "r p"]:
+        """The share of the paint that is left at footprints of R rows."""
+        which = self.rows(count)
+        field = torch.zeros(count, centre.shape[-2], device=centre.device)
+        for k in range(self.wave.shape[1]):
+            wave, phase = self.wave[which, k], self.phase[which, k]
+            field = field + torch.cos((centre * wave[:, None]).sum(-1) + phase[:, None])
+        level = cast("Tensor", torch.special.ndtri(1 - self.wear.clamp_min(_LEAST_WEAR)))[which, None]
+        worn = torch.sigmoid((field * math.sqrt(2 / self.wave.shape[1]) - level) / _SOFT)
+        return torch.where((self.wear > 0)[which, None], 1 - worn, 1.0)
+
+    def seen(self, frames: Float[Tensor, "n 3 h w"], rows: int, step: int = 0) -> Float[Tensor, "n 3 h w"]:
+        """Pictures as the camera of each look takes them.
+
+        Args:
+            frames: N / R pictures of each of R rows, row after row.
+            rows: R.
+            step: of the drive: every step has noise of its own.
+        """
+        which = self.rows(rows).repeat_interleave(len(frames) // rows)
+        shown = frames * self.gain.to(frames)[which][:, :, None, None]
+        if bool((self.blur > 0).any()):
+            kernel = frames.new_tensor([0.25, 0.5, 0.25])
+            soft = pad(shown, (1, 1, 1, 1), mode="replicate")
+            soft = conv2d(soft, kernel.view(1, 1, 1, 3).expand(3, 1, 1, 3), groups=3)
+            soft = conv2d(soft, kernel.view(1, 1, 3, 1).expand(3, 1, 3, 1), groups=3)
+            shown = torch.lerp(shown, soft, self.blur.to(frames)[which][:, None, None, None])
+        if self.noise:
+            # Of one seed on every device; rows of one look have the same noise.
+            generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) % 2**63)
+            each = torch.randn(len(self), *frames.shape[1:], generator=generator).to(frames)
+            shown = shown + self.noise * each[which]
+        return shown.clamp(0.0, 1.0)

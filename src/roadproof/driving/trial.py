@@ -1,0 +1,113 @@
+"""One drive over paint against the same drive without it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadproof.datatypes import Event, Weather
+from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, passage_deviation_m, path_of
+from roadproof.driving.episode import Episode
+from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
+from roadproof.driving.starts import NOMINAL, StartOffset
+from roadproof.errors import EpisodeError
+from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import check_name
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Trial:
+    """One drive over a pattern against the same drive without it. All numbers are of driving, or all predicted.
+
+    Args:
+        pattern: "attack", or "random-N".
+        weather: of both drives.
+        traffic: whether there were other cars and people.
+        seed: of cars and people.
+        clean: file of the drive without paint, in the episodes' folder.
+        painted: file of the drive with it.
+        deviation_m: between them (`driving.deviation`).
+        lateral_m: largest offset from the clean path, left positive.
+        points: infraction points with paint; None where nothing is known of them, as for the next three.
+        clean_points: without.
+        leaderboard: the Leaderboard's factor with paint.
+        clean_leaderboard: without.
+        first_event_s: when something first went wrong; None where nothing did, or nothing is known of it.
+        clean_first_event_s: the same without paint.
+        ending: why the painted drive ended.
+        events: of the painted drive, those that count (`infractions.counted`), so that anyone can count again.
+        clean_events: of the clean one.
+        start: how both drives begin.
+
+    Raises:
+        EpisodeError: the name of an episode's file is not a plain one.
+    """
+
+    pattern: str
+    weather: Weather
+    traffic: bool
+    seed: int
+    clean: str
+    painted: str
+    deviation_m: float
+    lateral_m: float
+    points: float | None
+    clean_points: float | None
+    leaderboard: float | None
+    clean_leaderboard: float | None
+    first_event_s: float | None
+    clean_first_event_s: float | None
+    ending: str
+    events: tuple[Event, ...] = ()
+    clean_events: tuple[Event, ...] = ()
+    start: StartOffset = NOMINAL
+
+    @property
+    def leaves_lane(self) -> bool:
+        """Whether part of the car gets over its lane's edge, or it commits more infractions than without paint."""
+        return abs(self.lateral_m) >= LEAVES_LANE_M or (self.points or 0.0) > (self.clean_points or 0.0)
+
+    def __post_init__(self) -> None:
+        for name in filter(None, (self.clean, self.painted)):  # drives that were not kept have none
+            if not check_name(name, "episode", EpisodeError).endswith(".npz"):
+                raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
+
+
+def judge(
+    clean: Episode,
+    painted: Episode,
+    canvas: CanvasPlacement,
+    *,
+    pattern: str,
+    clean_file: str,
+    painted_file: str,
+    start: StartOffset = NOMINAL,
+) -> Trial:
+    """The trial of two drives that differ in the paint alone.
+
+    Deviation is taken over the instants at which the clean drive has the canvas in view, the largest offset over the
+    whole painted drive.
+    """
+    beside = lateral_m(path_of(clean), path_of(painted))
+    known = not painted.paint.predicted
+    return Trial(
+        pattern=pattern,
+        weather=painted.weather,
+        traffic=painted.cars + painted.pedestrians > 0,
+        seed=painted.seed,
+        clean=clean_file,
+        painted=painted_file,
+        deviation_m=passage_deviation_m(clean, painted, canvas),
+        lateral_m=float(beside[np.abs(beside).argmax()]),
+        points=infraction_points(painted.events) if known else None,
+        clean_points=infraction_points(clean.events) if known else None,
+        leaderboard=leaderboard_factor(painted.events) if known else None,
+        clean_leaderboard=leaderboard_factor(clean.events) if known else None,
+        first_event_s=first_event_s(painted.events),
+        clean_first_event_s=first_event_s(clean.events),
+        ending=str(painted.ending),
+        events=counted(painted.events),
+        clean_events=counted(clean.events),
+        start=start,
+    )

@@ -1,0 +1,143 @@
+"""Limits on paint, as one object: what a search may paint, kept exactly whatever the search.
+
+Limits hold by the way patterns are made (`SearchSpace.pattern`), not by a penalty: every point of the search space
+becomes a pattern that obeys, so no step of any search ever leaves them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.errors import PatternError
+from roadproof.paint.colours import AllowedColours, allowed_colours
+from roadproof.paint.keepout import KeepOut, keep_out
+from roadproof.paint.site import LaneMark, Site, rgb_of
+from roadproof.patterns import Pattern
+
+MOST_M = 10.0
+"""The largest keep-out, metres."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PaintLimits:
+    """What paint may be; a field that is left out limits nothing.
+
+    Args:
+        max_area_m2: the largest sum of the figures' areas; the widths of all figures shrink together.
+        colours: the only paints that there are, as "#d6a83d".
+        printable: whether offset print must be able to mix the paint (`colours.PRINT`).
+        contrast: the least and the most contrast to the asphalt, 0 none, 1 black on white.
+        keep_out_m: the least distance of every figure's edge from the edge of every lane mark.
+        asphalt: the colour of the bare road as paint, as "#5a5a5b"; measured in the recordings by default.
+        marks: the lane marks; those that the recordings carry by default.
+
+    Raises:
+        PatternError: a value is out of its range.
+    """
+
+    max_area_m2: float | None = None
+    colours: tuple[str, ...] = ()
+    printable: bool = False
+    contrast: tuple[float, float] | None = None
+    keep_out_m: float | None = None
+    asphalt: str | None = None
+    marks: tuple[LaneMark, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_area_m2 is not None and not 0.0 < self.max_area_m2 <= 1e4:
+            raise PatternError(f"max_area_m2 is {self.max_area_m2}, expected square metres above 0, and 10,000 at most")
+        if self.keep_out_m is not None and not 0.0 <= self.keep_out_m <= MOST_M:
+            raise PatternError(f"keep_out_m is {self.keep_out_m}, expected 0 to {MOST_M:g} m")
+        if self.contrast is not None and not 0.0 <= self.contrast[0] <= self.contrast[1] - 0.01 <= 0.99:
+            raise PatternError(f"contrast is {self.contrast}, expected 0 ≤ least < most ≤ 1, at least 0.01 apart")
+        for colour in (*self.colours, *([self.asphalt] if self.asphalt else [])):
+            rgb_of(colour)
+
+    def site(self, known: Site) -> Site:
+        """A site with what these limits say of it in place of what is known."""
+        return replace(
+            known,
+            asphalt=rgb_of(self.asphalt) if self.asphalt else known.asphalt,
+            marks=known.marks if self.marks is None else self.marks,
+        )
+
+    def check(self, site: Site, *, albedo: tuple[float, float], black: bool, measured: bool = True) -> None:
+        """See that a site is known well enough, and that the limits leave a pattern there.
+
+        Args:
+            site: the site, as `site` gives it.
+            albedo: the lowest and highest value of a channel.
+            black: whether only black is painted.
+            measured: whether the asphalt must be known by now; before recordings are made it is not.
+
+        Raises:
+            PatternError: something is not known, or no pattern is left; the message says what to do.
+        """
+        if site.size_m is None and (self.max_area_m2 is not None or self.keep_out_m is not None):
+            raise PatternError(
+                "limits in metres need the size of the canvas, which these recordings do not have; give RecordingSet a "
+                "canvas"
+            )
+        if self.keep_out_m is not None and site.marks is None:
+            raise PatternError(
+                "keep_out_m needs the lane marks, which are not known here; give marks in the file of --paint "
+                "(PaintLimits(marks=...)), or record and calibrate again in a simulator with a road map"
+            )
+        if measured and self.contrast is not None and site.asphalt is None:
+            raise PatternError(
+                "contrast needs the colour of the asphalt, which was not measured; give asphalt in the file of --paint "
+                "(PaintLimits(asphalt=...))"
+            )
+        colours, _ = _maps(self, site, albedo)
+        darkest = torch.full((1, 3), albedo[0])
+        if black and float((colours(darkest) - darkest).abs().max()) > 1e-3:
+            raise PatternError("only black paint is searched, but the limits on colour leave no black; let colour vary")
+
+    def applied(self, pattern: Pattern, site: Site, *, albedo: tuple[float, float], max_share: float | None) -> Pattern:
+        """The pattern that obeys, near one that may not; differentiable.
+
+        Args:
+            pattern: one, or a batch.
+            site: that was checked.
+            albedo: of the search space.
+            max_share: the largest share of the canvas that may be painted, besides `max_area_m2`.
+        """
+        colours, clear = _maps(self, site, albedo)
+        boxes = pattern.boxes if clear is None else clear(pattern.boxes)
+        obeying = Pattern(pattern.shapes, boxes, colours(pattern.colours))
+        if self.max_area_m2 is not None and site.size_m is not None:
+            share = self.max_area_m2 / (site.size_m[0] * site.size_m[1])
+            max_share = share if max_share is None else min(share, max_share)
+        return obeying if max_share is None else shrunk(obeying, max_share)
+
+
+@lru_cache(maxsize=32)
+def _maps(limits: PaintLimits, site: Site, albedo: tuple[float, float]) -> tuple[AllowedColours, KeepOut | None]:
+    """What brings colours and boxes to allowed ones."""
+    colours = allowed_colours(
+        albedo=albedo,
+        palette=limits.colours,
+        printable=limits.printable,
+        limit=limits.contrast,
+        asphalt=site.asphalt,
+    )
+    clear = None if limits.keep_out_m is None else keep_out(site, limits.keep_out_m)
+    return colours, clear
+
+
+def shrunk(pattern: Pattern, max_share: float) -> Pattern:
+    """The pattern with all widths in the same ratio, so that its figures sum to a share of the canvas at most."""
+    excess = (pattern.painted_share / max_share * (1 + 1e-6)).clamp_min(1.0)
+    x, y, width, length, rotation_deg = pattern.boxes.unbind(-1)
+    boxes = torch.stack([x, y, width / excess[..., None], length, rotation_deg], -1)
+    return Pattern(pattern.shapes, boxes, pattern.colours)
+
+
+def area_m2(pattern: Pattern, size_m: tuple[float, float]) -> Float[Tensor, "*b"]:
+    """The sum of the figures' areas; what lies over another figure or beyond the canvas counts too."""
+    return pattern.painted_share * (size_m[0] * size_m[1])

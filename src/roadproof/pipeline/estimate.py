@@ -1,0 +1,158 @@
+"""What work will take, before it begins: drives, seconds, disk.
+
+Steps are counted as the work itself counts them. What one costs is measured for the controller, here and now, and
+otherwise the figures below, which were taken on a laptop's two cores: expect a factor of two either way.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+
+import torch
+from torch.nn import Module
+
+from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published
+from roadproof.attacks.gradopt import Rung
+from roadproof.calibration import Method as Calibration
+from roadproof.calibration.published import PAINTS, RUNS
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import steer_of
+from roadproof.controllers.checks import require_usable
+from roadproof.pipeline.budget import Budget
+
+DRIVE_S, CROWDED_S = 2.2, 12.0
+"""A drive of a built-in scenario in the town, alone and among 20 cars and 20 people."""
+
+STRETCH_STEPS = 75
+"""Steps of a drive through recordings."""
+
+COMPOSITING = 1.3
+"""What a frame of a search takes of what the controller alone takes."""
+
+DRIVE_MB, FILM_MB, EPISODE_MB = 1.1, 7.0, 0.1
+"""A recorded drive, or a replay of one; the film and the report; a drive of an evaluation."""
+
+_BATCH, _ROUNDS = 8, 3
+_USUAL, _MEASURED = "from usual costs", "the controller measured here, drives from usual costs"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Estimate:
+    """What work takes.
+
+    Args:
+        drives: of the simulator.
+        seconds: wall time.
+        megabytes: on the disk.
+        basis: what the seconds come from, in words.
+    """
+
+    drives: int = 0
+    seconds: float = 0.0
+    megabytes: float = 0.0
+    basis: str = _USUAL
+
+    def __add__(self, other: Estimate) -> Estimate:
+        return replace(
+            other if self.basis == _USUAL else self,
+            drives=self.drives + other.drives,
+            seconds=self.seconds + other.seconds,
+            megabytes=self.megabytes + other.megabytes,
+        )
+
+    def times(self, count: int, *, at_once: int = 1) -> Estimate:
+        """The same work so many times, so many at once."""
+        seconds = self.seconds * math.ceil(count / at_once)
+        return replace(self, drives=self.drives * count, seconds=seconds, megabytes=self.megabytes * count)
+
+
+RECORDED_DRIVE = Estimate(drives=1, seconds=DRIVE_S, megabytes=DRIVE_MB)
+"""A drive past the bare canvas, or a replay of one, whose pictures are kept."""
+
+
+def frame_seconds(controller: Controller, *, gradients: bool = True) -> float:
+    """What a frame of a search takes: compositing, and the controller, there and back, measured here and now.
+
+    Raises:
+        ControllerError: the controller raises or answers wrongly.
+    """
+    size, weights = (
+        controller.input_size or (88, 200),
+        controller.parameters() if isinstance(controller, Module) else (),
+    )
+    device = next((each.device for each in weights), torch.device("cpu"))
+    require_usable(controller, size=size, device=str(device), drives=False, gradients=gradients)
+    frames = torch.rand(_BATCH, 3, *size, device=device, requires_grad=gradients)
+    speed, command = torch.full((_BATCH,), 7.0, device=device), torch.full((_BATCH,), 2, device=device)
+    took_s = math.inf
+    for _ in range(_ROUNDS):
+        began = time.perf_counter()
+        answer = steer_of(controller, frames, speed, command)
+        if gradients:
+            answer.sum().backward()
+        took_s = min(took_s, time.perf_counter() - began)
+    return COMPOSITING * took_s / _BATCH
+
+
+def of_search(
+    method: Method, objective: Objective, frames: int, controller: Controller, *, groups: int = 2
+) -> Estimate:
+    """A search for patterns.
+
+    Args:
+        method: how is searched.
+        objective: what for; a path is driven step by step.
+        frames: of a group of drives.
+        controller: is measured.
+        groups: searched at once.
+    """
+    steps = STRETCH_STEPS if isinstance(objective, PathDeviation) else frames
+    if isinstance(method, GradOpt):
+        rungs = method.ladder(objective)
+    elif isinstance(method, Published):
+        rungs = method.ladder
+    else:
+        rungs = (Rung(1, method.steps(objective), 1.0),)
+    count = sum(
+        rung.starts * rung.iterations * math.ceil((frames if rung.open_loop else steps) / rung.every) for rung in rungs
+    )
+    seconds = groups * count * frame_seconds(controller, gradients=method.by_gradient)
+    return Estimate(seconds=seconds, megabytes=1.0, basis=_MEASURED)
+
+
+def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Estimate:
+    """Drives in the town, alone and in traffic."""
+    seconds = (alone * DRIVE_S + crowded * CROWDED_S) / processes
+    return Estimate(drives=alone + crowded, seconds=seconds, megabytes=(alone + crowded) * EPISODE_MB)
+
+
+def of_evaluation(
+    weathers: int, starts: int, runs: int, *, random: int = 0, film: bool = True, processes: int = 1
+) -> Estimate:
+    """An evaluation: every clean drive and every painted one, and what is filmed after them."""
+    alone = weathers * (2 * max(starts, 1) + random)
+    crowded = weathers * runs * (3 if random else 2)
+    return of_drives(alone, crowded, processes=processes) + Estimate(
+        seconds=2 * DRIVE_S * film, megabytes=FILM_MB * film
+    )
+
+
+def of_run(budget: Budget, controller: Controller, *, film: bool = True, processes: int = 1) -> Estimate:
+    """A whole stress test of one scenario.
+
+    Args:
+        budget: of it.
+        controller: is measured.
+        film: whether the report's drives are made.
+        processes: drives of the evaluation at once.
+    """
+    count, weathers = budget.trajectories.count, len(budget.recorded_in)
+    replays = RUNS * count + len(PAINTS) if budget.calibration is Calibration.PUBLISHED else 2 * count
+    frames = budget.window.frames * (1 + count // 2) * weathers
+    searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
+    recorded = RECORDED_DRIVE.times(weathers * (count + replays))
+    chosen = of_drives(budget.select + budget.rounds * (1 + budget.select))
+    judged = of_evaluation(len(budget.weathers), budget.starts, budget.runs, film=film, processes=processes)
+    return searched + recorded + chosen + judged

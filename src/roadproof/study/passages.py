@@ -1,0 +1,90 @@
+"""What the car's camera sees while it passes a pattern, once in each of a study's conditions."""
+
+from __future__ import annotations
+
+import io
+from itertools import count, product
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from roadproof.datatypes import Control, Observation
+from roadproof.driving.deviation import passage, path_of
+from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.episode import Episode
+from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.trial import Trial
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+PICTURES = 6
+SIZE_PX = (240, 180)
+HORIZON_M = 14.0
+"""The first picture is taken so far before the canvas, the last at its end."""
+
+
+def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: PatternImage) -> dict[str, bytes]:
+    """Strips of camera pictures as JPEG files, by name: "passage-clear-noon.jpg", "passage-clear-noon-traffic.jpg".
+
+    The first drive over the pattern in each weather, alone and in traffic, is driven again from its controls.
+
+    Args:
+        simulator: an open simulator of the kind that drove.
+        evaluation: the drives that were judged.
+        folder: where its episodes are.
+        paint: the canvas as it was painted.
+
+    Raises:
+        SimulatorError: as `rollout` does.
+    """
+    files: dict[str, bytes] = {}
+    for weather, traffic in product(evaluation.weathers, (False, True)):
+        for trial in evaluation.of(traffic=traffic, weather=weather)[:1]:
+            strip = _strip(simulator, evaluation.scenario, trial, folder, paint)
+            packed = io.BytesIO()
+            Image.fromarray(strip).save(packed, format="JPEG", quality=88)
+            files[file_of(weather, traffic=traffic)] = packed.getvalue()
+    return files
+
+
+def file_of(weather: str, *, traffic: bool) -> str:
+    """The file of a condition's strip."""
+    return f"passage-{weather}{'-traffic' if traffic else ''}.jpg"
+
+
+def _strip(
+    simulator: Simulator, scenario: Scenario, trial: Trial, folder: Path, paint: PatternImage
+) -> UInt8[np.ndarray, "h w 3"]:
+    clean, painted = load_episodes(folder, (trial.clean, trial.painted))
+    steps, taken, numbers = _steps(clean, painted, scenario), list[UInt8[np.ndarray, "h w 3"]](), count()
+
+    def keep(seen: Observation, _: Control | None) -> None:
+        times = steps.count(next(numbers))
+        if times:
+            small = Image.fromarray(seen.shown).resize(SIZE_PX, Image.Resampling.LANCZOS)
+            taken.extend([np.asarray(small)] * times)
+
+    rollout(
+        simulator,
+        replay(painted),
+        trial.start.of(scenario),
+        weather=painted.weather,
+        pattern=paint,
+        cars=painted.cars,
+        pedestrians=painted.pedestrians,
+        seed=painted.seed,
+        full_pictures=frozenset(steps),
+        on_step=keep,
+        until=lambda _: len(taken) == PICTURES,
+    )
+    return np.concatenate(taken, 1)
+
+
+def _steps(clean: Episode, painted: Episode, scenario: Scenario) -> list[int]:
+    """Evenly spread over the clean drive's passage, as far as the painted drive goes."""
+    seen, last = passage(path_of(clean), scenario.canvas, horizon_m=HORIZON_M), len(painted) - 1
+    first, end = min(seen.start, last), min(seen.stop - 1, last)
+    return [round(first + (end - first) * k / (PICTURES - 1)) for k in range(PICTURES)]

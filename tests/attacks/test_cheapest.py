@@ -1,0 +1,92 @@
+"""The fewest square metres of paint for a deviation."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from recorded_drives import VEHICLE, drivable_set
+from roadproof.attacks import Cheapest, GradOpt, PathDeviation, attack, cheapest, site_of
+from roadproof.attacks.cheapest import in_words
+from roadproof.attacks.groups import RIGHT_GROUP
+from roadproof.errors import PatternError, RoadproofError
+from roadproof.paint import PaintLimits, conspicuousness
+from roadproof.recorded.vehicle import Vehicle
+from roadproof.search_space import SearchSpace
+from scenes import recording_set
+
+GOAL = PathDeviation(every=8)
+
+
+class PullsToBrightPaint(torch.nn.Module):
+    input_size = (88, 200)
+
+    def steer(self, frames, speed_mps, command):
+        return 2e-5 * (frames[..., 100:] - frames[..., :100]).sum((1, 2, 3))
+
+    def act(self, frame, speed_mps, command):
+        raise NotImplementedError
+
+
+@pytest.fixture(scope="module")
+def searched():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+        road = drivable_set()
+        method = GradOpt(iterations=6, restarts=1, halving=False)
+        space = SearchSpace(figures=3, limits=PaintLimits(contrast=(0.0, 0.4)))
+        found = attack(road, PullsToBrightPaint(), space, method=method, objective=GOAL, groups=[RIGHT_GROUP])
+        yield road, found
+
+
+@pytest.mark.slow
+def test_less_paint_still_reaches_the_deviation_and_keeps_the_limits(searched, tmp_path):
+    road, found = searched
+    wanted_m = 0.5 * found.predicted_range_m[0]
+    seen = []
+    less = cheapest(
+        road,
+        PullsToBrightPaint(),
+        found,
+        wanted_m,
+        groups=[RIGHT_GROUP],
+        objective=GOAL,
+        on_level=lambda level, area: seen.append(area),
+    )
+    strongest = conspicuousness(found.pattern, site_of(road))
+    told = less.conspicuousness
+    assert told.area_m2 < 0.8 * strongest.area_m2
+    assert less.predicted_m >= wanted_m
+    assert [level.predicted_m >= wanted_m for level in less.levels] == [True] * len(less.levels)
+    assert seen == sorted(seen, reverse=True)
+    # What is told of it is what the recorded world says of its file.
+    less.save(tmp_path)
+    kept = Cheapest.load(tmp_path)
+    measure = GOAL.measure(road, PullsToBrightPaint(), [RIGHT_GROUP], device="cpu")
+    from roadproof.patterns import Pattern
+    from roadproof.recorded.world import UNSURE
+
+    batch = Pattern(kept.pattern.shapes, kept.pattern.boxes[None], kept.pattern.colours[None])
+    again = measure.worlds[0].deviations_m(PullsToBrightPaint(), batch, UNSURE).min()
+    assert again == pytest.approx(less.predicted_m, abs=1e-3)
+    assert kept.levels == less.levels
+    site = site_of(road)
+    far = (kept.pattern.colours.double() - torch.tensor(site.asphalt).double()).norm(dim=-1) / math.sqrt(3)
+    assert float(far.max()) <= 0.4
+    assert "Least paint that is predicted" in in_words(less, wanted_m)
+
+
+def test_a_deviation_that_nothing_reaches_has_no_cheapest_pattern(searched):
+    road, found = searched
+    assert cheapest(road, PullsToBrightPaint(), found, 90.0, groups=[RIGHT_GROUP], objective=GOAL) is None
+    assert "there is none with less paint" in in_words(None, 90.0)
+
+
+def test_deviations_out_of_range_and_canvases_of_unknown_size_are_one_line(searched):
+    road, found = searched
+    with pytest.raises(RoadproofError, match=r"cheapest is 0\.0 m, expected metres"):
+        cheapest(road, PullsToBrightPaint(), found, 0.0, groups=[RIGHT_GROUP])
+    with pytest.raises((PatternError, RoadproofError), match="canvas"):
+        cheapest(recording_set(frames=3), PullsToBrightPaint(), found, 0.5, groups=[RIGHT_GROUP])

@@ -1,0 +1,117 @@
+"""Searches in expectation over what varies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from recorded_drives import VEHICLE, drivable_set
+from roadproof.attacks import GradOpt, PathDeviation, Published, SteeringShift, Surrogate, attack, method_of
+from roadproof.attacks.groups import RIGHT_GROUP
+from roadproof.compositing import Variation
+from roadproof.errors import RoadproofError
+from roadproof.recorded.vehicle import Vehicle
+from roadproof.search_space import SearchSpace
+
+SHORT = GradOpt(iterations=2, restarts=1, halving=False)
+SPACE = SearchSpace(figures=2)
+
+
+class PullsToBrightPaint(torch.nn.Module):
+    input_size = (88, 200)
+
+    def steer(self, frames, speed_mps, command):
+        return 1e-5 * (frames[..., 100:] - frames[..., :100]).sum((1, 2, 3))
+
+    def act(self, frame, speed_mps, command):
+        raise NotImplementedError
+
+
+@pytest.fixture(autouse=True)
+def known_vehicle(monkeypatch):
+    monkeypatch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+
+
+@pytest.fixture(scope="module")
+def road():
+    whole = drivable_set()
+    return replace(whole, recordings=tuple(each.thinned(8) for each in whole.recordings))
+
+
+def units(count=2, groups=1):
+    return SPACE.random((groups, count), torch.Generator().manual_seed(3))
+
+
+@pytest.mark.parametrize("objective", [SteeringShift, lambda **more: PathDeviation(every=16, **more)])
+def test_the_value_is_the_mean_over_looks_and_the_gradient_is_its_own(road, objective):
+    variation = Variation(draws=3)
+    measure = objective(variation=variation).measure(road, PullsToBrightPaint(), [RIGHT_GROUP], device="cpu")
+    measure.redraw(11)
+    unit = units()
+    value, gradient = measure.values_and_gradients(SPACE, unit)
+    torch.testing.assert_close(value, measure.values(SPACE, unit))
+    again, _ = measure.values_and_gradients(SPACE, unit)
+    assert torch.equal(value, again)
+    # One look after another, each as the only one.
+    looks, alone = measure._looks, []
+    for k in range(3):
+        one = {
+            name: getattr(looks, name)[k : k + 1]
+            for name in ("gain", "blur", "shift_m", "turn_deg", "wear", "wave", "phase")
+        }
+        measure._looks = replace(looks, noise=0.0, **one)
+        alone.append(measure.values(SPACE, unit))
+    if not isinstance(measure, Surrogate):
+        measure._looks = replace(looks, noise=0.0)
+        torch.testing.assert_close(measure.values(SPACE, unit), torch.stack(alone).mean(0), atol=1e-5, rtol=1e-3)
+        return
+    # The steering shift of this linear controller is checked against finite differences instead.
+    measure.redraw(11)
+    step = torch.zeros_like(unit)
+    step[0, 0, 0, 1] = 2e-3
+    slope = (measure.values(SPACE, unit + step) - measure.values(SPACE, unit - step))[0, 0] / 4e-3
+    torch.testing.assert_close(slope, gradient[0, 0, 0, 1], rtol=0.1, atol=1e-6)
+
+
+def test_every_step_has_looks_of_its_own_from_the_seed_and_an_interrupted_search_goes_on_to_the_same(road, tmp_path):
+    def once(**options):
+        objective = PathDeviation(every=16, variation=Variation(draws=2))
+        return attack(road, PullsToBrightPaint(), SPACE, method=SHORT, objective=objective, seed=5, **options)
+
+    whole = once()
+
+    def interrupt(step, _):
+        if step == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        once(checkpoint=tmp_path / "search", on_step=interrupt)
+    resumed = once(checkpoint=tmp_path / "search")
+    np.testing.assert_array_equal(resumed.history, whole.history)
+    assert torch.equal(resumed.pattern.boxes, whole.pattern.boxes)
+    assert whole.objective == "path deviation over variations"
+    assert all(check.passed for check in whole.checks if check.name == "deterministic controller")
+
+
+def test_black_boxes_compare_patterns_in_the_same_looks(road):
+    objective = SteeringShift(variation=Variation(draws=2))
+    one, again = (
+        attack(road, PullsToBrightPaint(), SPACE, method=method_of("random", calls=4), objective=objective)
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.history, again.history)
+    plain = attack(road, PullsToBrightPaint(), SPACE, method=method_of("random", calls=4), objective=SteeringShift())
+    assert not np.array_equal(plain.history, one.history)
+
+
+def test_the_published_search_knows_no_variation(road):
+    with pytest.raises(RoadproofError, match="not the steering shift over variations"):
+        attack(road, PullsToBrightPaint(), SPACE, method=Published(), objective=SteeringShift(variation=Variation()))
+
+
+def test_runs_without_variation_are_known_as_before():
+    assert repr(SteeringShift()) == "SteeringShift()"
+    assert "variation" not in repr(PathDeviation())
