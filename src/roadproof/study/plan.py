@@ -141,10 +141,14 @@ class Job(Conditions):
         """What tells this job from every other: a hash of all it depends on."""
         told = {"job_version": JOB_VERSION, **asdict(self)}
         # Jobs are older than these words.
-        words = [(told, name) for name in ("weights", "paint", "variation")] + [(told["method"], "attack_weathers")]
-        for table, name in words:
-            if not table.get(name):
-                table.pop(name, None)
+        tables: list[tuple[dict[str, Any], tuple[str, ...]]] = [
+            (told, ("weights", "paint", "variation")),
+            (told["method"], ("attack_weathers",)),
+        ]
+        for table, names in tables:
+            for name in names:
+                if not table.get(name):
+                    table.pop(name, None)
         content = json.dumps(told, sort_keys=True, default=str)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
