@@ -139,13 +139,9 @@ class Job(Conditions):
     @property
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
-        told = {"job_version": JOB_VERSION, **asdict(self)}
+        told: dict[str, Any] = {"job_version": JOB_VERSION, **asdict(self)}
         # Jobs are older than these words.
-        tables: list[tuple[dict[str, Any], tuple[str, ...]]] = [
-            (told, ("weights", "paint", "variation")),
-            (told["method"], ("attack_weathers",)),
-        ]
-        for table, names in tables:
+        for table, names in ((told, ("weights", "paint", "variation")), (told["method"], ("attack_weathers",))):
             for name in names:
                 if not table.get(name):
                     table.pop(name, None)
