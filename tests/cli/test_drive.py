@@ -1,10 +1,10 @@
 """`roadproof drive` as its users call it: film, episode, summary, and one clear line for every mistake."""
 
-import dataclasses
 import os
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +12,11 @@ import torch
 from PIL import Image
 
 import needs
+from paint_shy import along_a_street
 from roadproof.coverage import Shape
 from roadproof.driving.episode import Episode
 from roadproof.patterns import Pattern, save_pattern
-from roadproof.scenarios import find_scenario, save_scenarios
+from roadproof.scenarios import save_scenarios
 
 needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
@@ -47,10 +48,8 @@ CONTROLLERS = textwrap.dedent(
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("workplace")
     (folder / "own_drivers.py").write_text(CONTROLLERS)
-    left = find_scenario("left-03")
-    # As far as the canvas, so that the paint is in view at once.
-    short = dataclasses.replace(left, name="short", time_limit_s=0.4)
-    save_scenarios([short, dataclasses.replace(left, name="longer", time_limit_s=2.0)], folder / "own.toml")
+    short, longer = along_a_street(folder, 0.4), along_a_street(folder, 2.0)
+    save_scenarios([replace(short, name="short"), replace(longer, name="longer")], folder / "own.toml")
     pattern = Pattern(
         (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]])
     )

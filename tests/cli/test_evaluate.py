@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 import needs
-from paint_shy import just_before_the_canvas
+from paint_shy import along_a_street
 from roadproof.coverage import Shape
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import Pattern, save_pattern
@@ -26,7 +26,7 @@ ONE_DRIVE = ["--weathers", "clear-noon", "--starts", "0", "--runs", "0", "--cont
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("workplace")
-    save_scenarios([just_before_the_canvas(1.5)], folder / "own.toml")
+    save_scenarios([along_a_street(folder, 1.5)], folder / "own.toml")
     pattern = Pattern(
         (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]])
     )
@@ -53,7 +53,7 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
         "--scenarios",
         "own.toml",
         "--scenario",
-        "short",
+        "street",
         "--quiet",
         *ONE_DRIVE,
         "--out",

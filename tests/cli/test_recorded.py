@@ -23,7 +23,7 @@ BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
-    recordings = drivable_set()
+    recordings = drivable_set(speed_mps=12.0)
     folder = tmp_path_factory.mktemp("workplace")
     save_recordings(recordings, folder / "run" / "recordings")
     save_recordings(dataclasses.replace(recordings, canvas=None), folder / "nowhere-known")
@@ -43,9 +43,8 @@ def call(workplace, *words):
     )
 
 
-@pytest.mark.parametrize("folder", ["run", "run/recordings"])
-def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path, folder):
-    options = ["--simulator", f"recorded:{folder}", "--controller", "paint_shy:paint_shy", "--no-film", "--quiet"]
+def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path):
+    options = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--no-film", "--quiet"]
     done = call(workplace, "evaluate", "pattern.json", *options, "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
@@ -56,8 +55,16 @@ def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path, folder):
 
 
 def test_the_command_drives_in_recordings_and_films_it(workplace, tmp_path):
+    """Given their own folder, and not the run's."""
     av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
-    options = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--pattern", "pattern.json"]
+    options = [
+        "--simulator",
+        "recorded:run/recordings",
+        "--controller",
+        "paint_shy:paint_shy",
+        "--pattern",
+        "pattern.json",
+    ]
     done = call(workplace, "drive", *options, "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert "predicted: nothing was driven for real, and infractions are not known" in done.stdout
