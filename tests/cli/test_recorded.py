@@ -1,24 +1,19 @@
 """The commands that drive in recordings, as their users call them."""
 
 import dataclasses
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-import torch
 
+from paint_shy import magenta
 from recorded_drives import drivable_set
-from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
-from roadproof.patterns import Pattern, save_pattern
+from roadproof.patterns import save_pattern
 from roadproof.recordings import save_recordings
+from support.command import roadproof
 
-TESTS = Path(__file__).parents[1]
-BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+BAR = magenta(300.0)
 
 
 @pytest.fixture(scope="module")
@@ -31,21 +26,9 @@ def workplace(tmp_path_factory):
     return folder
 
 
-def call(workplace, *words):
-    """In a process of its own where nothing checks types, as the installed command has it."""
-    return subprocess.run(
-        [sys.executable, "-c", "from roadproof.cli import main; main()", *words],
-        cwd=workplace,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)])},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path):
     options = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--no-film", "--quiet"]
-    done = call(workplace, "evaluate", "pattern.json", *options, "--out", str(tmp_path))
+    done = roadproof("evaluate", "pattern.json", *options, "--out", tmp_path, folder=workplace)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     for words in ("nothing was driven for real", "predicted", "not known", "10 predicted drives", "paint composited"):
@@ -65,7 +48,7 @@ def test_the_command_drives_in_recordings_and_films_it(workplace, tmp_path):
         "--pattern",
         "pattern.json",
     ]
-    done = call(workplace, "drive", *options, "--out", str(tmp_path))
+    done = roadproof("drive", *options, "--out", tmp_path, folder=workplace)
     assert done.returncode == 0, done.stderr
     assert "predicted: nothing was driven for real, and infractions are not known" in done.stdout
     with av.open(str(tmp_path / "drive.mp4")) as film:
