@@ -13,6 +13,7 @@ import time
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.scenarios import Scenario
+from support.command import PROGRAM
 
 START_S = 300.0
 CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
@@ -74,7 +75,7 @@ def interruptible():
 
 
 @contextlib.contextmanager
-def serving(*arguments, program="from roadproof.cli import main; main()"):
+def serving(*arguments, program=PROGRAM):
     """Serve; yields the process and its port, once it answers."""
     command = [sys.executable, "-c", program, "carla", "serve", "--port", "0", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

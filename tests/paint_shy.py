@@ -5,9 +5,17 @@ import dataclasses
 import torch
 
 from carla_serving import straight_map
+from roadproof.coverage import Shape
 from roadproof.datatypes import Control, VehicleState
 from roadproof.geometry import CanvasPlacement
+from roadproof.patterns import Pattern
 from roadproof.scenarios import Scenario, find_scenario
+
+
+def magenta(size_px):
+    """One square in the middle of the canvas, of what `PaintShy` flees from."""
+    box = torch.tensor([[200.0, 200.0, size_px, size_px, 0.0]])
+    return Pattern((Shape.RECTANGLE,), box, torch.tensor([[1.0, 0.0, 1.0]]))
 
 
 class PaintShy:

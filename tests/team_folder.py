@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from paint_shy import PaintShy
+from paint_shy import PaintShy, magenta
 from recorded_drives import CANVAS, drivable_set, track
-from roadproof.coverage import Shape
 from roadproof.datatypes import Ending, VehicleState, Weather
 from roadproof.drives import Drive, Swerve, Trajectories, Window
 from roadproof.drives.folder import Settings, write_drive, write_settings
@@ -16,7 +15,7 @@ from roadproof.recordings import Push, save_recordings
 from roadproof.scenarios import Scenario, save_scenarios
 
 SPEED_MPS = 12.0
-BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+BAR = magenta(300.0)
 GREEN = Pattern(BAR.shapes, BAR.boxes, torch.tensor([[0.0, 0.5, 0.0]]))
 
 PLAN = """

@@ -24,10 +24,12 @@ VEHICLE = dataclasses.replace(
 )
 
 
-@pytest.fixture(autouse=True)
-def known_vehicle(monkeypatch):
+@pytest.fixture(scope="module", autouse=True)
+def known_vehicle():
     """The straight drives of the set say nothing of the steering."""
-    monkeypatch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +41,14 @@ def search(road, **options):
     return attack(road, RampFollower(), SPACE, **{"objective": PathDeviation(), "method": SHORT, **options})
 
 
-def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, tmp_path):
-    result = search(road)
+@pytest.fixture(scope="module")
+def whole(road):
+    """What a search finds that is not interrupted."""
+    return search(road)
+
+
+def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, whole, tmp_path):
+    result = whole
     world = RecordedWorld(road)
     world.fit(RampFollower())
     by_chance = SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9)))
@@ -82,14 +90,12 @@ def test_a_search_drives_in_every_weather_that_was_recorded(road):
         RecordedWorld(both)
 
 
-def test_a_search_doubts_a_controller_that_was_not_recorded(road):
+def test_a_search_doubts_a_controller_that_was_not_recorded(road, whole):
     class Stray(RampFollower):
         def steer(self, frames, speed_mps, command):
             return super().steer(frames, speed_mps, command) + 0.15
 
-    found = {
-        check.name: check for check in search(road, method=GradOpt(iterations=1, restarts=1, halving=False)).checks
-    }
+    found = {check.name: check for check in whole.checks}
     assert found["keeps to the recorded road without paint"].passed
     method = GradOpt(iterations=1, restarts=1, halving=False)
     stray = attack(road, Stray(), SPACE, objective=PathDeviation(), method=method)
@@ -98,8 +104,8 @@ def test_a_search_doubts_a_controller_that_was_not_recorded(road):
     assert "record with it" in doubt.advice
 
 
-def test_the_same_seed_finds_the_same_and_an_interrupted_search_goes_on_to_it(road, tmp_path):
-    whole, stopped = search(road), tmp_path / "search.safetensors"
+def test_the_same_seed_finds_the_same_and_an_interrupted_search_goes_on_to_it(road, whole, tmp_path):
+    stopped = tmp_path / "search.safetensors"
 
     def interrupt(step, _):
         if step == 5:

@@ -35,7 +35,7 @@ def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch
     pytest.importorskip("av", reason="av is not installed")
     monkeypatch.setitem(BUDGETS, "quick", TINY)
     file, out = tmp_path / "scenarios.toml", tmp_path / "run"
-    save_scenarios([along_a_street(tmp_path, 3.2)], file)
+    save_scenarios([along_a_street(tmp_path, 2.5)], file)
     for _ in range(2):  # the second finds all done
         code, printed = demo(
             "--scenarios", file, "--scenario", "street", "--figures", 1, "--processes", 2, "--out", out

@@ -1,50 +1,28 @@
 """`roadproof evaluate` and `roadproof report` as their users call them."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
-import torch
 from PIL import Image
 
 import needs
-from paint_shy import just_before_the_canvas
-from roadproof.coverage import Shape
+from paint_shy import along_a_street, magenta
 from roadproof.driving.evaluation import Evaluation
-from roadproof.patterns import Pattern, save_pattern
+from roadproof.patterns import save_pattern
 from roadproof.scenarios import save_scenarios
+from support.command import roadproof
 
 needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
 
-TESTS = Path(__file__).parents[1]
 ONE_DRIVE = ["--weathers", "clear-noon", "--starts", "0", "--runs", "0", "--controller", "paint_shy:paint_shy"]
 
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("workplace")
-    save_scenarios([just_before_the_canvas(1.5)], folder / "own.toml")
-    pattern = Pattern(
-        (Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]])
-    )
-    save_pattern(pattern, folder / "pattern.json")
+    save_scenarios([along_a_street(folder, 1.5)], folder / "own.toml")
+    save_pattern(magenta(300.0), folder / "pattern.json")
     Image.new("RGBA", (400, 400), (255, 0, 255, 255)).save(folder / "magenta.png")
     return folder
-
-
-def call(workplace, *options):
-    """In a process of its own where nothing checks types, as the installed command has it."""
-    return subprocess.run(
-        [sys.executable, "-c", "from roadproof.cli import main; main()", *options],
-        cwd=workplace,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)])},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
 
 
 def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path):
@@ -53,13 +31,13 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
         "--scenarios",
         "own.toml",
         "--scenario",
-        "short",
+        "street",
         "--quiet",
         *ONE_DRIVE,
         "--out",
         str(run / "evaluation"),
     ]
-    done = call(workplace, "evaluate", "pattern.json", *options)
+    done = roadproof("evaluate", "pattern.json", *options, folder=workplace)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     evaluation = Evaluation.load(run / "evaluation")
@@ -71,14 +49,14 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
         frames = sum(1 for _ in film.decode(video=0))
     assert frames == 31, "one for each observation"
 
-    said = call(workplace, "report", str(run))
+    said = roadproof("report", run)
     assert said.returncode == 0, said.stderr
     assert "paint_shy:paint_shy" in said.stdout
     page = (run / "report.html").read_text()
     assert "data:video/mp4;base64," in page
     assert f"{abs(trial.lateral_m):.2f} m to the right" in page
 
-    again = call(workplace, "evaluate", "pattern.json", *options, "--no-film")
+    again = roadproof("evaluate", "pattern.json", *options, "--no-film", folder=workplace)
     assert again.returncode == 0
     assert Evaluation.load(run / "evaluation").trials == evaluation.trials
 

@@ -1,9 +1,6 @@
 """The commands with controllers that do everything wrong: one line, before anything is driven."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import pytest
 
@@ -12,6 +9,7 @@ import needs
 from recorded_drives import drivable_set
 from roadproof.recordings import save_recordings
 from roadproof.scenarios import find_scenario, save_scenarios
+from support.command import roadproof
 
 
 @pytest.fixture(scope="module")
@@ -103,24 +101,14 @@ def test_debug_shows_the_whole_traceback(here, invoke):
     assert printed.err.splitlines()[-1].startswith("roadproof: bad_drivers:fails raised ZeroDivisionError at ")
 
 
-def roadproof(folder, before, *words):
-    """The command in a process of its own, where nothing checks types, after `before`."""
-    code = f"from roadproof import foreign; {before}; from roadproof.cli import main\nif __name__ == '__main__': main()"
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, words)],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+HASTY = "from roadproof import cli, foreign; foreign.NOTICE_S = 0.3; cli.LIMIT_S = 1.0"
 
 
 @pytest.mark.parametrize(("name", "how"), [("Hanging", "was ended"), ("Deaf", "; ended")])
 def test_an_act_that_hangs_is_told_and_ended(workplace, tmp_path, name, how):
-    hasty = "import roadproof.cli as c; foreign.NOTICE_S = 0.3; foreign.GRACE_S = 0.5; c.LIMIT_S = 1.0"
+    hasty = f"{HASTY}; foreign.GRACE_S = 0.5"
     given = ["--simulator", "recorded:set", "--controller", f"bad_drivers:{name}", "--out", tmp_path / "out"]
-    done = roadproof(workplace, hasty, "drive", *given)
+    done = roadproof("drive", *given, folder=workplace, before=hasty)
     assert done.returncode == 2, done.stderr
     told = done.stderr.splitlines()
     assert told[0].startswith("the controller's act has not answered for ")
@@ -132,8 +120,7 @@ def test_an_act_that_hangs_is_told_and_ended(workplace, tmp_path, name, how):
 
 def test_an_import_that_hangs_is_told_and_ended(tmp_path):
     (tmp_path / "own_endless.py").write_text("import time\nwhile True:\n    time.sleep(0.01)\n")
-    hasty = "import roadproof.cli as c; foreign.NOTICE_S = 0.3; c.LIMIT_S = 1.0"
-    done = roadproof(tmp_path, hasty, "check-controller", "own_endless:make")
+    done = roadproof("check-controller", "own_endless:make", folder=tmp_path, before=HASTY)
     assert done.returncode == 2, done.stderr
     assert "the import of own_endless has not answered" in done.stderr
     assert "own_endless.py:3" in done.stderr

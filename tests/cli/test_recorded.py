@@ -1,29 +1,24 @@
 """The commands that drive in recordings, as their users call them."""
 
 import dataclasses
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-import torch
 
+from paint_shy import magenta
 from recorded_drives import drivable_set
-from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
-from roadproof.patterns import Pattern, save_pattern
+from roadproof.patterns import save_pattern
 from roadproof.recordings import save_recordings
+from support.command import roadproof
 
-TESTS = Path(__file__).parents[1]
-BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+BAR = magenta(300.0)
 
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
-    recordings = drivable_set()
+    recordings = drivable_set(speed_mps=12.0)
     folder = tmp_path_factory.mktemp("workplace")
     save_recordings(recordings, folder / "run" / "recordings")
     save_recordings(dataclasses.replace(recordings, canvas=None), folder / "nowhere-known")
@@ -31,22 +26,9 @@ def workplace(tmp_path_factory):
     return folder
 
 
-def call(workplace, *words):
-    """In a process of its own where nothing checks types, as the installed command has it."""
-    return subprocess.run(
-        [sys.executable, "-c", "from roadproof.cli import main; main()", *words],
-        cwd=workplace,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(TESTS)])},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
-@pytest.mark.parametrize("folder", ["run", "run/recordings"])
-def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path, folder):
-    options = ["--simulator", f"recorded:{folder}", "--controller", "paint_shy:paint_shy", "--no-film", "--quiet"]
-    done = call(workplace, "evaluate", "pattern.json", *options, "--out", str(tmp_path))
+def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path):
+    options = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--no-film", "--quiet"]
+    done = roadproof("evaluate", "pattern.json", *options, "--out", tmp_path, folder=workplace)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     for words in ("nothing was driven for real", "predicted", "not known", "10 predicted drives", "paint composited"):
@@ -56,9 +38,17 @@ def test_the_command_evaluates_in_a_set_alone(workplace, tmp_path, folder):
 
 
 def test_the_command_drives_in_recordings_and_films_it(workplace, tmp_path):
+    """Given their own folder, and not the run's."""
     av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
-    options = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--pattern", "pattern.json"]
-    done = call(workplace, "drive", *options, "--out", str(tmp_path))
+    options = [
+        "--simulator",
+        "recorded:run/recordings",
+        "--controller",
+        "paint_shy:paint_shy",
+        "--pattern",
+        "pattern.json",
+    ]
+    done = roadproof("drive", *options, "--out", tmp_path, folder=workplace)
     assert done.returncode == 0, done.stderr
     assert "predicted: nothing was driven for real, and infractions are not known" in done.stdout
     with av.open(str(tmp_path / "drive.mp4")) as film:

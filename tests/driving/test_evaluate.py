@@ -10,8 +10,7 @@ import torch
 
 import bad_drivers
 import needs
-from paint_shy import PaintShy, along_a_street
-from roadproof.coverage import Shape
+from paint_shy import PaintShy, along_a_street, magenta
 from roadproof.datatypes import Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
@@ -28,7 +27,7 @@ from roadproof.scenarios import identity
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
 
-MAGENTA = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+MAGENTA = magenta(380.0)
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON)
 CONDITIONS = {"weathers": WEATHERS, "starts": 0, "runs": 2, "cars": 2, "pedestrians": 2, "seed": 3}
 

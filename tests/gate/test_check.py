@@ -19,16 +19,9 @@ from roadproof.gate.check import architecture_of, run_check
 from roadproof.gate.plan import load_check
 from roadproof.gate.result import CHECK_FILE
 from roadproof.gate.verdict import Kind, Status
-from team_folder import PLAN, MagentaShy, magenta_shy, write_team
+from team_folder import PLAN, MagentaShy, magenta_shy
 
 CHANGE = '[change]\nreference = "reference"\ndeviation_m = { absolute = 0.1, relative = 0.2 }\n'
-
-
-@pytest.fixture(scope="module")
-def team(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("team")
-    write_team(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,7 @@ from roadproof.errors import CheckError
 from roadproof.gate.plan import load_check
 from roadproof.gate.verdict import Kind
 from roadproof.patterns import save_pattern
-from team_folder import BAR, PLAN, write_team
-
-
-@pytest.fixture(scope="module")
-def team(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("team")
-    write_team(folder)
-    return folder
-
+from team_folder import BAR, PLAN
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "check" / "check.toml"
 

@@ -4,21 +4,18 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 
 import needs
-from paint_shy import along_a_street
+from paint_shy import along_a_street, magenta
 
 needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
-from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
-from roadproof.patterns import Pattern
 from roadproof.pipeline.film import EVENT_SHOWN_S, film_trial, last_event
 
-PATTERN = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 380.0, 380.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+PATTERN = magenta(380.0)
 
 
 def stops_for_good(_):

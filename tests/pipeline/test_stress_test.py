@@ -32,7 +32,7 @@ TINY = Budget(
 
 
 def run(town, folder, **options):
-    scenario = along_a_street(folder.parent, 3.2)
+    scenario = along_a_street(folder.parent, 2.5)
     options = {"budget": TINY, "space": SearchSpace(figures=1), "controller_name": "pilotnet"} | options
     return stress_test(town, load_controller("pilotnet"), scenario, folder, **options)
 

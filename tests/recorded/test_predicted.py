@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from paint_shy import PaintShy
+from paint_shy import PaintShy, magenta
 from recorded_drives import drivable_set
 from roadproof.attacks import Candidate
-from roadproof.coverage import Shape
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
-from roadproof.patterns import Pattern, raster
+from roadproof.patterns import raster
 from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recorded.simulator import RecordedSimulator
@@ -24,7 +23,7 @@ from roadproof.scenarios import find_scenario
 from roadproof.simulators.protocol import PaintKind
 from runs import driven
 
-BAR = Pattern((Shape.RECTANGLE,), torch.tensor([[200.0, 200.0, 300.0, 300.0, 0.0]]), torch.tensor([[1.0, 0, 1]]))
+BAR = magenta(300.0)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ remember, and beartype alone checks its types in a fraction of the time.
 
 import dataclasses
 import inspect
-import re
 from typing import get_args
 
 import jaxtyping
@@ -25,30 +24,30 @@ def install():
 
 def _checked(*, typechecker):
     def check(found):
-        if inspect.isfunction(found) and not _names_a_shape(found):
-            return _types_alone(found, typechecker)
-        if dataclasses.is_dataclass(found) and "__init__" in vars(found) and not _names_a_shape(found.__init__):
-            found.__init__ = _types_alone(found.__init__, typechecker)
+        if inspect.isfunction(found):
+            return _checked_function(found, typechecker)
+        if dataclasses.is_dataclass(found) and "__init__" in vars(found):
+            found.__init__ = _checked_function(found.__init__, typechecker)
             return found
         return _with_shapes(found, typechecker=typechecker)
 
     return check
 
 
-def _types_alone(function, typechecker):
+def _checked_function(function, typechecker):
+    # A class is not there yet while its methods are made.
+    itself = dict.fromkeys(function.__qualname__.split(".")[:-1], object)
     try:
-        return beartype(function)
-    except BeartypeDecorHintException:
-        # An annotation that only type checkers understand: jaxtyping checks the others.
-        return _with_shapes(function, typechecker=typechecker)
+        hints = inspect.get_annotations(function, locals=itself, eval_str=True)
+        if not any(map(_is_shape, hints.values())):
+            return beartype(function)
+    except (NameError, AttributeError, TypeError, BeartypeDecorHintException):
+        # A name that only type checkers see: jaxtyping leaves it out, and checks the others.
+        pass
+    return _with_shapes(function, typechecker=typechecker)
 
 
-def _names_a_shape(function):
-    words = re.findall(r"\w+", " ".join(map(str, inspect.get_annotations(function).values())))
-    return any(_is_shape(function.__globals__.get(word)) for word in words)
-
-
-def _is_shape(found):
-    if isinstance(found, type) and issubclass(found, jaxtyping.AbstractArray | jaxtyping.AbstractDtype):
+def _is_shape(hint):
+    if isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray):
         return True
-    return any(_is_shape(each) for each in get_args(found))
+    return any(map(_is_shape, get_args(hint)))

@@ -1,14 +1,8 @@
-"""A small map, and `roadproof carla serve` over it in a process of its own, for the tests of a module."""
+"""`roadproof carla serve` over a small map in a process of its own, for the tests of a module."""
 
 import pytest
 
-from carla_serving import serving, straight_map
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    """The map's file."""
-    return straight_map(tmp_path_factory.mktemp("maps"))
+from carla_serving import serving
 
 
 @pytest.fixture(scope="module")

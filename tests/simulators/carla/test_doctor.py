@@ -1,14 +1,13 @@
 """The doctor and the scenario maker against `roadproof carla serve`."""
 
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 import needs
 from carla_serving import CAMERA, INPUT, free_port, serving
+from support.command import roadproof
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
@@ -73,11 +72,8 @@ def test_nobody_there_is_one_finding():
 
 def test_the_command_writes_a_scenario_between_two_spawn_points(port, tmp_path):
     out = tmp_path / "carla.toml"
-    command = [sys.executable, "-c", "from roadproof.cli import main; main()", "carla", "scenario"]
     for numbers, code in ((("0", "5"), 0), (("0", "6"), 0), (("0", "99"), 2)):
-        told = subprocess.run(
-            [*command, *numbers, "--port", str(port), "--out", str(out)], capture_output=True, text=True
-        )
+        told = roadproof("carla", "scenario", *numbers, "--port", port, "--out", out)
         assert told.returncode == code, told.stderr
     assert "street has no spawn point 99, expected 0 to 19" in told.stderr
     assert [(made.name, made.kind, made.map_name) for made in load_scenarios(out)] == [

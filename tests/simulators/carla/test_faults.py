@@ -16,6 +16,7 @@ import pytest
 import needs
 from carla_serving import SMALL, SMALL_INPUT, serving
 from carla_serving import STREET as WHOLE_STREET
+from support.command import PROGRAM
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
@@ -37,7 +38,6 @@ STREET = dataclasses.replace(
 )
 AHEAD = Control(0.0, throttle=0.6)
 PATIENCE_S = 3.0
-MAIN = "from roadproof.cli import main; main()"
 
 
 def small(port):
@@ -125,7 +125,7 @@ def test_a_command_whose_server_dies_ends_with_one_line_and_leaves_no_process(st
     with serving("--map", street) as (process, port):
         options = ["--scenarios", "street.toml", "--scenario", "street", "--simulator", f"carla://127.0.0.1:{port}"]
         with subprocess.Popen(
-            [sys.executable, "-c", MAIN, "drive", *options],
+            [sys.executable, "-c", PROGRAM, "drive", *options],
             cwd=tmp_path,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -4,8 +4,6 @@ import contextlib
 import dataclasses
 import os
 import signal
-import subprocess
-import sys
 import textwrap
 import time
 
@@ -27,6 +25,7 @@ from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
+from support.command import roadproof
 
 AHEAD = Control(0.0, throttle=0.6)
 
@@ -239,8 +238,7 @@ def test_a_server_of_another_version_is_refused(street):
     ids=lambda words: " ".join(words[:2]),
 )
 def test_without_the_client_one_line_names_the_extra(words):
-    program = "import sys; sys.modules['carla'] = None\nfrom roadproof.cli import main; main()"
-    told = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True)
+    told = roadproof(*words, before="import sys; sys.modules['carla'] = None")
     assert told.returncode == 2
     assert told.stderr.count("\n") == 1
     assert "pip install 'roadproof[carla]'" in told.stderr

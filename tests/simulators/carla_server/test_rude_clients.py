@@ -14,7 +14,8 @@ import time
 import pytest
 
 import needs
-from carla_serving import interruptible, serving, straight_map
+from carla_serving import interruptible, serving
+from support.command import PROGRAM, roadproof
 
 needs.town()
 msgpack = pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
@@ -32,11 +33,6 @@ from roadproof.cli import main
 main()
 """
 """A server that loses patience soon."""
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    return straight_map(tmp_path_factory.mktemp("maps"))
 
 
 @pytest.fixture(scope="module")
@@ -577,7 +573,7 @@ def test_a_signal_ends_it_in_one_line_with_clients_there(street, number):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_the_town_is_built_ends_it_too(number):
-    command = [sys.executable, "-c", "from roadproof.cli import main; main()", "carla", "serve", "--port", "0"]
+    command = [sys.executable, "-c", PROGRAM, "carla", "serve", "--port", "0"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with subprocess.Popen(command, preexec_fn=interruptible, **pipes) as process:
         assert process.stdout.readline().startswith(b"Building town")
@@ -591,17 +587,14 @@ def test_a_signal_while_the_town_is_built_ends_it_too(number):
 
 @pytest.mark.parametrize("port", [-1, 65535, 65536, 70000])
 def test_a_port_that_cannot_be_is_refused_before_anything_begins(port):
-    command = [sys.executable, "-c", "from roadproof.cli import main; main()", "carla", "serve", "--port", str(port)]
-    told = subprocess.run(command, capture_output=True, text=True)
+    told = roadproof("carla", "serve", "--port", port)
     assert (told.returncode, told.stdout) == (2, "")
     assert told.stderr == f"roadproof: --port is {port}, expected 0 to 65,534\n"
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
 def test_other_addresses_than_loopback_need_a_word(street, host):
-    words = ["carla", "serve", "--map", str(street), "--port", "0", "--host", host]
-    command = [sys.executable, "-c", "from roadproof.cli import main; main()", *words]
-    told = subprocess.run(command, capture_output=True, text=True)
+    told = roadproof("carla", "serve", "--map", street, "--port", "0", "--host", host)
     assert told.returncode == 2
     assert told.stderr.startswith(f"roadproof: host {host!r} is not this machine's loopback: whoever reaches the port")
     assert "--allow-remote" in told.stderr
@@ -614,8 +607,6 @@ def test_with_the_word_it_listens_elsewhere(street):
 
 
 def test_a_host_without_an_address_here_is_one_clear_line(street):
-    words = ["carla", "serve", "--map", str(street), "--host", "nowhere.invalid"]
-    command = [sys.executable, "-c", "from roadproof.cli import main; main()", *words]
-    told = subprocess.run(command, capture_output=True, text=True)
+    told = roadproof("carla", "serve", "--map", street, "--host", "nowhere.invalid")
     assert told.returncode == 2
     assert "roadproof: host 'nowhere.invalid' has no address" in told.stderr

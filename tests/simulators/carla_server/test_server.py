@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import needs
-from carla_serving import free_port, serving, straight_map
+from carla_serving import free_port, serving
+from support.command import roadproof
 
 carla = pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()
@@ -24,8 +25,8 @@ LISTENING = []
 
 
 @pytest.fixture(scope="module")
-def port(tmp_path_factory):
-    with serving("--map", straight_map(tmp_path_factory.mktemp("maps"))) as (_, opened):
+def port(street):
+    with serving("--map", street) as (_, opened):
         yield opened
 
 
@@ -323,14 +324,12 @@ def test_what_cannot_be_served_is_one_clear_line(arguments, complaint):
     assert "Traceback" not in str(caught.value)
 
 
-def test_a_taken_port_is_one_clear_line(tmp_path):
+def test_a_taken_port_is_one_clear_line(street):
     with socket.socket() as taken:
         port = free_port()
         taken.bind(("127.0.0.1", port))
         taken.listen()
-        command = [sys.executable, "-c", "from roadproof.cli import main; main()", "carla", "serve"]
-        command += ["--port", str(port), "--map", str(straight_map(tmp_path))]
-        told = subprocess.run(command, capture_output=True, text=True)
+        told = roadproof("carla", "serve", "--port", port, "--map", street)
     assert told.returncode == 2
     assert f"port {port} of 127.0.0.1 cannot be opened" in told.stderr
 
