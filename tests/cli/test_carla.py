@@ -56,8 +56,10 @@ def impatient(monkeypatch):
 
 
 def check_nobody(said, port):
-    assert said.startswith(f"roadproof: the CARLA server at 127.0.0.1:{port} did not answer for its version in time")
-    assert said.count("\n") == 1
+    # On a slow machine the command may say before that it takes long.
+    last = said.splitlines()[-1]
+    assert last.startswith(f"roadproof: the CARLA server at 127.0.0.1:{port} did not answer for its version in time")
+    assert said.count("roadproof: ") == 1
 
 
 @pytest.mark.slow
