@@ -53,7 +53,7 @@ def run(
     begun = sum(is_done(job, out) for job in chosen.jobs)
     if begun < len(chosen.jobs):
         # One that is not there is refused at once, not job by job.
-        begin(_estimate(chosen, load_controller(chosen.controller), workers))
+        begin(_estimate(chosen, load_controller(chosen.controller), workers), out)
     failed = 0
     with progress("Jobs", len(chosen.jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
 
