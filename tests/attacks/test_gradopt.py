@@ -280,9 +280,7 @@ def test_the_local_linearisation_is_what_two_renderings_say(masks):
 def test_the_published_search_refuses_what_was_not_published():
     recordings, controller = recording_set(frames=2), pull_to_the_right()
     with pytest.raises(PatternError, match="published families alone"):
-        PublishedMeasure(recordings, controller, (RIGHT_GROUP,)).values(
-            SearchSpace(figures=1, family="free"), torch.rand(1, 1, 1, 8)
-        )
+        attack(recordings, controller, SearchSpace(figures=1, family="free"), method=Published())
     with pytest.raises(RoadproofError, match="enlarges the steering shift, not the path deviation"):
         attack(recordings, controller, SearchSpace(figures=1), method=Published(), objective=PathDeviation())
     with pytest.raises(RoadproofError, match="masks is 'soft', expected binary or antialiased"):

@@ -28,7 +28,7 @@ from roadproof.scenarios import find_scenario
 from roadproof.study.job import run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
 from roadproof.study.plan import Job, StartPlan, TrafficPlan
-from roadproof.study.rows import CostColumns, DriveColumns, JobColumns
+from roadproof.study.rows import CostColumns, DriveColumns, JobColumns, PaintColumns
 
 COSTS = ("search_seconds", "seconds")
 GRADOPT = GradOptPlan(
@@ -81,8 +81,9 @@ def test_gradopt_finds_and_is_judged_in_every_condition(street, tmp_path):
         ("clear-noon", True),
         ("rainy-noon", False),
     ]
-    drive, costs = DriveColumns.__annotations__, CostColumns.__annotations__
-    assert all(tuple(row) == (*JobColumns.__annotations__, "controller", *drive, *costs) for row in result.rows)
+    parts = (DriveColumns, PaintColumns, CostColumns)
+    columns = (*JobColumns.__annotations__, "controller", *(name for part in parts for name in part.__annotations__))
+    assert all(sorted(row) == sorted(columns) for row in result.rows)
     assert {row["job"] for row in result.rows} == {job.key}
     first = result.rows[0]
     # One drive recorded, two to calibrate, one over the only candidate; a pair for each row.

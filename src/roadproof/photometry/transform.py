@@ -103,7 +103,7 @@ class ColourTransform:
             found = f"{description.get('format')!r} version {description.get('version')!r}"
             raise ColourError(f"colour transform is {found}, expected {_FORMAT!r} version {_VERSION}")
         try:
-            response = _response_from_dict(description["response"])
+            response = _response_from_dict(dict(description["response"]))
             shading = description["shading"]
             return cls(response, None if shading is None else _shading_from_dict(shading))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
