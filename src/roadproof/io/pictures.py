@@ -29,7 +29,8 @@ def read_picture(
         error: it is missing, damaged, of another kind, or larger than any picture here.
     """
     try:
-        with Image.open(path, formats=("PNG", "JPEG")) as picture:
+        # Pillow leaves a file open whose first bytes cannot be read.
+        with path.open("rb") as file, Image.open(file, formats=("PNG", "JPEG")) as picture:
             if picture.width * picture.height > MOST_PIXELS:
                 raise ValueError(f"{picture.width}×{picture.height} pixels, expected at most {MOST_PIXELS}")
             return np.array(picture.convert(mode))
