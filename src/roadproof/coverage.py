@@ -92,10 +92,10 @@ class Footprints:
     ) -> Footprints:
         """Footprints from canvas coordinates and Jacobians, where and as precise as they are."""
         variance = FOOTPRINT_VARIANCE[resampling]
-        moment = variance * jacobian @ jacobian.mT
         x, y = centre.unbind(-1)
-        across, skewed, along = moment[..., 0, 0], 2 * moment[..., 0, 1], moment[..., 1, 1]
-        features = torch.stack([x, y, torch.ones_like(x), across, skewed, along], -2)
+        (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
+        moments = (variance * (a * a + b * b), 2 * variance * (a * c + b * d), variance * (c * c + d * d))
+        features = torch.stack([x, y, torch.ones_like(x), *moments], -2)
         return Footprints(centre, jacobian, features, variance)
 
     def __len__(self) -> int:

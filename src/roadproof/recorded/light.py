@@ -39,7 +39,7 @@ class Light:
 
         Args:
             pixel: index into a flattened picture.
-            source: where in its frame each of them comes from, px.
+            source: where in its frame each of them comes from, in halves of its width and height from its middle.
             frame: index of each picture's frame.
             footprints: of the pixels on the canvas, (R, 1, P, ...).
         """
@@ -49,8 +49,11 @@ class Light:
             return gain, offset, share
         height, width = self._view.height_px, self._view.width_px
         # Light changes slowly across a frame: the nearest pixel's will do.
-        x, y = source.round().long().unbind(-1)
-        light = self._maps[frame[:, None] * (height * width) + y.clamp(0, height - 1) * width + x.clamp(0, width - 1)]
+        x, y = source.unbind(-1)
+        column = ((x + 1) * (width / 2) - 0.5).round_().clamp_(0, width - 1).long()
+        row = ((y + 1) * (height / 2) - 0.5).round_().clamp_(0, height - 1).long()
+        index = (frame * (height * width))[:, None] + row * width + column
+        light = self._maps.index_select(0, index.flatten()).view(*index.shape, -1)
         return light[..., :3], light[..., 3:6], share * light[..., 6]
 
 

@@ -18,9 +18,9 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d
+from torch.nn.functional import grid_sample
 
 from roadproof.compositing.view import OwnViews
 from roadproof.coverage import Footprints
@@ -119,6 +119,7 @@ class FrameBank:
         self._light = Light(recordings, self.device)
         self._set_rays()
         self.input_from_ground = self._recorded_views(recordings)
+        self._input_from_car = self.input_from_ground @ _ground_from_car(self.poses)
 
     def _exact(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -144,7 +145,15 @@ class FrameBank:
         pixels = self._exact(np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1)).float()
         first = self.horizon_row * view.width_px
         self._sky, self._ground = pixels[:, :first], pixels[:, first:]
-        self._size = pixels.new_tensor([[view.width_px], [view.height_px]])
+        self._halves_from_px = self._exact(
+            np.array(
+                [
+                    [2 / view.width_px, 0.0, 1 / view.width_px - 1],
+                    [0.0, 2 / view.height_px, 1 / view.height_px - 1],
+                    [0.0, 0.0, 1.0],
+                ]
+            )
+        )
         ground_from_canvas = _ground_from_canvas(self.canvas)
         low, high = -0.5, CANVAS_SIZE_PX - 0.5
         corners = np.array([[low, high, high, low], [low, low, high, high], [1.0, 1.0, 1.0, 1.0]])
@@ -182,31 +191,36 @@ class FrameBank:
             turned = poses.picked(missed)
             other = self.nearest(turned, LOOKING_THE_SAME_WAY)
             second, further = self._sampled(other, self._sources(turned, other)[2])
-            better = (beyond[missed] > 0) & (further < beyond[missed])
-            shown = shown.index_copy(0, missed, torch.where(better[:, None], second, shown[missed]))
+            first, short = shown.index_select(0, missed), beyond.index_select(0, missed)
+            better = (short > 0) & (further < short)
+            shown = shown.index_copy_(0, missed, torch.where(better[:, None], second, first))
         frames = shown.round_().div_(255)
         return Views(frames, self._canvas_views(frames, input_from_ground, ground_from_input, source, gap))
 
     def _sources(self, poses: Poses, gap: Gap) -> tuple[Tensor, Tensor, Float[Tensor, "r 2 n"]]:
-        """G' of each pose and its inverse, (R, 3, 3), and where in its frame every pixel comes from, px."""
+        """G' of each pose and its inverse, (R, 3, 3), and where in its frame every pixel comes from.
+
+        In halves of the frame's width and height, from its middle.
+        """
         # The car has moved on the ground as a whole: the camera looks at it as it did from the recorded pose.
-        recorded = self.input_from_ground[gap.frame]
-        wanted = recorded @ _ground_from_car(self.poses.picked(gap.frame)) @ _inverse(_ground_from_car(poses))
+        wanted = self._input_from_car[gap.frame] @ _inverse(_ground_from_car(poses))
         ground_from_input = _inverse(wanted)
-        below = recorded @ ground_from_input
+        below = self.input_from_ground[gap.frame] @ ground_from_input
         c, s, o = torch.cos(gap.turned_rad), torch.sin(gap.turned_rad), torch.zeros_like(gap.turned_rad)
         turn = torch.stack([c, o, -s, o, o + 1, o, s, o, c], -1).view(-1, 3, 3)
         above = self._input_from_level @ turn @ self._level_from_input
-        mapped = torch.cat([above.float() @ self._sky, below.float() @ self._ground], 2)
+        above, below = ((self._halves_from_px @ part).float() for part in (above, below))
+        mapped = torch.cat([above @ self._sky, below @ self._ground], 2)
         return wanted, ground_from_input, mapped[:, :2] / mapped[:, 2:]
 
     def _sampled(self, gap: Gap, source: Float[Tensor, "r 2 n"]) -> tuple[Float[Tensor, "r 3 h w"], Tensor]:
         """Frames looked up there, and how far each pixel lies beyond its frame, in halves of its size."""
-        grid = ((source + 0.5) * (2 / self._size) - 1).clamp(-3, 3)
-        grid = grid.mT.reshape(-1, self.view.height_px, self.view.width_px, 2)
-        levels = self.levels[gap.frame]
+        height, width = self.view.height_px, self.view.width_px
+        near = source.clamp(-3, 3)
+        levels = self.levels.index_select(0, gap.frame)
+        grid = near.mT.reshape(-1, height, width, 2)
         shown = grid_sample(levels, grid, mode="bilinear", padding_mode="border", align_corners=False)
-        return shown, grid.abs().amax(-1) - 1
+        return shown, near.abs_().amax(1).view(-1, height, width) - 1
 
     def _canvas_views(
         self,
@@ -226,10 +240,11 @@ class FrameBank:
         horizon = self.horizon_row * width
         mapped = canvas_from_input @ self._ground[:, first - horizon : rows.stop * width - horizon]
         depth = mapped[:, 2]
+        ahead = depth > 0
         seen = mapped[:, :2] / depth[:, None]
-        inside = ((seen > -0.5) & (seen < CANVAS_SIZE_PX - 0.5)).all(1) & (depth > 0)
-        near = max_pool2d(inside.float().view(len(inside), 1, -1, width), 3, 1, 1).flatten(1) > 0
-        touches = near & (depth > 0)
+        middle = (CANVAS_SIZE_PX - 1) / 2
+        inside = ((seen - middle).abs_().amax(1) < CANVAS_SIZE_PX / 2) & ahead
+        touches = _dilated(inside.view(len(inside), -1, width)).flatten(1) & ahead
         counts = touches.sum(1)
         most = int(counts.max())
         if most == 0:
@@ -241,19 +256,17 @@ class FrameBank:
         place = start[:, None] + torch.minimum(number, (counts[:, None] - 1).clamp_min(0))
         own = pixel[place.clamp_max(len(pixel) - 1)]
         valid = number < counts[:, None]
-        x, y = seen.gather(2, own[:, None].expand(-1, 2, -1)).unbind(1)
-        scale = depth.gather(1, own)
         # A picture without any canvas has no pixel to copy: what stands for it must only be finite.
         some = (counts > 0)[:, None]
-        x, y, scale = (torch.where(some, part, 1.0) for part in (x, y, scale))
-        at = torch.stack([x, y], -1)
-        slope = canvas_from_input[:, None, :2, :2] - at[..., None] * canvas_from_input[:, None, 2:, :2]
-        footprints = Footprints.made(at[:, None], (slope / scale[..., None, None])[:, None], self.view.resampling)
+        at = torch.where(some[:, None], _picked(seen, own), 1.0)
+        scale = torch.where(some, depth.gather(1, own), 1.0)
+        slope = canvas_from_input[:, :2, :2, None] - at[:, :, None] * canvas_from_input[:, 2:, :2, None]
+        jacobian = (slope / scale[:, None, None]).permute(0, 3, 1, 2)
+        footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
         flat = own + first
-        place = source.gather(2, flat[:, None].expand(-1, 2, -1)).mT
-        gain, offset, share = self._light.at(flat, place, gap.frame, footprints)
+        gain, offset, share = self._light.at(flat, _picked(source, flat).mT, gap.frame, footprints)
         share = torch.where(valid, share, 0.0)[..., None]
-        clean = frames.flatten(2).gather(2, flat[:, None].expand(-1, 3, -1)).mT
+        clean = _picked(frames.flatten(2), flat).mT
         return OwnViews.of(flat, valid, footprints, clean, share * gain, share * (offset - clean), self.colour.response)
 
     def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
@@ -280,6 +293,22 @@ class Views(NamedTuple):
 
     frames: Float[Tensor, "r 3 h w"]
     canvas: OwnViews | None
+
+
+def _picked(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
+    """Some pixels of each picture."""
+    return planes.gather(2, index[:, None].expand(-1, planes.shape[1], -1))
+
+
+def _dilated(mask: Bool[Tensor, "r h w"]) -> Bool[Tensor, "r h w"]:
+    """A mask grown by one pixel to every side: as far as the widest filter reaches."""
+    wide = mask.clone()
+    wide[:, :, 1:] |= mask[:, :, :-1]
+    wide[:, :, :-1] |= mask[:, :, 1:]
+    grown = wide.clone()
+    grown[:, 1:] |= wide[:, :-1]
+    grown[:, :-1] |= wide[:, 1:]
+    return grown
 
 
 def _inverse(matrix: Float[Tensor, "*b n n"]) -> Float[Tensor, "*b n n"]:
