@@ -30,6 +30,7 @@ from scipy.stats import spearmanr
 import roadproof
 from roadproof.attacks import GradOpt, PathDeviation, Surrogate
 from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.calibration import calibrate
@@ -38,7 +39,6 @@ from roadproof.io.files import write_atomically
 from roadproof.memory import keep_freed_memory
 from roadproof.patterns import Pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Scenario, find_scenario
 from roadproof.search_space import SearchSpace
@@ -89,8 +89,8 @@ def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict
         rolling = time.perf_counter()
         predicted = world.worlds[0].deviations_m(controller, painted)[:, 0]
         rolled_s = time.perf_counter() - rolling
-        objective = DrivenObjective(simulator, controller, scenario, space, measure="deviation")
-        driven = [objective.effect(painted[k]).deviation for k in range(len(names))]
+        driving = DrivenMeasure(InSimulator(simulator, scenario), controller, PathDeviation())
+        driven = [driving.effect(painted[k]).deviation for k in range(len(names))]
     return {
         "cell": f"{controller_name} {scenario.name}",
         "seed": seed,

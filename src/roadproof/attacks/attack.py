@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.checks import check_gradients, check_search, check_world
+from roadproof.attacks.checks import Check, check_bounds, check_gradients, check_search, check_world
 from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import Measure, Objective, SteeringShift, variation_of
+from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SteeringShift, variation_of
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
@@ -28,11 +29,12 @@ from roadproof.io.identity import require_same
 from roadproof.io.records import plain
 from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
+from roadproof.roads.marks import site_at
 from roadproof.search_space import SearchSpace
 
 
 def attack(
-    recordings: RecordingSet,
+    recordings: RecordingSet | InSimulator,
     controller: Controller,
     space: SearchSpace,
     *,
@@ -46,20 +48,21 @@ def attack(
     checkpoint: Path | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
-    """Find the pattern that moves a controller most on recorded drives.
+    """Find the pattern that moves a controller most, on recorded drives or in a simulator.
 
     Args:
-        recordings: the drives, with their view of the canvas and its colours.
+        recordings: the drives, with their view of the canvas and its colours; or a stretch of road in a simulator,
+            where every pattern takes a drive, and the method has to do without gradients.
         controller: on `device`.
         space: the patterns allowed.
         objective: what is made large: `SteeringShift()` by default, as published, or `PathDeviation()`, which drives
             in the recordings and needs their tracks; or one of your own.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
-        groups: drives attacked together. By default, with gradients and drives pushed to both sides, the paper's two
-            sides, of which the stronger is kept; else all drives, to whichever side they give way.
+        groups: recorded drives attacked together. By default, with gradients and drives pushed to both sides, the
+            paper's two sides, of which the stronger is kept; else all drives, to whichever side they give way.
         seed: of everything random.
         device: where to search.
-        random_patterns: random patterns a group that the self-check compares with; 0 for none.
+        random_patterns: random patterns a group that the self-check on recordings compares with; 0 for none.
         starts: of an earlier search, to search on from: each for its own group, instead of as many random ones.
         checkpoint: file that keeps the search after every step; an interrupted one goes on from it.
         on_step: called after every step with its number and the best shift so far.
@@ -68,14 +71,26 @@ def attack(
         ControllerError: the controller takes other frames, or answers NaN.
         RecordingError: a group names drives that the set lacks.
         PatternError: the method does not know these patterns, or the limits on paint leave none on this road.
+        RoadproofError: the method needs gradients, and a simulator has none; or as `rollout` in a simulator does.
     """
     objective, method = objective or SteeringShift(), method or GradOpt()
     method.check_space(space)
-    site = site_of(recordings)
-    space = space.on(site)
-    groups = groups or method.groups(recordings)
-    measure = method.measure(objective, recordings, controller, groups, device=device)
     start = time.perf_counter()
+    if isinstance(recordings, InSimulator):
+        if method.by_gradient:
+            raise RoadproofError(
+                f"method {method.word} needs gradients, and a drive in a simulator has none; record and calibrate the "
+                "stretch and attack the recordings, or give a method without gradients, as CMAES(calls=140)"
+            )
+        site = site_at(recordings.simulator, recordings.scenario)
+        measure = DrivenMeasure(recordings, controller, objective)
+        groups = measure.groups
+    else:
+        site = site_of(recordings)
+        groups = groups or method.groups(recordings)
+        measure = method.measure(objective, recordings, controller, groups, device=device)
+        start = time.perf_counter()
+    space = space.on(site)
     search = method.search(
         measure,
         space,
@@ -86,19 +101,21 @@ def attack(
         on_step=on_step,
     )
     candidates = _candidates(measure, search, space, groups)
-    cost = Cost(controller_frames=measure.frames_evaluated, seconds=time.perf_counter() - start)
-    checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
-    if method.by_gradient:
-        checks = (check_gradients(measure, space, search), *checks)
-    if isinstance(measure, DeviationMeasure):
-        checks += check_world(measure, candidates[0].pattern)
+    cost = Cost(
+        controller_frames=measure.frames_evaluated,
+        seconds=time.perf_counter() - start,
+        simulator_calls=measure.calls if isinstance(measure, DrivenMeasure) else 0,
+    )
+    checks = _checks(measure, method, space, search, candidates[0], random_patterns, seed)
+    first = candidates[0]
     return AttackResult(
-        pattern=candidates[0].pattern,
-        group=candidates[0].group,
+        pattern=first.pattern,
+        group=first.group,
         objective=objective.name,
-        surrogate_shift=candidates[0].surrogate_shift,
-        predicted_m=candidates[0].predicted_m,
-        predicted_range_m=candidates[0].predicted_range_m,
+        surrogate_shift=first.surrogate_shift,
+        predicted_m=first.predicted_m,
+        predicted_range_m=first.predicted_range_m,
+        driven=first.driven,
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
         candidates=candidates,
         history=search.history.double().numpy(),
@@ -107,8 +124,26 @@ def attack(
         space=space,
         method=method,
         seed=seed,
-        conspicuousness=conspicuousness(candidates[0].pattern, space.site or site),
+        conspicuousness=conspicuousness(first.pattern, space.site or site),
     )
+
+
+def _checks(
+    measure: Measure,
+    method: Method,
+    space: SearchSpace,
+    search: Search,
+    found: Candidate,
+    random_patterns: int,
+    seed: int,
+) -> tuple[Check, ...]:
+    """What may be distrusted of a search, by what it was made on."""
+    if not isinstance(measure, RecordedMeasure):
+        return (check_bounds(space, search),)
+    checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
+    if method.by_gradient:
+        checks = (check_gradients(measure, space, search), *checks)
+    return checks + check_world(measure, found.pattern) if isinstance(measure, DeviationMeasure) else checks
 
 
 def kept_attack(
@@ -179,8 +214,8 @@ def kept_attack(
 
 
 def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:
-    """Those of a group, as points."""
-    points = [space.point(start.pattern) for start in starts if start.group == str(group)]
+    """Those of a group, as points; a simulator's drives belong to none and take all."""
+    points = [space.point(start.pattern) for start in starts if not group.pushes or start.group == str(group)]
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
@@ -190,14 +225,19 @@ def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Se
     Of what is predicted with small errors of steering the least counts: where the way forks, a pattern that depends on
     a hair does not come first.
     """
-    shifts, predicted = measure.readings(space, search.best_unit)
+    shifts, predicted = None, None
+    if isinstance(measure, RecordedMeasure):
+        shifts, predicted = measure.readings(space, search.best_unit)
     restarts = search.best.shape[1]
     rank = search.best.cpu() if predicted is None else predicted.amin(-1)
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
     candidates: list[Candidate] = []
     for group, restart in (divmod(index, restarts) for index in order):
         pattern, name = space.pattern(search.best_unit[group, restart].cpu()), str(groups[group])
-        if predicted is None:
+        if isinstance(measure, DrivenMeasure):
+            candidates.append(Candidate(pattern, name, driven=measure.effect(pattern)))
+            continue
+        if shifts is None or predicted is None:
             candidates.append(Candidate(pattern, name, float(search.best[group, restart])))
             continue
         shift, metres = float(shifts[group, restart]), predicted[group, restart]

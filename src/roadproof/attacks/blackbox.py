@@ -18,6 +18,7 @@ from torch import Tensor
 
 from roadproof.attacks import proposals
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
+from roadproof.attacks.driven import DrivenMeasure
 from roadproof.attacks.gradopt import Running, Search
 from roadproof.attacks.groups import Group, parse_groups
 from roadproof.attacks.method import Method
@@ -69,7 +70,7 @@ class BlackBox(Method):
         return parse_groups("all", recordings)
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
-        """Try patterns on recorded frames or in the recorded world, some at once; each counts by its best group."""
+        """Try patterns, on recordings some at once; each counts by its best group."""
         del objective
         groups = len(measure.groups)
 
@@ -82,7 +83,7 @@ class BlackBox(Method):
             space,
             self,
             seed=running["seed"],
-            at_once=self.at_once,
+            at_once=1 if isinstance(measure, DrivenMeasure) else self.at_once,
             first=torch.cat(list(given)) if sum(map(len, given)) else None,
             world=measure.fingerprint(),
             checkpoint=running.get("checkpoint"),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search, random_search
-from roadproof.attacks.objective import Measure
+from roadproof.attacks.objective import Measure, RecordedMeasure
 from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
 
@@ -50,7 +50,7 @@ def check_search(
         random_patterns: patterns of the random search it is compared with, a group; 0 leaves that check out.
         seed: of those.
     """
-    checks = [_check_determinism(measure, space, search), _check_bounds(space, search)]
+    checks = [_check_determinism(measure, space, search), check_bounds(space, search)]
     if random_patterns:
         checks.append(_check_against_random(measure, space, search, random_patterns, seed))
     return tuple(checks)
@@ -103,7 +103,7 @@ def _check_determinism(measure: Measure, space: SearchSpace, search: Search) -> 
     )
 
 
-def check_gradients(measure: Measure, space: SearchSpace, search: Search) -> Check:
+def check_gradients(measure: RecordedMeasure, space: SearchSpace, search: Search) -> Check:
     """Look whether gradients come through the controller, at what was found and at random patterns."""
     _, gradient = measure.values_and_gradients(space, search.best_unit)
     _, at_start = measure.values_and_gradients(
@@ -126,7 +126,8 @@ def _zero_share(gradient: Float[Tensor, "*n"]) -> Float[Tensor, ""]:
     return (gradient == 0).float().mean()
 
 
-def _check_bounds(space: SearchSpace, search: Search) -> Check:
+def check_bounds(space: SearchSpace, search: Search) -> Check:
+    """Look whether the bounds hold the strongest pattern back."""
     group, restart = divmod(int(search.best.argmax()), search.best.shape[1])
     shape_parameters = search.best_unit[group, restart, :, : len(space.shape_ranges)]
     stuck = float(((shape_parameters == 0) | (shape_parameters == 1)).float().mean())

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
-from roadproof.attacks.objective import Measure, Varied
+from roadproof.attacks.objective import Measure, RecordedMeasure, Varied
 from roadproof.attacks.surrogate import FIXED
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
@@ -52,7 +52,7 @@ class Rung:
         if min(self.starts, self.iterations, self.every) < 1 or not self.learning_rate > 0:
             raise RoadproofError(f"{self} has a number that is too small; expected 1 or more, and a rate above 0")
 
-    def view(self, measure: Measure) -> Measure:
+    def view(self, measure: RecordedMeasure) -> RecordedMeasure:
         """What it climbs of a measure; the measure itself where it looks at all of it."""
         climbed = measure.open_loop() if self.open_loop else measure
         return climbed if self.every == 1 else climbed.thinned(self.every)
@@ -109,7 +109,7 @@ class Running(TypedDict, total=False):
 
 
 def gradopt(
-    measure: Measure, space: SearchSpace, rungs: Ladder, *, momentum: float = 0.9, **running: Unpack[Running]
+    measure: RecordedMeasure, space: SearchSpace, rungs: Ladder, *, momentum: float = 0.9, **running: Unpack[Running]
 ) -> Search:
     """Make a measure large over a search space.
 
@@ -162,7 +162,7 @@ def gradopt(
 
 
 def _starts(
-    measure: Measure,
+    measure: RecordedMeasure,
     space: SearchSpace,
     count: int,
     seed: int,
@@ -193,7 +193,7 @@ def _next_rung(state: dict[str, Tensor], space: SearchSpace, before: Rung, rung:
 
 
 def _step(
-    measure: Measure, space: SearchSpace, learning_rate: float, momentum: float, state: dict[str, Tensor]
+    measure: RecordedMeasure, space: SearchSpace, learning_rate: float, momentum: float, state: dict[str, Tensor]
 ) -> dict[str, Tensor]:
     unit = state["unit"]
     value, gradient = measure.values_and_gradients(space, unit)

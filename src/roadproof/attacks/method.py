@@ -9,7 +9,7 @@ import torch
 
 from roadproof.attacks.gradopt import Running, Search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
-from roadproof.attacks.objective import Measure, Objective
+from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
 from roadproof.controllers import Controller
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -41,7 +41,7 @@ class Method:
         groups: Sequence[Group],
         *,
         device: torch.device | str,
-    ) -> Measure:
+    ) -> RecordedMeasure:
         """What it makes large of an objective: the objective's own measure.
 
         Raises:

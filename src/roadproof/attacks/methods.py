@@ -19,7 +19,7 @@ from roadproof.attacks.blackbox import CMAES, TPE, BayesianOptimisation, Gaussia
 from roadproof.attacks.gradopt import Ladder, Rung, Running, Search, dropping, gradopt
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
-from roadproof.attacks.objective import Measure, Objective, SteeringShift
+from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SteeringShift
 from roadproof.attacks.published import MASKS, PublishedMeasure
 from roadproof.controllers import Controller
 from roadproof.errors import PatternError, RoadproofError
@@ -72,7 +72,7 @@ class GradOpt(Method):
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
         """Climb its ladder."""
-        return gradopt(measure, space, self.ladder(objective), **running)
+        return gradopt(cast("RecordedMeasure", measure), space, self.ladder(objective), **running)
 
 
 SHIFT_RUNGS = (Rung(24, 30, every=4), Rung(8, 30, every=2))
@@ -86,7 +86,7 @@ class _OnGrid(Rung):
 
     grid: float = 1.0
 
-    def view(self, measure: Measure) -> Measure:
+    def view(self, measure: RecordedMeasure) -> RecordedMeasure:
         """The published measure on that grid."""
         return cast("PublishedMeasure", measure).on_grid(self.grid)
 
@@ -164,7 +164,7 @@ class Published(Method):
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
         """Climb as published."""
         del objective
-        return gradopt(measure, space, self.ladder, momentum=0.0, **running)
+        return gradopt(cast("RecordedMeasure", measure), space, self.ladder, momentum=0.0, **running)
 
 
 METHODS: dict[str, type[Any]] = {

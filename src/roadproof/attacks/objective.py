@@ -32,7 +32,7 @@ each of some drives that differ by as little as a prediction may be wrong."""
 
 @runtime_checkable
 class Measure(Protocol):
-    """Values patterns for every group at once; what `gradopt` climbs."""
+    """Values patterns for every group at once; all that a search without gradients asks for."""
 
     groups: tuple[Group, ...]
     frames_evaluated: int
@@ -42,16 +42,25 @@ class Measure(Protocol):
         """Where patterns are valued."""
         ...
 
-    def thinned(self, every: int) -> Measure:
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """Values of R points a group, without gradients."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Tells this measure from every other, so that an interrupted search goes on with its own."""
+        ...
+
+
+@runtime_checkable
+class RecordedMeasure(Measure, Protocol):
+    """A measure on recordings: it has gradients, which `gradopt` climbs, and tells more of what was found."""
+
+    def thinned(self, every: int) -> RecordedMeasure:
         """A cheaper measure, on every n-th frame or step, whose order of starts is much the same."""
         ...
 
-    def open_loop(self) -> Measure:
+    def open_loop(self) -> RecordedMeasure:
         """The steering shift on the same recorded frames: where a search may begin."""
-        ...
-
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """Values of R points a group, without gradients."""
         ...
 
     def values_and_gradients(
@@ -62,10 +71,6 @@ class Measure(Protocol):
 
     def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Readings:
         """What is told of R points a group in the end."""
-        ...
-
-    def fingerprint(self) -> str:
-        """Tells this measure from every other, so that an interrupted search goes on with its own."""
         ...
 
 
@@ -91,7 +96,7 @@ class Objective(Protocol):
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
-    ) -> Measure:
+    ) -> RecordedMeasure:
         """The measure of patterns on a set of recordings.
 
         Raises:

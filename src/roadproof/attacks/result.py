@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.attacks.checks import Check
+from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.records import Form, RecordFile
+from roadproof.io.records import Form, RecordFile, plain
 from roadproof.paint import Conspicuousness
 from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.search_space import SearchSpace
@@ -28,10 +29,12 @@ class Cost:
     Args:
         controller_frames: frames the controller was shown, forward or forward and backward.
         seconds: wall time of the search, without loading and checks.
+        simulator_calls: drives in a simulator, the clean one among them; 0 on recordings.
     """
 
     controller_frames: int
     seconds: float
+    simulator_calls: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,34 +44,40 @@ class Candidate:
     Args:
         pattern: its best.
         group: the drives it was found on.
-        surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames.
+        surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames; None where there
+            were none.
         predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
             steering; None where nothing was driven there.
         predicted_range_m: least and most of it over those.
+        driven: what it did in the drive that chose it; None where nothing was driven in a simulator.
     """
 
     pattern: Pattern
     group: str
-    surrogate_shift: float
+    surrogate_shift: float | None = None
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+    driven: Effect | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class AttackResult:
-    """The pattern an attack found on recorded drives, and how it was found.
+    """The pattern an attack found, and how it was found.
 
-    Its numbers come from composited frames: the *surrogate*'s of single recorded ones, *predicted* ones of drives in
-    the recorded world. What the car does is for driving to say.
+    On recordings its numbers come from composited frames: the *surrogate*'s of single recorded ones, *predicted* ones
+    of drives in the recorded world. What the car does is for driving to say. In a simulator they are *driven*, in the
+    drives that chose the pattern: other drives have to report it.
 
     Args:
         pattern: the strongest pattern.
         group: the group it was found for, e.g. "clean+right".
         objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
-        surrogate_shift: its mean steering shift a frame towards that group's side, in steer units.
+        surrogate_shift: its mean steering shift a frame towards that group's side, in steer units; None where there
+            were no recorded frames.
         predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
             steering; None where the search did not drive there.
         predicted_range_m: least and most of it over those.
+        driven: what the strongest pattern did in the drive that chose it; None where nothing was driven in a simulator.
         by_group: the best value of every group, in the objective's unit: steer a frame, or metres; the published
             method's is a sum over frames.
         candidates: every start's best, the strongest first: by the least predicted deviation where there is one. The
@@ -85,7 +94,7 @@ class AttackResult:
 
     pattern: Pattern
     group: str
-    surrogate_shift: float
+    surrogate_shift: float | None
     by_group: dict[str, float]
     candidates: tuple[Candidate, ...]
     history: Float[np.ndarray, "i g r"]
@@ -97,6 +106,7 @@ class AttackResult:
     objective: str = "steering shift"
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+    driven: Effect | None = None
     conspicuousness: Conspicuousness | None = None
 
     def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:
@@ -118,7 +128,8 @@ class AttackResult:
             self,
             made_of=made_of or {},
             candidates=[
-                [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m] for each in self.candidates
+                [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m, plain(each.driven)]
+                for each in self.candidates
             ],
         )
 
@@ -143,12 +154,13 @@ class AttackResult:
 
 
 class _Ranked(msgspec.Struct, array_like=True, frozen=True):
-    """A candidate but for its pattern, as a list; older results lack the last one or two."""
+    """A candidate but for its pattern, as a list; older results lack the last ones."""
 
     group: str
-    surrogate_shift: float
+    surrogate_shift: float | None
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+    driven: Effect | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +197,6 @@ RESULT_FILE = RecordFile(
         "method": Form(dict[str, Any], stored, _method),
         "history": Form(Float[np.ndarray, "i g r"], _rounded, _rounded),
     },
-    notes={"kind": "surrogate and predicted: composited frames, not driving"},
+    notes={"kind": "surrogate and predicted: composited frames, not driving; driven: the drives that chose"},
 )
 _ROWS_FILE = RecordFile(kind=_Rows, error=RoadproofError, remedy="search again")

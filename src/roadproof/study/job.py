@@ -12,7 +12,8 @@ import torch
 
 from roadproof.attacks import BayesianOptimisation, site_of
 from roadproof.attacks.blackbox import blackbox_search
-from roadproof.attacks.objective import varied
+from roadproof.attacks.driven import DrivenMeasure, InSimulator
+from roadproof.attacks.objective import OBJECTIVES, varied
 from roadproof.controllers import Controller, load_controller
 from roadproof.driving.deviation import path_of
 from roadproof.driving.drive_store import load_episodes
@@ -22,7 +23,6 @@ from roadproof.io.arrays import packed
 from roadproof.paint import Site, conspicuousness
 from roadproof.patterns import Pattern, raster, save_pattern
 from roadproof.pipeline.budget import STEERING, Budget
-from roadproof.pipeline.driven_objective import DrivenObjective
 from roadproof.pipeline.selection import first_of_each_group
 from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.recordings import load_recordings
@@ -166,18 +166,10 @@ def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path
         found, calls_before, seconds_before = _searched(job, world, controller, folder / "start", budget)
         chosen = first_of_each_group(found.attack.candidates, plan.start)
         first = torch.stack([space.point(candidate.pattern) for _, candidate in chosen])
-    objective = DrivenObjective(
-        world,
-        controller,
-        job.scenario,
-        space,
-        measure=plan.objective,
-        weather=job.weathers[0],
-        seed=job.seed,
-        keep=folder / "driven.json",
-    )
+    stretch = InSimulator(world, job.scenario, job.weathers[0], job.seed, keep=folder / "driven.json")
+    measure = DrivenMeasure(stretch, controller, OBJECTIVES[plan.objective])
     trials = blackbox_search(
-        objective,
+        lambda unit: measure.values(space, unit[None])[0],
         space,
         black_box(plan),
         seed=job.seed,
@@ -192,7 +184,7 @@ def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path
         seconds=tuple(map(float, seconds_before + trials.seconds)),
         best=tuple(map(float, trials.best_so_far)),
         measure=plan.objective,
-        deviation_m=tuple(objective.effect(patterns[index]).deviation for index in best),
+        deviation_m=tuple(measure.effect(patterns[index]).deviation for index in best),
     )
     site = _said(job, site_at(world, job.scenario))
     return _Found(patterns[trials.best], history.calls[-1], history.seconds[-1], 0.0, history, site)

@@ -1,0 +1,176 @@
+"""What a pattern is worth in a simulator: its effect in one whole drive, closed loop, without gradients.
+
+    attack(InSimulator(simulator, scenario), controller, space, method=CMAES(calls=140), objective=PathDeviation())
+
+    steering shift  |∑_{f<F'} (steer_f − clean steer_f)| with F' = 80 % of the clean drive's frames; what the authors
+                    gave their Bayesian optimisation. A drive that ends before adds nothing after its end.
+    path deviation  the paper's deviation in metres, which evaluations report (`driving.deviation_m`).
+
+Both are taken of every drive; the objective asked for is the value.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.attacks.groups import Direction, Group
+from roadproof.attacks.objective import Objective, PathDeviation, SteeringShift
+from roadproof.controllers import Controller
+from roadproof.datatypes import Observation, Weather
+from roadproof.driving.deviation import passage, passage_deviation_m, path_of
+from roadproof.driving.episode import Episode
+from roadproof.driving.rollout import Driver, rollout
+from roadproof.errors import RoadproofError
+from roadproof.geometry import CanvasPlacement
+from roadproof.io.records import Form, RecordFile
+from roadproof.patterns import Pattern, raster
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import PatternImage, Simulator
+
+SHARE = 0.8
+"""Of the clean drive's frames, over which the authors sum the steering."""
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """What a pattern did in one drive.
+
+    Args:
+        steering: absolute sum of the steering's shift, steer units.
+        deviation: between the paths, metres.
+    """
+
+    steering: float
+    deviation: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InSimulator:
+    """A stretch of road in a simulator, driven in the same conditions every time, without others on the road.
+
+    Args:
+        simulator: an open simulator.
+        scenario: the stretch of road.
+        weather: of all drives.
+        seed: of all drives.
+        keep: file that keeps the effect of every drive; a pattern it knows is not driven again. It belongs to one
+            scenario, controller, weather and seed.
+    """
+
+    simulator: Simulator
+    scenario: Scenario
+    weather: Weather = Weather.CLEAR_NOON
+    seed: int = 0
+    keep: Path | None = None
+
+
+class DrivenMeasure:
+    """The effect of patterns in a simulator, one drive each, to whichever side the car gives way.
+
+    Args:
+        place: where and how is driven; the clean drive is made at once.
+        driver: a controller, or whoever gets in after the reset.
+        objective: `SteeringShift()` or `PathDeviation()`; what else they say is of recordings.
+
+    Raises:
+        RoadproofError: the objective is another one, or the file of drives is damaged; or as `rollout` does, for the
+            clean drive.
+    """
+
+    groups = (Group((), Direction.EITHER),)
+    device = torch.device("cpu")
+
+    def __init__(self, place: InSimulator, driver: Controller | Driver[Simulator], objective: Objective) -> None:
+        if not isinstance(objective, SteeringShift | PathDeviation) or objective.variation is not None:
+            raise RoadproofError(
+                f"a drive in a simulator gives the steering shift and the path deviation, not the {objective.name}"
+            )
+        self._deviates = isinstance(objective, PathDeviation)
+        self._place, self._known = place, dict[str, Effect]()
+        if place.keep is not None and place.keep.exists():
+            self._known = _FILE.read(place.keep).drives
+        self.calls, self.frames_evaluated = 0, 0
+
+        def drive(pattern: PatternImage | None, until: Callable[[Observation], bool] | None) -> Episode:
+            simulator, scenario, weather, seed = place.simulator, place.scenario, place.weather, place.seed
+            made = rollout(simulator, driver, scenario, weather=weather, pattern=pattern, seed=seed, until=until)
+            self.calls, self.frames_evaluated = self.calls + 1, self.frames_evaluated + made.steer.size
+            return made
+
+        self._drive = drive
+        self.clean = drive(None, None)
+
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """The value of R points; one drive each, unless the pattern has been driven over."""
+        effects = [self.effect(space.pattern(point)) for point in unit[0]]
+        found = [each.deviation if self._deviates else each.steering for each in effects]
+        return torch.tensor([found], dtype=torch.float64)
+
+    def effect(self, pattern: Pattern) -> Effect:
+        """What a pattern does."""
+        paint = raster(pattern)
+        key = hashlib.sha256(paint.tobytes()).hexdigest()[:24]
+        if key not in self._known:
+            self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._place.scenario.canvas)
+            if self._place.keep is not None:
+                _FILE.write(self._place.keep, _Kept(self._known))
+        return self._known[key]
+
+    def fingerprint(self) -> str:
+        """Tells these drives from others: the clean one, and what is taken of each."""
+        told = hashlib.sha256(path_of(self.clean).tobytes() + self.clean.steer.tobytes())
+        return f"{told.hexdigest()} {self._deviates}"
+
+    def _enough(self) -> Callable[[Observation], bool]:
+        """Ends a drive behind the last frame that either effect looks at: a car off the road need not wait there."""
+        canvas = self._place.scenario.canvas
+        last = max(_counted_frames(self.clean), passage(path_of(self.clean), canvas).stop)
+        seen = 0
+
+        def enough(_: Observation) -> bool:
+            nonlocal seen
+            seen += 1
+            return seen > last
+
+        return enough
+
+
+def effect_of(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> Effect:
+    """What the paint changed between two drives that differ in it alone."""
+    frames = min(_counted_frames(clean), painted.steer.size)
+    shift = painted.steer[:frames] - clean.steer[:frames]
+    return Effect(steering=abs(float(shift.sum())), deviation=passage_deviation_m(clean, painted, canvas))
+
+
+def _counted_frames(clean: Episode) -> int:
+    return int(SHARE * clean.steer.size)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """Effects by digest of the paint; a list of three values each in their file."""
+
+    drives: dict[str, Effect]
+
+
+_ROWS = Form(
+    tuple[tuple[str, float, float], ...],
+    lambda known: [(key, each.steering, each.deviation) for key, each in known.items()],
+    lambda rows: {key: Effect(*numbers) for key, *numbers in rows},
+)
+_FILE = RecordFile(
+    kind=_Kept,
+    name="roadproof-driven",
+    error=RoadproofError,
+    remedy="remove it",
+    forms={"drives": _ROWS},
+    notes={"kind": "closed loop"},
+)

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from paint_shy import along_a_street
+from roadproof.attacks import CMAES, AttackResult, GradOpt, InSimulator, PathDeviation, SteeringShift, attack
+from roadproof.attacks.driven import DrivenMeasure, effect_of
+from roadproof.controllers import load_controller
+from roadproof.driving.rollout import rollout
+from roadproof.driving.trial import judge
+from roadproof.errors import RoadproofError
+from roadproof.scenarios import find_scenario
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.town.simulator import TownSimulator
+from runs import driven
+
+SPACE = SearchSpace(figures=2)
+
+
+def test_steering_is_summed_over_the_first_four_fifths_as_published():
+    scenario = find_scenario("left-03")
+    clean = driven(scenario)
+    frames = int(0.8 * clean.steer.size)
+    shift = np.zeros(clean.steer.size)
+    shift[:10], shift[frames:] = -0.02, 5.0
+    painted = dataclasses.replace(clean, steer=clean.steer + shift)
+    effect = effect_of(clean, painted, scenario.canvas)
+    assert effect.steering == pytest.approx(0.2)
+    assert effect.deviation == 0.0
+    # A drive that ends before counts as the clean one from there on.
+    short = {
+        name: getattr(clean, name)[:201] for name in clean.__slots__ if np.size(getattr(clean, name)) == len(clean)
+    }
+    short |= {name: getattr(painted, name)[:200] for name in ("steer", "throttle", "brake")}
+    assert effect_of(clean, dataclasses.replace(clean, **short), scenario.canvas).steering == pytest.approx(0.2)
+
+
+def test_deviation_is_the_one_that_evaluations_report():
+    scenario = find_scenario("left-03")
+    clean, painted = driven(scenario), driven(scenario, 1.3, painted=True)
+    trial = judge(clean, painted, scenario.canvas, pattern="attack", clean_file="a.npz", painted_file="b.npz")
+    assert effect_of(clean, painted, scenario.canvas).deviation == trial.deviation_m > 0.1
+
+
+@pytest.mark.slow
+def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, tmp_path):
+    street, controller = along_a_street(tmp_path), load_controller("pilotnet")
+    place = InSimulator(town, street, keep=tmp_path / "driven.json")
+    unit = SPACE.random((1, 1), torch.Generator().manual_seed(1))
+    first = DrivenMeasure(place, controller, SteeringShift())
+    steering = first.values(SPACE, unit)
+    assert first.calls == 2
+    second = DrivenMeasure(place, controller, PathDeviation())
+    deviation = second.values(SPACE, unit)
+    assert second.calls == 1  # the clean one again
+    assert first.fingerprint() != second.fingerprint()
+    damaged = {"format": "roadproof-driven", "version": 1, "drives": [["a", "b"]]}
+    (tmp_path / "damaged.json").write_text(json.dumps(damaged))
+    with pytest.raises(RoadproofError, match="incomplete or damaged"):
+        DrivenMeasure(dataclasses.replace(place, keep=tmp_path / "damaged.json"), controller, SteeringShift())
+    clean = rollout(town, controller, street)
+    whole = effect_of(clean, rollout(town, controller, street, pattern=SPACE.pattern(unit[0, 0])), street.canvas)
+    assert (float(steering), float(deviation)) == (whole.steering, whole.deviation)
+    assert whole.steering > 0.01
+
+
+@pytest.mark.slow
+def test_attack_in_a_simulator_finds_the_best_it_drove_over(town, tmp_path):
+    street, controller = along_a_street(tmp_path), load_controller("pilotnet")
+    place, method = InSimulator(town, street), CMAES(calls=4)
+    found = attack(place, controller, SPACE, method=method, objective=PathDeviation(), seed=3)
+    assert found.cost.simulator_calls == 5, "the clean drive, and one for each pattern"
+    assert found.surrogate_shift is None and found.predicted_m is None
+    assert found.driven is not None
+    assert found.driven.deviation == max(each.driven.deviation for each in found.candidates if each.driven)
+    assert found.history.shape == (4, 1, 1)
+    assert found.history[-1, 0, 0] == pytest.approx(found.driven.deviation)
+    found.save(tmp_path / "attack")
+    again = AttackResult.load(tmp_path / "attack")
+    assert again.driven == found.driven
+    assert [each.driven for each in again.candidates] == [each.driven for each in found.candidates]
+    on = attack(place, controller, SPACE, method=method, objective=PathDeviation(), starts=again.candidates[:1])
+    assert on.history[0, 0, 0] == pytest.approx(found.driven.deviation), "the start is the first that is driven"
+
+
+def test_a_search_by_gradient_in_a_simulator_is_refused_before_it_drives():
+    # Not opened: whatever is driven there fails with another error.
+    place = InSimulator(TownSimulator(), find_scenario("left-03"))
+    with pytest.raises(RoadproofError, match="needs gradients, and a drive in a simulator has none"):
+        attack(place, load_controller("pilotnet"), SPACE, method=GradOpt())
