@@ -77,7 +77,7 @@ class DrivenMeasure:
 
     Args:
         place: where and how is driven; the clean drive is made at once.
-        driver: a controller, or whoever gets in after the reset.
+        driver: a controller, or a function that is given the simulator after each reset.
         objective: `SteeringShift()` or `PathDeviation()`; what else they say is of recordings.
 
     Raises:

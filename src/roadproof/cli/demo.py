@@ -75,7 +75,7 @@ def demo(
             seed=seed,
             controller_name=controller,
             device=device,
-            another=partial(open_simulator, simulator),
+            factory=partial(open_simulator, simulator),
             processes=processes,
             cheapest_m=cheapest,
             on_progress=show,

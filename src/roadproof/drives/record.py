@@ -54,7 +54,7 @@ def record(
 
     Args:
         simulator: an open simulator.
-        driver: a controller, or whoever gets in after the reset.
+        driver: a controller, or a function that is given the simulator after each reset.
         scenario: where.
         weather: of all drives.
         trajectories: which drives; one clean and one pushed 1.5 m to each side by default.

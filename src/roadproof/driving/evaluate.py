@@ -9,10 +9,9 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import cycle
-from typing import TypeAlias
 
 import torch
 
@@ -26,17 +25,14 @@ from roadproof.patterns import Pattern, raster
 from roadproof.processes import DIED, processes_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import PatternImage, Simulator
+from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
 
 PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 _LOOK_S = 0.5
 
-Opening: TypeAlias = Callable[[], AbstractContextManager[Simulator]]
-"""Makes a simulator for a with-block, as `TownSimulator` does."""
-
 
 def evaluate(
-    simulator: Opening | Simulator,
+    simulator: SimulatorFactory | Simulator,
     driver: AnyDriver,
     scenario: Scenario,
     pattern: Pattern | PatternImage,
@@ -172,7 +168,7 @@ def _planned(
 
 
 def make_together(
-    opening: Opening,
+    factory: SimulatorFactory,
     episodes: Episodes,
     drives: Sequence[Conditions],
     processes: int,
@@ -181,7 +177,7 @@ def make_together(
     """Deal the drives out to processes; what is done shows in the folder.
 
     Args:
-        opening: makes a simulator in each of them.
+        factory: makes a simulator in each of them.
         episodes: where the drives are kept.
         drives: that are missing.
         processes: how many at most.
@@ -193,7 +189,7 @@ def make_together(
     """
     shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
     with processes_beside(len(shares)) as pool:
-        running = [pool.submit(_make_share, opening, episodes, share) for share in shares]
+        running = [pool.submit(_make_share, factory, episodes, share) for share in shares]
         try:
             while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
                 on_done(sum(episodes.has(drive) for drive in drives))
@@ -206,9 +202,9 @@ def make_together(
     on_done(len(drives))
 
 
-def _make_share(opening: Opening, episodes: Episodes, drives: Sequence[Conditions]) -> None:
+def _make_share(factory: SimulatorFactory, episodes: Episodes, drives: Sequence[Conditions]) -> None:
     """What one process does."""
     torch.set_num_threads(1)
-    with opening() as world:
+    with factory() as world:
         for drive in drives:
             episodes.make(world, drive)

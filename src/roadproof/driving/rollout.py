@@ -28,7 +28,7 @@ Policy: TypeAlias = Callable[[Observation], Control]
 """What one drive is driven by: what is seen in, what is done out."""
 
 Driver: TypeAlias = Callable[[SimulatorT], Policy]
-"""Gets into a simulator after its reset and gives the policy of this one drive."""
+"""Is given the simulator after its reset, and returns the policy of this one drive."""
 
 OnStep: TypeAlias = Callable[[Observation, Control | None], object]
 """Told of each observation and the control that answers it, before it is carried out; the last has none."""
@@ -52,7 +52,8 @@ def rollout(
 
     Args:
         simulator: an open simulator.
-        driver: a controller, or whoever gets in after the reset, such as `training.expert.expert` or `replay`.
+        driver: a controller, or a function that is given the simulator after each reset, such as
+            `training.expert.expert` or `replay`.
         scenario: start, goal, canvas, time limit and map.
         weather: of the drive.
         pattern: painted on the canvas; None leaves the road bare.

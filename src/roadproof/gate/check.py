@@ -135,7 +135,7 @@ class _Run:
 
     def cases(self, place: Place) -> list[Case]:
         plan = self.plan
-        with place.opening() as world:
+        with place.factory() as world:
             size = (world.input.height_px, world.input.width_px)
             fresh = plan.budget == "full"
             require_usable(self.controller, size=size, device=self.device, gradients=fresh)
@@ -157,7 +157,7 @@ class _Run:
             for key, (conditions, _) in told.items():
                 self._check_comparable(key, conditions)
             stage = f"Driving {scenario.name}, {', '.join(place.weathers)}"
-            stretch.drive(place.opening, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
+            stretch.drive(place.factory, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
             return [self._judged(place, stretch, key, *each) for key, each in told.items()]
 
     def _check_comparable(self, key: Key, conditions: str) -> None:
@@ -228,7 +228,7 @@ class _Run:
         drives = self.folder / "drives" / case.scenario
         (drives / FILM).unlink(missing_ok=True)
         clean, driven = load_episodes(drives, (worst.clean, worst.painted))
-        with place.opening() as world:
+        with place.factory() as world:
             scenario = place.begun_in(world)
             trial = judge_pair(
                 clean,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.simulators.loading import open_simulator
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -25,13 +25,13 @@ class Place:
     Args:
         scenario: the scenario that is driven.
         weathers: the weathers in which it is driven there.
-        opening: opens the world; its result is used in a with-block.
+        factory: opens the world; its result is used in a with-block.
         where: the world as `--simulator` names it.
     """
 
     scenario: Scenario
     weathers: tuple[Weather, ...]
-    opening: Callable[[], AbstractContextManager[Simulator]]
+    factory: SimulatorFactory
     where: str
 
     def begun_in(self, world: Simulator) -> Scenario:
@@ -48,16 +48,16 @@ def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
         device: where recorded worlds make their pictures.
     """
     if plan.budget == "full":
-        opening = partial(open_simulator, plan.simulator)
+        factory = partial(open_simulator, plan.simulator)
         return tuple(
-            Place(scenario=each, weathers=plan.weathers, opening=opening, where=plan.simulator)
+            Place(scenario=each, weathers=plan.weathers, factory=factory, where=plan.simulator)
             for each in plan.scenarios
         )
     return tuple(
         Place(
             scenario=each,
             weathers=(weather,),
-            opening=partial(_open_recordings, plan.recordings[each.name, weather], weather, device),
+            factory=partial(_open_recordings, plan.recordings[each.name, weather], weather, device),
             where=f"recorded:{plan.recordings[each.name, weather]}",
         )
         for each in plan.scenarios

@@ -15,7 +15,7 @@ from roadproof.datatypes import Ending, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import Opening, make_together
+from roadproof.driving.evaluate import make_together
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
@@ -26,7 +26,7 @@ from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.formatting import in_words
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Identified, Simulator
+from roadproof.simulators.protocol import Identified, Simulator, SimulatorFactory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,11 +93,11 @@ class Stretch:
     paints: tuple[Paint, ...]
     episodes: Episodes
 
-    def drive(self, opening: Opening, processes: int, on_drive: Callable[[int, int], object]) -> None:
+    def drive(self, factory: SimulatorFactory, processes: int, on_drive: Callable[[int, int], object]) -> None:
         """Make the drives that are missing: past the bare road, then over paint where those went well.
 
         Args:
-            opening: opens one more world, for each of several processes.
+            factory: opens one more world, for each of several processes.
             processes: drives made at once.
             on_drive: told how many are there, of how many.
 
@@ -107,20 +107,20 @@ class Stretch:
         """
         alone = [each for weather in self.weathers for each in self._alone(weather).values()]
         total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
-        self._make(alone, opening, processes, lambda done: on_drive(done, total))
+        self._make(alone, factory, processes, lambda done: on_drive(done, total))
         pairs = [pair for weather in self.weathers for paint in self.paints for pair in self._pairs(weather, paint)]
         total = len(alone) + len(pairs)
         painted = [painted for _, painted in pairs]
-        self._make(painted, opening, processes, lambda done: on_drive(len(alone) + done, total))
+        self._make(painted, factory, processes, lambda done: on_drive(len(alone) + done, total))
 
     def _make(
-        self, drives: Sequence[Conditions], opening: Opening, processes: int, on_done: Callable[[int], object]
+        self, drives: Sequence[Conditions], factory: SimulatorFactory, processes: int, on_done: Callable[[int], object]
     ) -> None:
         missing = [each for each in drives if not self.episodes.has(each)]
         made = len(drives) - len(missing)
         on_done(made)
         if processes > 1 and len(missing) > 1:
-            make_together(opening, self.episodes, missing, processes, lambda done: on_done(made + done))
+            make_together(factory, self.episodes, missing, processes, lambda done: on_done(made + done))
             return
         for k, each in enumerate(missing):
             self.episodes.make(self.world, each)

@@ -16,7 +16,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.identity import identity_of
 from roadproof.drives import Drives, record
 from roadproof.driving.drive_store import load_episodes
-from roadproof.driving.evaluate import Opening, evaluate
+from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.identity import ANSWERS, digest, require_same
@@ -31,7 +31,7 @@ from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
 CHEAPEST = "cheapest"
 """The folder of a run with the least paint for a deviation."""
@@ -53,7 +53,7 @@ class Stages:
     seed: int
     controller_name: str
     device: str
-    another: Opening | None
+    factory: SimulatorFactory | None
     processes: int
     on_progress: OnProgress
 
@@ -233,7 +233,7 @@ class Stages:
     def evaluate(self, pattern: Pattern) -> Evaluation:
         """The drives over the chosen pattern that say how bad it is."""
         return evaluate(
-            self.another if self.another and self.processes > 1 else self.simulator,
+            self.factory if self.factory and self.processes > 1 else self.simulator,
             self.controller,
             self.scenario,
             pattern,

@@ -26,7 +26,6 @@ from roadproof.attacks.cheapest import check_wanted
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
-from roadproof.driving.evaluate import Opening
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
@@ -43,7 +42,7 @@ from roadproof.processes import require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
 STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "evaluate")
 
@@ -92,7 +91,7 @@ def stress_test(
     seed: int = 0,
     controller_name: str = "",
     device: str = "cpu",
-    another: Opening | None = None,
+    factory: SimulatorFactory | None = None,
     processes: int = 1,
     film: bool = True,
     cheapest_m: float | None = None,
@@ -110,7 +109,7 @@ def stress_test(
         seed: the seed of recording, search and traffic.
         controller_name: what reports call the controller.
         device: where to search, "cpu" or "cuda:0".
-        another: a function that opens one more simulator of the same kind; needed for several processes.
+        factory: opens one more simulator of the same kind; needed for several processes.
         processes: how many drives of the evaluation are made at once; the controller must be picklable for several.
         film: whether to film the two drives that the report shows, and to render the recorded frames over the paint,
             which takes three drives more.
@@ -125,9 +124,9 @@ def stress_test(
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     folder = as_path(folder)
-    if processes < 1 or (processes > 1 and another is None):
+    if processes < 1 or (processes > 1 and factory is None):
         raise RoadproofError(
-            f"{processes} processes; expected 1, or more with a function that opens another simulator for each"
+            f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
         )
     stages = Stages(
         simulator=simulator,
@@ -139,7 +138,7 @@ def stress_test(
         seed=seed,
         controller_name=controller_name,
         device=device,
-        another=another,
+        factory=factory,
         processes=processes,
         on_progress=on_progress,
     )

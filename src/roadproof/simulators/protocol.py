@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from enum import StrEnum
 from types import TracebackType
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
@@ -120,6 +122,10 @@ class Simulator(Protocol):
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px."""
         ...
+
+
+SimulatorFactory: TypeAlias = Callable[[], AbstractContextManager[Simulator]]
+"""Makes a simulator for a with-block, as `TownSimulator` does."""
 
 
 @runtime_checkable
