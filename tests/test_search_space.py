@@ -81,6 +81,7 @@ def test_no_more_than_the_allowed_share_is_painted(shape):
         ({"figures": 0}, "figures is 0"),
         ({"figures": 1, "shape": Shape.ELLIPSE}, "free family"),
         ({"figures": 1, "albedo": (0.9, 0.2)}, "albedo"),
+        ({"figures": 1, "albedo": (float("nan"), 1.0)}, "albedo"),
         ({"figures": 1, "max_painted_share": 0.0}, "max_painted_share"),
     ],
 )

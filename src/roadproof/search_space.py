@@ -99,8 +99,11 @@ class SearchSpace:
             raise PatternError(f"number of figures is {self.figures}, expected 1 to {MAX_FIGURES}")
         if self.family != "free" and self.shape is not Shape.RECTANGLE:
             raise PatternError(f"the {self.family} family has rectangles only; use the free family for a {self.shape}")
-        if not 0.0 <= self.albedo[0] < self.albedo[1] <= 1.0:
-            raise PatternError(f"albedo is {self.albedo}, expected 0 ≤ lowest < highest ≤ 1")
+        match self.albedo:
+            case (float() | int() as low, float() | int() as high) if 0.0 <= low < high <= 1.0:
+                pass
+            case _:
+                raise PatternError(f"albedo is {self.albedo!r:.80}, expected two numbers, 0 ≤ lowest < highest ≤ 1")
         if self.max_painted_share is not None and not 0.0 < self.max_painted_share <= 1.0:
             raise PatternError(f"max_painted_share is {self.max_painted_share}, expected a value in (0, 1]")
 

@@ -143,6 +143,15 @@ def test_a_calibration_is_kept_for_its_own_drives_and_method(two_paint, drives, 
         Calibrated.kept(tmp_path, drives, Method.POSE)
 
 
+def test_recordings_that_were_put_in_another_runs_place_are_refused(two_paint, drives, tmp_path):
+    first, *others = two_paint.recordings.recordings
+    turned = dataclasses.replace(first, frames=255 - first.frames)
+    elsewhere = dataclasses.replace(two_paint.recordings, recordings=(turned, *others))
+    dataclasses.replace(two_paint, recordings=elsewhere).save(tmp_path)
+    with pytest.raises(CalibrationError, match="drive clean has other frames than were recorded in this run"):
+        Calibrated.kept(tmp_path, drives, Method.TWO_PAINT)
+
+
 def test_a_replay_that_goes_another_way_is_refused(town, drives):
     clean = drives.drives[0]
     elsewhere = dataclasses.replace(clean.episode, x_m=clean.episode.x_m + 0.5)

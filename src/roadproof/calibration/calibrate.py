@@ -88,7 +88,23 @@ class Calibrated:
         report = CalibrationReport.FILE.made(path, content)
         before = content.get("made_of") or {"method": report.method}
         require_same(run / "recordings", "a calibration", before, now, CalibrationError)
-        return Calibrated(load_recordings(run / "recordings"), report, now)
+        recordings = load_recordings(run / "recordings")
+        for recording in recordings.recordings:
+            if not _same_frames(recording, drives):
+                raise CalibrationError(
+                    f"{run / 'recordings'}: drive {recording.name} has other frames than were recorded in this run; "
+                    "remove that folder, and the drives are calibrated again"
+                )
+        return Calibrated(recordings, report, now)
+
+
+def _same_frames(recording: Recording, drives: Drives) -> bool:
+    """Whether what was calibrated is frames of the drive of that name; a calibration may leave some out."""
+    drive = next((drive for drive in drives.drives if drive.name == recording.name), None)
+    if drive is None:
+        return False
+    kept = np.isin(drive.frame_number, recording.frame_number)
+    return kept.sum() == len(recording.frames) and np.array_equal(drive.frames[kept], recording.frames)
 
 
 def _parts(drives: Drives, method: Method) -> dict[str, object]:
