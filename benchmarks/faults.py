@@ -39,7 +39,7 @@ from typing import Any
 
 import roadproof
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from bad_inputs import attempt, command_lines, damaged_files
 from killable import EXPECTED, kill_and_resume, starter
 from long_work import evaluations, searches

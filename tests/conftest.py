@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import needs
-from support import type_checks
+import type_checks
 
 # Workers side by side have a core each; torch reads this when it is first imported.
 if "PYTEST_XDIST_WORKER" in os.environ:

@@ -4,11 +4,11 @@ import pytest
 from PIL import Image
 
 import needs
+from command import roadproof
 from paint_shy import along_a_street, magenta
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
 from roadproof.scenarios import save_scenarios
-from support.command import roadproof
 
 needs.town()
 av = pytest.importorskip("av", reason="films need the extra roadproof[video]")

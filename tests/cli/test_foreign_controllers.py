@@ -6,10 +6,10 @@ import pytest
 
 import bad_drivers
 import needs
+from command import roadproof
 from recorded_drives import drivable_set
 from roadproof.recordings import save_recordings
 from roadproof.scenarios import find_scenario, save_scenarios
-from support.command import roadproof
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from command import roadproof
 from paint_shy import magenta
 from recorded_drives import drivable_set
 from roadproof.datatypes import Weather
@@ -11,7 +12,6 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
 from roadproof.recordings import save_recordings
-from support.command import roadproof
 
 BAR = magenta(300.0)
 

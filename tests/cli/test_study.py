@@ -8,7 +8,7 @@ import pytest
 
 import needs
 from roadproof.study.folder import pandas, read_table
-from support.street_plan import write_plan
+from street_plan import write_plan
 
 PLAN = """
 format = "roadproof-study"

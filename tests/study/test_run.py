@@ -14,8 +14,8 @@ from roadproof.study.folder import read_table
 from roadproof.study.job import run_job
 from roadproof.study.plan import load_study
 from roadproof.study.run import run_study
+from street_plan import write_plan
 from study_work import counts, dies_for_two_figures, fails_for_bo, tells_threads
-from support.street_plan import write_plan
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def on_a_cluster(tmp_path_factory):
         write_plan(place, plan)
     (folder / "node").mkdir()
     words = [f"{place}:{work.__name__}" for work, place in done.items()]
-    script = Path(__file__).parents[1] / "study_on_ray.py"
+    script = Path(__file__).parents[1] / "support" / "study_on_ray.py"
     # By default Ray's workers let all others go first, so that beside other tests they hardly get to work.
     fair = os.environ | {"RAY_raylet_start_wait_time_s": "240", "RAY_worker_niceness": "0"}
     command = [sys.executable, str(script), str(folder / "node"), *words]

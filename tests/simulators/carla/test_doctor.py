@@ -7,7 +7,7 @@ import pytest
 
 import needs
 from carla_serving import CAMERA, INPUT, free_port, serving
-from support.command import roadproof
+from command import roadproof
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()

@@ -16,7 +16,7 @@ import pytest
 import needs
 from carla_serving import SMALL, SMALL_INPUT, serving
 from carla_serving import STREET as WHOLE_STREET
-from support.command import PROGRAM
+from command import PROGRAM
 
 pytest.importorskip("carla", reason="CARLA's client is not installed: pip install 'roadproof[carla]'")
 needs.town()

@@ -18,6 +18,7 @@ needs.town()
 pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")
 import carla
 
+from command import roadproof
 from roadproof.datatypes import Control, EventKind, Weather
 from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.simulators.carla.simulator import CarlaSimulator
@@ -25,7 +26,6 @@ from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
-from support.command import roadproof
 
 AHEAD = Control(0.0, throttle=0.6)
 

@@ -15,7 +15,7 @@ import pytest
 
 import needs
 from carla_serving import interruptible, serving
-from support.command import PROGRAM, roadproof
+from command import PROGRAM, roadproof
 
 needs.town()
 msgpack = pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]")

@@ -10,10 +10,10 @@ import subprocess
 import sys
 import time
 
+from command import PROGRAM
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.scenarios import Scenario
-from support.command import PROGRAM
 
 START_S = 300.0
 CAMERA = CameraModel(width_px=320, height_px=240, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
