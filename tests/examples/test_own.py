@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import runpy
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 import needs
 import roadproof
-from references import approach
 from roadproof.attacks import GradOpt
-from roadproof.attacks.gradopt import Rung
 from roadproof.controllers import check_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.driving.evaluation import Evaluation
-from roadproof.geometry import apply_homography
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.stress_test import stress_test
 
@@ -32,26 +26,6 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def run(name, *arguments, monkeypatch):
     monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
     return runpy.run_path(str(EXAMPLES / name), run_name="__main__")
-
-
-def test_a_recording_of_ones_own_is_attacked(tmp_path, monkeypatch, capsys):
-    homographies = approach(3, last_m=10.0)
-    corners = np.array([[-0.5, -0.5], [399.5, -0.5], [399.5, 399.5], [-0.5, 399.5]])
-    seen = [apply_homography(each, corners).ravel() for each in homographies]
-    rng = np.random.default_rng(0)
-    drive = tmp_path / "drive"
-    drive.mkdir()
-    for number in range(3):
-        Image.fromarray(rng.integers(90, 140, (600, 800, 3), np.uint8)).save(drive / f"{number}.png")
-    np.savetxt(drive / "corners.csv", np.column_stack([seen, np.full(3, 6.0)]), delimiter=",")
-    # The example's own search, less of it.
-    monkeypatch.setattr(GradOpt, "ladder", lambda self, objective: (Rung(2, 4),))
-    run("own_recording.py", drive, "pilotnet", tmp_path / "out", monkeypatch=monkeypatch)
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert result["surrogate_shift"] > 0
-    assert list(result["by_group"]) == ["all"]
-    assert (tmp_path / "out" / "pattern.png").exists()
-    assert "steer a frame, predicted" in capsys.readouterr().out
 
 
 @pytest.mark.slow

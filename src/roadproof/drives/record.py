@@ -22,7 +22,7 @@ from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Win
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, homography_from_pose
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.io.files import AnyPath, as_path
 from roadproof.recordings import Push
 from roadproof.scenarios import Scenario
@@ -272,25 +272,29 @@ def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
     Raises:
         RecordingError: the canvas is not in view.
     """
-    shows = in_view(film.states, settings.scenario, settings.camera, settings.view, settings.window.least_px)
+    shows = in_view(film.states, settings.scenario.canvas, settings.camera, settings.view, settings.window.least_px)
     which = np.flatnonzero(shows)
     if which.size == 0:
         raise RecordingError(
             f"drive {name} of {settings.scenario.name} never sees {settings.window.least_px} pixels of the canvas "
             f"within {settings.window.horizon_m:g} m; check the driver, or where the canvas lies"
         )
-    count = min(settings.window.frames, which.size)
-    which = which[np.unique(np.linspace(0, which.size - 1, count).round().astype(int))]
+    which = which[evenly(which.size, settings.window.frames)]
     return np.array(film.steps)[which], np.stack([film.frames[int(k)] for k in which]), which
 
 
+def evenly(count: int, most: int) -> Int[np.ndarray, " f"]:
+    """Indices of at most so many of a number of frames, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+
+
 def in_view(
-    states: list[VehicleState], scenario: Scenario, camera: CameraModel, view: CropResize, least_px: int
+    states: list[VehicleState], canvas: CanvasPlacement, camera: CameraModel, view: CropResize, least_px: int
 ) -> Bool[np.ndarray, " n"]:
     """Whether the canvas fills so many pixels of the controller's input, going by the pose; occluders do not count."""
     if not states:
         return np.zeros(0, bool)
-    image_from_canvas = np.stack([homography_from_pose(camera, state, scenario.canvas) for state in states])
+    image_from_canvas = np.stack([homography_from_pose(camera, state, canvas) for state in states])
     try:
         index, centre, _ = canvas_pixels(image_from_canvas, view)
     except GeometryError:

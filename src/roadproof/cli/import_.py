@@ -1,0 +1,34 @@
+"""`roadproof import`: drives of your own in, recordings out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from roadproof.cli.options import argument
+from roadproof.cli.output import say
+
+
+def import_(
+    folder: Annotated[Path, argument("Your pictures and tables, with drives.toml; see docs/recordings.md.")],
+    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("out/recordings"),
+) -> None:
+    """Make recordings of drives of your own: pictures, and a table of poses and controls."""
+    from roadproof.drives.own import import_drives, preview
+    from roadproof.io.files import write_atomically
+    from roadproof.recordings import save_recordings
+
+    recordings = import_drives(folder)
+    save_recordings(recordings, out)
+    shown = out / "preview.png"
+    write_atomically(shown, preview(recordings).save)
+    camera, canvas = recordings.camera, recordings.canvas
+    say(f"camera {camera.up_m:.2f} m above the ground, pitch {camera.pitch_deg:.1f}°, {camera.fov_deg:.1f}° wide")
+    if canvas is not None:
+        say(f"canvas {canvas.width_m:.2f} m across the road, {canvas.length_m:.2f} m along it")
+    for drive in recordings.recordings:
+        say(f"  {drive.name:8} {len(drive.frames)} frames, steps {drive.frame_number[0]} to {drive.frame_number[-1]}")
+    say(f"Is the canvas where it should be? {shown}")
+    say(f"Recordings in {out}; next: roadproof attack {out} --objective deviation --controller ...")

@@ -1,0 +1,134 @@
+"""Where the car, the camera and the canvas were in drives of your own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+from scipy import optimize
+
+from roadproof.datatypes import VehicleState
+from roadproof.drives.own.plan import PLAN, GroundPoint, OwnDrives
+from roadproof.drives.own.table import POSE, Table
+from roadproof.errors import RecordingError
+from roadproof.geometry import CameraModel, CanvasPlacement
+from roadproof.recordings import Track
+
+_ORIGIN = VehicleState(0.0, 0.0, 0.0, 0.0, 0.0)
+_MOST_MISSED_PX = 5.0
+
+
+def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
+    """Poses as they are stated, or summed up from speed and yaw rate.
+
+    Args:
+        own: the plan.
+        table: of the drive.
+        alone: whether it is the only drive; sums begin at the world's origin, which two drives do not share.
+
+    Raises:
+        RecordingError: the table does not say where the car was, or poses jump.
+    """
+    numbers, dt_s = table.numbers, own.dt_s
+    if all(name in numbers for name in POSE):
+        x_m, y_m, yaw_rad = (numbers[name] for name in POSE)
+        way = np.gradient(x_m) * np.cos(yaw_rad) + np.gradient(y_m) * np.sin(yaw_rad) if len(x_m) > 1 else x_m * 0
+        speed = numbers.get("speed_mps", way / dt_s)
+    elif "yaw_rate_rad_s" in numbers:
+        if not alone:
+            raise RecordingError(
+                f"{table.drive.table} has speed and yaw rate alone, which do not say how drives lie to each "
+                "other; give x_m, y_m and yaw_rad, or import one drive"
+            )
+        speed, rate = table.needed("speed_mps"), numbers["yaw_rate_rad_s"]
+        yaw_rad = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * dt_s)])
+        middle = (yaw_rad[1:] + yaw_rad[:-1]) / 2
+        way = (speed[1:] + speed[:-1]) / 2 * dt_s
+        x_m, y_m = (np.concatenate([[0.0], np.cumsum(way * turn(middle))]) for turn in (np.cos, np.sin))
+    else:
+        raise RecordingError(
+            f"{table.drive.table} does not say where the car was: expected columns x_m, y_m and yaw_rad, or speed_mps "
+            "and yaw_rate_rad_s, or the canvas' corners"
+        )
+    try:
+        return Track(
+            dt_s=dt_s,
+            step=np.arange(len(x_m)),
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=yaw_rad,
+            speed_mps=speed,
+            steer=table.needed("steer"),
+            throttle=table.column("throttle"),
+            brake=table.column("brake"),
+        )
+    except RecordingError as error:
+        raise RecordingError(f"{table.drive.table}: {error}") from None
+
+
+def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
+    """Where the canvas is stated to lie, or on the way of the first drive.
+
+    Raises:
+        RecordingError: it is stated twice or not at all, or lies beyond the way.
+    """
+    stated = own.canvas
+    if stated is None:
+        raise RecordingError(f"{PLAN} has no table [canvas]; say where may be painted, for instance ahead_m = 30")
+    size = {"width_m": stated.width_m, "length_m": stated.length_m}
+    place = [stated.x_m, stated.y_m, stated.yaw_rad]
+    if stated.ahead_m is None:
+        if None in place:
+            raise RecordingError(f"[canvas] of {PLAN} has neither ahead_m nor x_m, y_m and yaw_rad; give one of them")
+        return CanvasPlacement(**dict(zip(POSE, cast("list[float]", place), strict=True)), **size)
+    if place != [None] * 3:
+        raise RecordingError(f"[canvas] of {PLAN} has both ahead_m and a place; leave one out")
+    way_m = np.concatenate([[0.0], np.hypot(np.diff(track.x_m), np.diff(track.y_m)).cumsum()])
+    if not 0.0 <= stated.ahead_m <= way_m[-1]:
+        raise RecordingError(f"[canvas] has ahead_m {stated.ahead_m:g}, expected 0 to {way_m[-1]:.1f}, the way driven")
+    x_m, y_m, yaw_rad = (
+        float(np.interp(stated.ahead_m, way_m, values)) for values in (track.x_m, track.y_m, np.unwrap(track.yaw_rad))
+    )
+    return CanvasPlacement(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, **size)
+
+
+def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint]) -> CameraModel:
+    """A camera whose height, pitch and field of view put known points of the ground where they are seen.
+
+    Args:
+        camera: where the fit begins; the same where no point is given.
+        ground: three points or more.
+
+    Raises:
+        RecordingError: fewer than three points, or they are missed by more than 5 px.
+    """
+    if not ground:
+        return camera
+    if len(ground) < 3:
+        raise RecordingError(f"{len(ground)} known points of the ground, expected 3 or more, near and far, or none")
+    place = np.array([[each.ahead_m, each.left_m, 0.0, 1.0] for each in ground])
+    seen = np.array([[each.x_px, each.y_px] for each in ground])
+
+    def placed_as(numbers: Float[np.ndarray, " 3"]) -> CameraModel:
+        up_m, pitch_deg, fov_deg = numbers.tolist()
+        return replace(camera, up_m=up_m, pitch_deg=pitch_deg, fov_deg=fov_deg)
+
+    def missed(numbers: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " m"]:
+        x, y, depth = placed_as(numbers).image_from_world(_ORIGIN) @ place.T
+        depth = np.maximum(depth, 1e-3)
+        return np.concatenate([x / depth - seen[:, 0], y / depth - seen[:, 1]])
+
+    begin = np.array([camera.up_m, camera.pitch_deg, camera.fov_deg])
+    found = cast("Any", optimize).least_squares(
+        missed, begin, bounds=([0.1, -80.0, 5.0], [10.0, 45.0, 170.0]), x_scale=(0.1, 1.0, 1.0)
+    )
+    off_px = float(np.hypot(*missed(found.x).reshape(2, -1)).max())
+    if off_px > _MOST_MISSED_PX:
+        raise RecordingError(
+            f"known points of the ground are missed by up to {off_px:.1f} px, expected at most {_MOST_MISSED_PX:g}; "
+            "check them, and the camera's forward_m and left_m"
+        )
+    return placed_as(found.x)

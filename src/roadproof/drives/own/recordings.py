@@ -1,0 +1,177 @@
+"""Drives that you recorded yourself, as recordings: a folder of pictures with a table of what the car did.
+
+FOLDER/drives.toml    what is common to all drives (`own.plan`)
+FOLDER/TABLE.csv      what a drive was, step by step (`own.table`)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from PIL import Image, ImageDraw
+
+from roadproof.drives.own.place import canvas_on, fitted_camera, track_of
+from roadproof.drives.own.plan import PLAN, OwnColour, OwnDrives, read_plan
+from roadproof.drives.own.table import CORNERS, Table, read_table
+from roadproof.drives.record import evenly, in_view
+from roadproof.drives.trajectories import Window
+from roadproof.errors import GeometryError, RecordingError
+from roadproof.geometry import CANVAS_SIZE_PX, homography_from_points, homography_from_pose
+from roadproof.io.files import AnyPath, as_path, inside
+from roadproof.io.pictures import read_picture
+from roadproof.photometry import AffineResponse, ColourTransform
+from roadproof.recorded import placed
+from roadproof.recordings import Recording, RecordingSet, Track
+
+WINDOW = Window(frames=40, least_px=8)
+"""Frames that are kept of a drive, as a recording for the recorded world has them."""
+
+_CORNERS_PX = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * CANVAS_SIZE_PX - 0.5
+
+
+def import_drives(folder: AnyPath) -> RecordingSet:
+    """Recordings from pictures and tables of your own; see docs/recordings.md for what is in the folder.
+
+    Poses come from the table; or from speed and yaw rate, for one drive alone, whose first row is then the world's
+    origin; or from the canvas' corners in each picture. Of each drive at most `WINDOW.frames` frames are kept.
+
+    Args:
+        folder: with drives.toml.
+
+    Returns:
+        A set with canvas and tracks, which can be attacked and driven in.
+
+    Raises:
+        RecordingError: a file is missing or damaged, a column is missing or has no number, poses jump, the canvas is
+            not in view, or known points do not agree with the camera; the message names it.
+    """
+    folder = as_path(folder)
+    own = read_plan(folder)
+    own = replace(own, camera=fitted_camera(own.camera, own.ground))
+    tables = [read_table(folder, drive) for drive in own.drive]
+    given = {
+        "camera": own.camera,
+        "view": own.input,
+        "colour": _colour(own.colour),
+        "origin": own.origin or f"imported from {folder.name}",
+    }
+    if all(name in table.numbers for table in tables for name in CORNERS):
+        return _from_corners(folder, own, tables, given)
+    return _from_poses(folder, own, tables, given)
+
+
+def _from_poses(folder: Path, own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
+    tracks = [track_of(own, table, alone=len(tables) == 1) for table in tables]
+    canvas = canvas_on(own, tracks[0])
+    drives: list[Recording] = []
+    for table, track in zip(tables, tracks, strict=True):
+        steps = table.pictured
+        states = [track.state(int(step)) for step in steps]
+        shown = steps[in_view(states, canvas, own.camera, own.input, WINDOW.least_px)]
+        if not len(shown):
+            raise RecordingError(
+                f"drive {table.drive.name} never sees {WINDOW.least_px} pixels of the canvas at x_m {canvas.x_m:.1f}, "
+                f"y_m {canvas.y_m:.1f}; check the camera, or where the canvas lies"
+            )
+        kept = shown[evenly(len(shown), WINDOW.frames)]
+        seen = np.stack([homography_from_pose(own.camera, track.state(int(step)), canvas) for step in kept])
+        drives.append(_recording(folder, own, table, kept, seen, track.speed_mps[kept], track))
+    return RecordingSet(**given, recordings=tuple(drives), canvas=canvas)
+
+
+def _from_corners(folder: Path, own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
+    drives: list[Recording] = []
+    controls: dict[str, Float[np.ndarray, "f 3"]] = {}
+    for table in tables:
+        kept = table.pictured[evenly(len(table.pictured), WINDOW.frames)]
+        corners = np.stack([table.numbers[name][kept] for name in CORNERS], 1).reshape(-1, 4, 2)
+        try:
+            seen = np.stack([homography_from_points(_CORNERS_PX, four) for four in corners])
+        except GeometryError as error:
+            raise RecordingError(f"{table.drive.table}, corners of the canvas: {error}") from None
+        drives.append(_recording(folder, own, table, kept, seen, table.needed("speed_mps")[kept]))
+        columns = [table.column(name)[kept] for name in ("steer", "throttle", "brake")]
+        controls[table.drive.name] = np.stack(columns, 1)
+    return placed(RecordingSet(**given, recordings=tuple(drives)), dt_s=own.dt_s, controls=controls)
+
+
+def _recording(
+    folder: Path,
+    own: OwnDrives,
+    table: Table,
+    kept: Int[np.ndarray, " f"],
+    seen: Float[np.ndarray, "f 3 3"],
+    speed_mps: Float[np.ndarray, " f"],
+    track: Track | None = None,
+) -> Recording:
+    command = table.column("command", 2.0)[kept]
+    if (command != command.round()).any():
+        raise RecordingError(
+            f"{table.drive.table}: command {command[command != command.round()][0]:g} is no whole number"
+        )
+    return Recording(
+        name=table.drive.name,
+        push=table.drive.push,
+        frames=np.stack([_frame(folder, own, table.pictures[int(step)]) for step in kept]),
+        frame_number=kept.astype(np.int64),
+        image_from_canvas=seen,
+        speed_mps=speed_mps,
+        command=command.astype(np.int64),
+        steer=table.needed("steer")[kept],
+        track=track,
+        weather=table.drive.weather,
+    )
+
+
+def _frame(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    path = folder
+    for part in PurePosixPath(name).parts:
+        path = inside(path, part, f"picture {name!r:.80}", RecordingError)
+    picture = read_picture(path, RecordingError, "check the column picture")
+    camera = own.camera
+    if picture.shape[:2] != (camera.height_px, camera.width_px):
+        raise RecordingError(
+            f"{path} has {picture.shape[1]}×{picture.shape[0]} pixels, expected {camera.width_px}×{camera.height_px} "
+            f"as the camera in {PLAN}"
+        )
+    try:
+        return own.input(picture)
+    except GeometryError as error:
+        raise RecordingError(f"{folder / PLAN}, input: {error}") from None
+
+
+def _colour(colour: OwnColour) -> ColourTransform:
+    black, white = (torch.tensor(each, dtype=torch.float64) for each in (colour.black, colour.white))
+    if not bool(((black >= 0) & (black < white) & (white <= 1)).all()):
+        raise RecordingError(
+            f"colour has black {colour.black} and white {colour.white}, expected 0 ≤ black < white ≤ 1"
+        )
+    return ColourTransform(AffineResponse(torch.diag(white - black), black))
+
+
+def preview(recordings: RecordingSet) -> Image.Image:
+    """First, middle and last frame of each drive with the canvas' outline, for people to see whether it is right."""
+    rows: list[np.ndarray] = []
+    for drive in recordings.recordings:
+        count = len(drive.frames)
+        rows.append(np.hstack([_outlined(recordings, drive, k) for k in (0, count // 2, count - 1)]))
+    return Image.fromarray(np.vstack(rows))
+
+
+def _outlined(recordings: RecordingSet, drive: Recording, k: int) -> UInt8[np.ndarray, "h w 3"]:
+    view = recordings.view
+    zoom = max(1, round(400 / view.width_px))
+    picture = Image.fromarray(drive.frames[k]).resize((zoom * view.width_px, zoom * view.height_px))
+    edge = np.linspace(_CORNERS_PX, np.roll(_CORNERS_PX, -1, 0), 300).swapaxes(0, 1).reshape(-1, 2)
+    seen = np.column_stack([edge, np.ones(len(edge))]) @ (view.input_from_camera @ drive.image_from_canvas[k]).T
+    seen = seen[seen[:, 2] > 0]
+    pen = ImageDraw.Draw(picture)
+    for x, y in ((seen[:, :2] / seen[:, 2:] + 0.5) * zoom).clip(-10, 10_000).tolist():
+        pen.rectangle((x - 1, y - 1, x + 1, y + 1), fill=(255, 64, 0))
+    return np.asarray(picture)

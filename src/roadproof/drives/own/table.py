@@ -1,0 +1,108 @@
+"""The table of a drive: one row a step, dt_s apart.
+
+column                    meaning                                                           needed
+picture                   file of the camera's picture, relative to the folder; may be empty  yes
+x_m, y_m, yaw_rad         pose of the vehicle's origin on the ground, yaw left positive     one
+yaw_rate_rad_s            odometry with speed_mps, instead of poses                         of these
+far_left_x … near_left_y  the canvas' four corners in the picture, px, instead of both      three
+speed_mps                 forward                                                           without poses
+steer                     in [−1, 1], positive to the right                                 yes
+throttle, brake           in [0, 1]                                                         no: 0
+command                   CARLA's codes                                                     no: 2, follow
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from roadproof.drives.own.plan import PLAN, OwnDrive
+from roadproof.errors import RecordingError
+from roadproof.io.files import inside
+
+POSE = ("x_m", "y_m", "yaw_rad")
+CORNERS = tuple(f"{corner}_{axis}" for corner in ("far_left", "far_right", "near_right", "near_left") for axis in "xy")
+_COLUMNS = (*POSE, "yaw_rate_rad_s", *CORNERS, "speed_mps", "steer", "throttle", "brake", "command")
+_MOST_BYTES = 2**26
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """The rows of a drive.
+
+    Args:
+        drive: whose.
+        pictures: their files; empty where a step has none.
+        numbers: the columns of numbers, by name.
+    """
+
+    drive: OwnDrive
+    pictures: tuple[str, ...]
+    numbers: dict[str, Float[np.ndarray, " n"]]
+
+    @property
+    def pictured(self) -> Int[np.ndarray, " f"]:
+        """Steps that have a picture."""
+        return np.flatnonzero([bool(name) for name in self.pictures])
+
+    def column(self, name: str, usual: float = 0.0) -> Float[np.ndarray, " n"]:
+        """A column, or one value where the table has none."""
+        return self.numbers.get(name, np.full(len(self.pictures), usual))
+
+    def needed(self, name: str) -> Float[np.ndarray, " n"]:
+        """A column that has to be there.
+
+        Raises:
+            RecordingError: it is not.
+        """
+        if name not in self.numbers:
+            raise RecordingError(f"{self.drive.table} has no column {name}; see docs/recordings.md")
+        return self.numbers[name]
+
+
+def read_table(folder: Path, drive: OwnDrive) -> Table:
+    """The table of a drive.
+
+    Raises:
+        RecordingError: the file is missing, too long or no table, a column is unknown, or a number is none; says where.
+    """
+    path = inside(folder, drive.table, f"{folder / PLAN}: table", RecordingError)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise RecordingError(
+                f"{path} has more than {_MOST_BYTES >> 20} MiB, expected a row a step; leave others out"
+            )
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file)
+            rows = list(reader)
+            names = list(reader.fieldnames or ())
+    except OSError as reason:
+        raise RecordingError(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
+    except (ValueError, csv.Error) as reason:
+        raise RecordingError(f"{path} is no table of comma-separated values ({reason})") from None
+    if "picture" not in names or not rows:
+        raise RecordingError(f"{path} has {len(rows)} rows and columns {', '.join(names)!r:.200}; expected one picture")
+    numbers = {name: _numbers(path, name, rows) for name in names if name in _COLUMNS}
+    unknown = [name for name in names if name not in _COLUMNS and name != "picture"]
+    if unknown:
+        raise RecordingError(f"{path} has a column {unknown[0]!r:.60}, expected {', '.join(('picture', *_COLUMNS))}")
+    return Table(drive, tuple((row["picture"] or "").strip() for row in rows), numbers)
+
+
+def _numbers(path: Path, name: str, rows: Sequence[dict[str, str]]) -> Float[np.ndarray, " n"]:
+    found = np.empty(len(rows))
+    for k, row in enumerate(rows):
+        text = row[name]
+        try:
+            # Corners are known where there is a picture.
+            found[k] = np.nan if name in CORNERS and not text and not row["picture"] else float(text)
+        except (TypeError, ValueError):
+            raise RecordingError(f"{path}, row {k + 1}: {name} is {text!r:.60}, expected a number") from None
+        if np.isinf(found[k]) or (np.isnan(found[k]) and row["picture"]):
+            raise RecordingError(f"{path}, row {k + 1}: {name} is {text!r:.60}, expected a finite number")
+    return found

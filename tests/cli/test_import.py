@@ -1,0 +1,26 @@
+from __future__ import annotations
+
+from command import roadproof
+from own_drives import write_own
+from roadproof.errors import RecordingError
+from roadproof.io.pictures import read_picture
+from roadproof.recordings import load_recordings
+
+
+def test_pictures_and_tables_become_recordings(tmp_path):
+    folder, out = write_own(tmp_path / "mine"), tmp_path / "set"
+    said = roadproof("import", folder, "--out", out).stdout
+    assert "canvas 7.60 m across the road, 9.50 m along it" in said
+    assert f"next: roadproof attack {out}" in said
+    assert [drive.name for drive in load_recordings(out).recordings] == ["clean", "right", "left"]
+    assert read_picture(out / "preview.png", RecordingError, "").shape == (3 * 176, 3 * 400, 3)
+
+
+def test_what_is_there_already_is_kept(tmp_path):
+    folder, out = write_own(tmp_path / "mine", ["clean"]), tmp_path / "set"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    done = roadproof("import", folder, "--out", out)
+    assert done.returncode == 2
+    assert "exists already" in done.stderr
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from own_drives import CORNER_NAMES, INPUT, PLAN, changed_table, write_own
+from paint_shy import PaintShy
+from recorded_drives import CANVAS, track
+from roadproof.attacks import GradOpt, PathDeviation, attack
+from roadproof.drives.own import import_drives, preview
+from roadproof.drives.own.place import fitted_camera
+from roadproof.drives.own.plan import GroundPoint
+from roadproof.errors import RecordingError
+from roadproof.geometry import CIL_CAMERA, homography_from_pose
+from roadproof.io.pictures import read_picture
+from roadproof.recordings import Push
+from roadproof.search_space import SearchSpace
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    return write_own(tmp_path_factory.mktemp("own") / "street")
+
+
+def test_poses_place_the_canvas_in_every_frame(own):
+    recordings = import_drives(own)
+    assert [each.push for each in recordings.recordings] == [Push.CLEAN, Push.RIGHT, Push.LEFT]
+    assert recordings.is_placed
+    assert recordings.canvas == CANVAS
+    clean, driven = recordings.recordings[0], track()
+    for number, seen in zip(clean.frame_number.tolist(), clean.image_from_canvas, strict=True):
+        np.testing.assert_allclose(seen, homography_from_pose(CIL_CAMERA, driven.state(number), CANVAS), rtol=1e-12)
+    first = int(clean.frame_number[0])
+    picture = read_picture(own / "clean" / f"{first}.png", RecordingError, "")
+    assert np.array_equal(clean.frames[0], INPUT(picture))
+    np.testing.assert_array_equal(clean.track.steer, driven.steer)
+    assert preview(recordings).size == (3 * 400, 3 * 176)
+
+
+def test_they_can_be_attacked_and_driven_in(own):
+    recordings = import_drives(own)
+    method = GradOpt(iterations=2, restarts=1, halving=False)
+    found = attack(recordings, PaintShy(), SearchSpace(figures=1), objective=PathDeviation(), method=method)
+    assert found.predicted_m is not None
+    assert found.predicted_m >= 0.0
+
+
+def test_speed_and_yaw_rate_give_poses(tmp_path):
+    plan = PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 36.0")
+    folder = write_own(tmp_path / "own", ["clean"], ["yaw_rate_rad_s"], plan)
+    recordings, driven = import_drives(folder), track()
+    summed = recordings.recordings[0].track
+    c, s = np.cos(driven.yaw_rad[0]), np.sin(driven.yaw_rad[0])
+    x_m, y_m = driven.x_m - driven.x_m[0], driven.y_m - driven.y_m[0]
+    np.testing.assert_allclose(summed.x_m, c * x_m + s * y_m, atol=0.1)
+    np.testing.assert_allclose(summed.y_m, c * y_m - s * x_m, atol=0.1)
+    assert recordings.canvas.x_m == pytest.approx(36.0, abs=0.2)
+    assert recordings.canvas.yaw_rad == pytest.approx(0.0, abs=0.05)
+    twice = write_own(tmp_path / "two", ["clean", "left"], ["yaw_rate_rad_s"], plan)
+    with pytest.raises(RecordingError, match="do not say how drives lie to each other"):
+        import_drives(twice)
+
+
+def test_corners_of_the_canvas_give_poses_and_its_size(tmp_path):
+    plan = PLAN[: PLAN.index("[canvas]")]
+    folder = write_own(tmp_path / "own", columns=CORNER_NAMES, plan=plan, every=1)
+    recordings = import_drives(folder)
+    assert recordings.is_placed
+    assert recordings.canvas.width_m == pytest.approx(CANVAS.width_m, rel=0.01)
+    assert recordings.canvas.length_m == pytest.approx(CANVAS.length_m, rel=0.01)
+
+
+def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():
+    true = replace(CIL_CAMERA, up_m=1.62, pitch_deg=-11.0, fov_deg=88.0)
+    places = np.array([[6.0, -1.5], [6.0, 1.5], [14.0, -3.0], [25.0, 2.0]])
+    state = replace(track().state(0), x_m=0.0, y_m=0.0, yaw_rad=0.0)
+    x, y, depth = true.image_from_world(state) @ np.column_stack([places, np.zeros(4), np.ones(4)]).T
+    seen = zip(x / depth, y / depth, places, strict=True)
+    ground = [GroundPoint(x_px=a, y_px=b, ahead_m=p, left_m=q) for a, b, (p, q) in seen]
+    found = fitted_camera(CIL_CAMERA, ground)
+    assert (found.up_m, found.pitch_deg, found.fov_deg) == pytest.approx((1.62, -11.0, 88.0), abs=1e-3)
+    assert fitted_camera(CIL_CAMERA, ()) == CIL_CAMERA
+    with pytest.raises(RecordingError, match="expected 3 or more"):
+        fitted_camera(CIL_CAMERA, ground[:2])
+    with pytest.raises(RecordingError, match=r"missed by up to \d+\.\d px"):
+        fitted_camera(CIL_CAMERA, [*ground[:3], replace(ground[3], y_px=ground[3].y_px + 200)])
+
+
+def test_black_and_white_are_seen_as_stated(tmp_path):
+    plan = PLAN + "\n[colour]\nblack = [0.1, 0.1, 0.2]\nwhite = [0.8, 0.7, 0.9]\n"
+    response = import_drives(write_own(tmp_path / "own", ["clean"], plan=plan)).colour.response
+    two = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
+    torch.testing.assert_close(response(two), torch.tensor([[0.1, 0.1, 0.2], [0.8, 0.7, 0.9]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (PLAN.replace("dt_s", "dt"), "unknown key 'dt'"),
+        (PLAN.replace("dt_s = 0.05", "dt_s = -1"), "dt_s of the track is -1"),
+        (PLAN.replace("fov_deg = 100.0", "fov_deg = 400.0"), "fov_deg is 400"),
+        (PLAN.replace("width_px = 800", "width_px = 640"), "has 800×600 pixels, expected 640×600"),
+        (PLAN.replace("x_m = 130.0", "x_m = 900.0"), "never sees 8 pixels of the canvas at x_m 900.0"),
+        (PLAN.replace("x_m = 130.0\n", ""), "neither ahead_m nor"),
+        (PLAN + "ahead_m = 3\n", "both ahead_m and a place"),
+        (PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 1e4"), "expected 0 to 4"),
+        (PLAN[: PLAN.index("[canvas]")], r"no table \[canvas\]"),
+        (PLAN + "\n[colour]\nblack = [0.9, 0, 0]\nwhite = [0.8, 1, 1]\n", "0 ≤ black < white ≤ 1"),
+        (PLAN.replace("[camera]", "[camera]\nlens = 3"), "unknown field 'lens'"),
+    ],
+)
+def test_a_plan_that_makes_no_sense_is_refused(tmp_path, own, plan, message):
+    text = (own / "drives.toml").read_text()
+    folder = tmp_path / "changed"
+    folder.symlink_to(own)
+    try:
+        (own / "drives.toml").write_text(plan + text[len(PLAN) :])
+        with pytest.raises(RecordingError, match=message):
+            import_drives(folder)
+    finally:
+        (own / "drives.toml").write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("row", "values", "message"),
+    [
+        (0, {"picture": "../../secret.png"}, "is not a plain name"),
+        (0, {"picture": "/etc/passwd.png"}, "is not a plain name"),
+        (0, {"picture": "clean/none.png"}, "none.png is missing"),
+        (3, {"x_m": "1e9"}, "the pose jumps by"),
+        (3, {"x_m": "twelve"}, r"row 4: x_m is 'twelve'"),
+        (3, {"yaw_rad": "inf"}, r"row 4: yaw_rad is 'inf', expected a finite number"),
+        (3, {"steer": "7"}, r"steer of the track goes from"),
+    ],
+)
+def test_a_table_that_makes_no_sense_is_refused(tmp_path, row, values, message):
+    folder = write_own(tmp_path / "own", ["clean"])
+    text = (folder / "clean.csv").read_text().splitlines()
+    shown = [k for k, line in enumerate(text[1:]) if ".png" in line]
+    changed_table(folder / "clean.csv", shown[0] if row == 0 else row, **values)
+    with pytest.raises(RecordingError, match=message):
+        import_drives(folder)
+
+
+def test_columns_are_known_or_named(tmp_path):
+    folder = write_own(tmp_path / "own", ["clean"], columns=["x_m", "y_m"])
+    with pytest.raises(RecordingError, match="does not say where the car was"):
+        import_drives(folder)
+    table = folder / "clean.csv"
+    table.write_text(table.read_text().replace("x_m", "east_m", 1))
+    with pytest.raises(RecordingError, match="column 'east_m', expected picture, x_m"):
+        import_drives(folder)
+    table.write_text("")
+    with pytest.raises(RecordingError, match="has 0 rows"):
+        import_drives(folder)
+    table.unlink()
+    with pytest.raises(RecordingError, match="cannot read"):
+        import_drives(folder)
