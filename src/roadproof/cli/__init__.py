@@ -20,6 +20,7 @@ from roadproof.cli.calibrate import calibrate
 from roadproof.cli.carla import carla
 from roadproof.cli.check import check
 from roadproof.cli.check_controller import check_controller
+from roadproof.cli.compare import compare
 from roadproof.cli.controllers import controllers
 from roadproof.cli.convert_cil import convert_cil
 from roadproof.cli.demo import demo
@@ -52,6 +53,7 @@ VERBS = (
     verb(select),
     verb(evaluate, estimates=True),
     report,
+    compare,
     verb(check, estimates=True),
     verb(drive),
     scenarios,

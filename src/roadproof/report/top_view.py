@@ -26,7 +26,7 @@ SCALE_M = 5.0
 GROUND = Ground(VARIABLES["kerb"], VARIABLES["asphalt"], VARIABLES["marking"])
 
 
-def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: Episode) -> Chart:
+def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: Episode, name: str = "above") -> Chart:
     """Both drives past the canvas, from above.
 
     Args:
@@ -34,6 +34,7 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
         paint: the pattern on the canvas.
         clean: the drive without paint.
         painted: the drive over it.
+        name: a word that tells this chart from the page's others.
     """
     around = around_canvas(scenario.canvas)
     bare, driven = around(path_of(clean)), around(path_of(painted))
@@ -64,7 +65,7 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
         "From above: the bare-road drive (blue) and the drive over the paint (red) past the canvas"
         f"{f', with {count} numbered event' + ('s' if count != 1 else '') if count else ''}"
     )
-    return Chart(svg_of(figure, "above", words), words + ". Up is the direction of travel at the canvas.")
+    return Chart(svg_of(figure, name, words), words + ". Up is the direction of travel at the canvas.")
 
 
 def _road(scenario: Scenario) -> RoadMap | None:

@@ -1,0 +1,34 @@
+"""`roadproof compare`: run folders in, one page that shows them beside each other out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from roadproof.cli.options import argument
+from roadproof.cli.output import say, table
+
+
+def compare(
+    folders: Annotated[
+        list[Path], argument("Two runs or more, such as before and after a fix; the first is compared with.")
+    ],
+    out: Annotated[Path, typer.Option(help="The page.")] = Path("out/compare.html"),
+) -> None:
+    """Compare runs: one page with their numbers, paths and patterns side by side."""
+    from roadproof.report.comparison import write_comparison
+    from roadproof.report.formatting import mean_in_words, range_in_words
+
+    runs = write_comparison(folders, out)
+    kinds = sorted({each.predicted for each in runs})
+    names = ("predicted m" if kind else "driven m" for kind in kinds)
+    shown = table(("run", "controller", "street"), (*names, "change m", "leaves lane"))
+    for each in runs:
+        metres = (range_in_words(each.whole) if kind == each.predicted else "" for kind in kinds)
+        evaluation, left = each.judged.evaluation, f"{each.whole.left_lane:.0%}"
+        shown.add_row(
+            each.name, evaluation.controller, evaluation.scenario.name, *metres, mean_in_words(each.change, 2), left
+        )
+    say(shown, f"The page is {out}")

@@ -1,0 +1,171 @@
+"""Several runs beside each other on one page: before and after a fix, two controllers, two ways of searching.
+
+write_comparison([Path("out/before"), Path("out/after")], Path("out/compare.html"))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import roadproof
+from roadproof.datatypes import Weather
+from roadproof.driving.evaluation import ATTACK, Row
+from roadproof.driving.intervals import Mean, mean_95
+from roadproof.driving.trial import Trial
+from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.report import charts
+from roadproof.report.html import encoded, environment
+from roadproof.report.road_view import on_asphalt
+from roadproof.report.run import Judged, Run, read_run
+from roadproof.report.top_view import top_view
+from roadproof.report.verdict import Verdict, verdict
+
+MOST_RUNS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """One run of a comparison.
+
+    Args:
+        name: what it is called: its folder's name, with the folder above where two have the same.
+        run: all of it.
+        judged: its evaluation.
+        verdict: what it shows.
+        whole: its drives over the pattern, all weathers together, alone on the road where it has such.
+        change: of the deviation against the first run, drive by drive alone on the road, metres; None where none of
+            their drives have weather and start in common.
+    """
+
+    name: str
+    run: Run
+    judged: Judged
+    verdict: Verdict
+    whole: Row
+    change: Mean | None
+
+    @property
+    def predicted(self) -> bool:
+        """Whether its drives are predicted."""
+        return self.judged.evaluation.predicted
+
+    def in_weather(self, weather: Weather) -> Row | None:
+        """Its drives in one weather, alone on the road; None where there are none."""
+        rows = self.judged.evaluation.rows()
+        return next(
+            (row for row in rows if row.pattern == "attack" and row.weather == weather and not row.traffic), None
+        )
+
+
+def compared(folders: Sequence[AnyPath]) -> tuple[Compared, ...]:
+    """Read runs that are to be compared.
+
+    Args:
+        folders: two run folders or more, each with an evaluation; the first is what the others are compared with.
+
+    Raises:
+        RoadproofError: there is one alone or more than `MOST_RUNS`, one twice, one without an evaluation, or a stage is
+            damaged; the message names it.
+    """
+    paths = [as_path(folder) for folder in folders]
+    if not 2 <= len(paths) <= MOST_RUNS:
+        raise RoadproofError(f"{len(paths)} runs to compare, expected 2 to {MOST_RUNS}")
+    twice = [path for path in paths if [each.resolve() for each in paths].count(path.resolve()) > 1]
+    if twice:
+        raise RoadproofError(f"{twice[0]} is given twice; compare different runs")
+    runs = [(path, read_run(path)) for path in paths]
+    found: list[Compared] = []
+    for path, run in runs:
+        if run.judged is None:
+            raise RoadproofError(f"{path} has no evaluation, so there is nothing to compare; finish it, or evaluate")
+        whole = _whole(run.judged)
+        alone = run.judged.evaluation.of(traffic=False)
+        change = _change(found[0].judged.evaluation.of(traffic=False), alone) if found else None
+        found.append(Compared(_name(path, paths), run, run.judged, verdict(run), whole, change))
+    return tuple(found)
+
+
+def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compared, ...]:
+    """Write one page on several runs; it needs no other file.
+
+    Args:
+        folders: as `compared` takes them.
+        page: the HTML file.
+
+    Returns:
+        The runs, as compared.
+
+    Raises:
+        RoadproofError: as `compared`.
+        OutputError: the page cannot be written.
+    """
+    runs = compared(folders)
+    weathers = list(dict.fromkeys(weather for each in runs for weather in each.judged.evaluation.weathers))
+    first = runs[0].judged.evaluation.scenario
+    same_place = all(each.judged.evaluation.scenario.canvas == first.canvas for each in runs)
+    text = environment().get_template("compare.html.jinja").render(
+        version=roadproof.__version__,
+        runs=runs,
+        kinds=sorted({each.predicted for each in runs}),
+        weathers=weathers,
+        cautions=_cautions(runs, same_place=same_place),
+        offsets=charts.offsets([(each.name, each.judged.clean, each.judged.painted) for each in runs], first.canvas)
+        if same_place and len({each.predicted for each in runs}) == 1
+        else None,
+        patterns=[encoded(on_asphalt(each.judged.paint, 360, _size(each)), "PNG") for each in runs],
+        above=[_above(each, number) for number, each in enumerate(runs)],
+    )  # fmt: skip
+    write_atomically(as_path(page), lambda part: part.write_text(text, encoding="utf-8"))
+    return runs
+
+
+def _above(each: Compared, number: int) -> charts.Chart:
+    judged = each.judged
+    return top_view(judged.evaluation.scenario, judged.paint, judged.clean, judged.painted, f"above-{number}")
+
+
+def _size(each: Compared) -> tuple[float, float]:
+    canvas = each.judged.evaluation.scenario.canvas
+    return canvas.width_m, canvas.length_m
+
+
+def _name(path: Path, paths: Sequence[Path]) -> str:
+    whole = path.resolve()
+    shared = sum(each.resolve().name == whole.name for each in paths) > 1
+    return f"{whole.parent.name}/{whole.name}" if shared else whole.name
+
+
+def _whole(judged: Judged) -> Row:
+    rows = [row for row in judged.evaluation.rows() if row.pattern == ATTACK and not row.traffic]
+    return next((row for row in rows if row.weather is None), rows[0])
+
+
+def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Mean | None:
+    """The mean change of the deviation over drives that have all but pattern and controller in common."""
+    known = {_conditions(trial): trial.deviation_m for trial in before}
+    shared = [trial for trial in after if _conditions(trial) in known]
+    return mean_95([trial.deviation_m - known[_conditions(trial)] for trial in shared]) if shared else None
+
+
+def _conditions(trial: Trial) -> tuple[object, ...]:
+    return trial.weather, trial.traffic, trial.seed if trial.traffic else 0, trial.start
+
+
+def _cautions(runs: Sequence[Compared], *, same_place: bool) -> list[str]:
+    """Why numbers beside each other may not be alike."""
+    said: list[str] = []
+    if not same_place:
+        said.append("They are of different stretches of road: how far a car deviates depends on the road too.")
+    if len({each.predicted for each in runs}) > 1:
+        said.append("Some were driven and some only predicted in recordings: their metres are not of one kind.")
+    if len({frozenset(map(_conditions, each.judged.evaluation.trials)) for each in runs}) > 1:
+        said.append(
+            "They were not judged in the same weathers, from the same starts, with the same others on the road."
+        )
+    patterns = {each.judged.paint.tobytes() for each in runs}
+    if len(patterns) == len(runs):
+        said.append("Each was judged over a pattern of its own.")
+    return said

@@ -1,0 +1,93 @@
+"""Runs beside each other: their numbers, and what is said where they are not alike."""
+
+import dataclasses
+
+import pytest
+
+from command import roadproof
+from pages import HOSTILE, Page
+from roadproof.errors import RoadproofError
+from roadproof.patterns import raster
+from roadproof.report.comparison import compared, write_comparison
+from roadproof.scenarios import find_scenario
+from roadproof.simulators.protocol import PaintKind
+from runs import CRASH, PATTERN, write_run
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    write_run(folder / "before", aside_m=1.5, events=CRASH)
+    write_run(folder / "after", aside_m=0.4)
+    return folder / "before", folder / "after"
+
+
+def test_the_change_is_drive_by_drive(runs):
+    before, after = compared(runs)
+    assert (before.name, after.name) == ("before", "after")
+    assert before.change is None
+    trials = [each.judged.evaluation.of(traffic=False) for each in (before, after)]
+    differences = [two.deviation_m - one.deviation_m for one, two in zip(*trials, strict=True)]
+    assert after.change.value == pytest.approx(sum(differences) / len(differences))
+    assert after.change.value < -0.1
+    assert after.change.count == len(differences)
+
+
+def test_the_page_shows_both_and_needs_nothing_else(runs, tmp_path):
+    write_comparison(runs, tmp_path / "compare.html")
+    text = (tmp_path / "compare.html").read_text()
+    page = Page(text)
+    assert "driven, m" in page.text
+    assert "predicted, m" not in page.text
+    assert all(each["src"].startswith("data:") for each in page.all("img"))
+    names = [each["id"] for _, each in page.tags if "id" in each]
+    assert len(names) == len(set(names)), "charts share no names"
+    assert {"runs", "weathers", "offsets", "patterns"} <= set(names)
+    assert write_comparison(runs, tmp_path / "again.html")
+    assert (tmp_path / "again.html").read_text() == text
+
+
+def test_what_is_not_alike_is_said(runs, tmp_path):
+    write_run(tmp_path / "elsewhere", scenario=find_scenario("straight-02"))
+    write_comparison([runs[0], tmp_path / "elsewhere"], tmp_path / "compare.html")
+    page = Page((tmp_path / "compare.html").read_text())
+    assert "different stretches of road" in page.text
+    assert "offsets" not in [each["id"] for _, each in page.tags if "id" in each]
+
+
+def test_driven_and_predicted_never_share_a_column(runs, tmp_path):
+    evaluation = write_run(tmp_path / "predicted")
+    predicted = dataclasses.replace(evaluation, paint=PaintKind.COMPOSITED)
+    predicted.save(tmp_path / "predicted" / "evaluation", raster(PATTERN))
+    write_comparison([runs[0], tmp_path / "predicted"], tmp_path / "compare.html")
+    page = Page((tmp_path / "compare.html").read_text())
+    assert "driven, m" in page.text
+    assert "predicted, m" in page.text
+    assert "not of one kind" in page.text
+
+
+def test_names_from_files_are_escaped(tmp_path):
+    for name in ("one", "two"):
+        write_run(tmp_path / name, controller=HOSTILE)
+    write_comparison([tmp_path / "one", tmp_path / "two"], tmp_path / "compare.html")
+    assert "<script" not in (tmp_path / "compare.html").read_text()
+
+
+def test_what_cannot_be_compared_is_refused(runs, tmp_path):
+    with pytest.raises(RoadproofError, match="1 runs to compare, expected 2 to 8"):
+        compared(runs[:1])
+    with pytest.raises(RoadproofError, match="given twice"):
+        compared([runs[0], runs[0]])
+    with pytest.raises(RoadproofError, match="no folder"):
+        compared([runs[0], tmp_path / "none"])
+    done = roadproof("compare", runs[0], tmp_path, "--out", tmp_path / "page.html")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_the_command_shows_a_table(runs, tmp_path):
+    done = roadproof("compare", *runs, "--out", tmp_path / "deep" / "page.html")
+    assert done.returncode == 0, done.stderr
+    assert "change m" in done.stdout
+    assert (tmp_path / "deep" / "page.html").exists()
