@@ -2,6 +2,8 @@
 
 import pytest
 
+from command import roadproof
+
 ATTACK = ("attack", "nowhere", "--controller", "pilotnet")
 EVALUATE = ("evaluate", "nowhere.json", "--controller", "pilotnet")
 REFUSED = [
@@ -38,3 +40,17 @@ def test_the_help_states_the_range(invoke):
     code, printed = invoke("attack", "--help")
     assert code == 0
     assert "[1 to 64]" in printed.out
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("roadproof comp", ["compare"]),
+        ("roadproof demo --scenario straight-0", [f"straight-0{k}" for k in range(1, 10)]),
+        ("roadproof evaluate --weathers clear-noon,rai", ["clear-noon,rainy-noon"]),
+    ],
+)
+def test_the_shell_completes_commands_scenarios_and_weathers(words, expected):
+    asked = {"_ROADPROOF_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    done = roadproof(before=f"import os; os.environ.update({asked!r})")
+    assert sorted(done.stdout.split()) == expected

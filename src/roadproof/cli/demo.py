@@ -29,7 +29,11 @@ def demo(
     budget: options.BudgetName = "quick",
     rounds: Annotated[int, number("Rounds of searching on along the way that the attacked car took.", 0, 100)] = 0,
     attack_weathers: Annotated[
-        str, typer.Option(help="Weathers, with commas between, over which the mean is attacked.")
+        str,
+        typer.Option(
+            help="Weathers, with commas between, over which the mean is attacked.",
+            autocompletion=options.weather_names,
+        ),
     ] = "clear-noon",
     figures: options.Figures = 5,
     cheapest: options.CheapestFor = None,

@@ -28,7 +28,11 @@ def evaluate(
     scenario: options.ScenarioOrRecorded = None,
     scenarios: options.ScenarioFile = None,
     weathers: Annotated[
-        str | None, unset("Weathers, with commas between; the paper's four by default, or that of the recordings.")
+        str | None,
+        unset(
+            "Weathers, with commas between; the paper's four by default, or that of the recordings.",
+            options.weather_names,
+        ),
     ] = None,
     starts: Annotated[
         int,

@@ -43,9 +43,22 @@ def number(about: str, least: int | float, most: int | float, *, show_default: b
     return typer.Option(help=f"{about}  [{least:,} to {most:,}]", show_default=show_default, callback=check)
 
 
-def unset(about: str) -> Any:  # noqa: ANN401
+def unset(about: str, complete: Callable[[str], list[str]] | None = None) -> Any:  # noqa: ANN401
     """An option without a value of its own, so that the help shows no default."""
-    return typer.Option(help=about, show_default=False)
+    return typer.Option(help=about, show_default=False, autocompletion=complete)
+
+
+def scenario_names(begun: str) -> list[str]:
+    """The built-in scenarios that begin so, for the shell."""
+    return [scenario.name for scenario in scenarios_of(None) if scenario.name.startswith(begun)]
+
+
+def weather_names(begun: str) -> list[str]:
+    """The weathers that begin so, for the shell; of a list with commas, the last."""
+    from roadproof.datatypes import Weather
+
+    before, comma, last = begun.rpartition(",")
+    return [before + comma + weather for weather in Weather if weather.startswith(last)]
 
 
 def argument(about: str) -> Any:  # noqa: ANN401
@@ -68,12 +81,19 @@ BudgetName: TypeAlias = Annotated[
         "published: as the paper's authors had it, hours."
     ),
 ]
-ScenarioName: TypeAlias = Annotated[str, typer.Option(help="One of those that `roadproof scenarios` lists.")]
+ScenarioName: TypeAlias = Annotated[
+    str, typer.Option(help="One of those that `roadproof scenarios` lists.", autocompletion=scenario_names)
+]
 ScenarioOrRecorded: TypeAlias = Annotated[
-    str | None, unset("One of those that `roadproof scenarios` lists; left-03 by default, or that of the recordings.")
+    str | None,
+    unset(
+        "One of those that `roadproof scenarios` lists; left-03 by default, or that of the recordings.", scenario_names
+    ),
 ]
 ScenarioFile: TypeAlias = Annotated[Path | None, unset("TOML file with scenarios of your own; else the built-in 40.")]
-WeatherName: TypeAlias = Annotated[str, typer.Option(help="One of the eight, for instance rainy-noon.")]
+WeatherName: TypeAlias = Annotated[
+    str, typer.Option(help="One of the eight, for instance rainy-noon.", autocompletion=weather_names)
+]
 SimulatorSpec: TypeAlias = Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")]
 WorldSpec: TypeAlias = Annotated[
     str,
