@@ -15,8 +15,8 @@ kills: demo, attack, check, study with two workers, training and hardening, tiny
 SIGKILL, SIGTERM or SIGINT; half the times the file written last loses its end. The same command is given again, where
 need be after the file that it names was removed. Expected: all files as without a kill, byte for byte but for times.
 
-memory: what the process holds after each tenth of 50 evaluations and of 200 searches in the recorded world; wrong is more
-at the end than in the middle, by more than two parts of a hundred.
+memory: what the process holds after each tenth of 50 evaluations and of 200 searches in the recorded world; wrong is
+more at the end than in the middle, by more than two parts of a hundred.
 
 Without --part all of them. A part's counts replace the old ones in OUT; the others stay.
 """
