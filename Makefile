@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 OUT ?= out/demo
 
-.PHONY: demo test fuzz lint bench clean
+.PHONY: demo test fuzz lint docs bench clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; \
@@ -39,6 +39,11 @@ lint: $(STAMP)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
 
+# The documentation as a site that needs no network: out/docs/index.html. A warning is an error.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --group docs
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html docs out/docs
+
 # What needs no development data; each file of benchmarks/ says how to run it.
 bench: $(STAMP)
 	mkdir -p out
@@ -46,4 +51,4 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/simulator_speed.py --json out/simulator_speed.json
 
 clean:
-	rm -rf $(VENV) build dist out
+	rm -rf $(VENV) build dist out docs/api
