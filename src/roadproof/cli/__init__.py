@@ -28,6 +28,7 @@ from roadproof.cli.drive import drive
 from roadproof.cli.evaluate import evaluate
 from roadproof.cli.harden import harden
 from roadproof.cli.import_ import import_
+from roadproof.cli.open_ import open_
 from roadproof.cli.record import record
 from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
@@ -65,6 +66,7 @@ VERBS = (
 for each in VERBS:
     app.command()(each)
 app.command("import")(import_)
+app.command("open")(open_)
 app.add_typer(carla, name="carla")
 app.add_typer(study, name="study")
 
