@@ -15,6 +15,7 @@ TEXTS = [
     for folder in ("README.md", "docs", "examples")
     for place in [Path(__file__).parents[1] / folder]
     for path in ([place] if place.is_file() else [*place.glob("*.md"), *place.glob("*.py")])
+    if path.name != "conf.py"  # builds the docs, and is none of them
 ]
 
 
