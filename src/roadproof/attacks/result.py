@@ -16,9 +16,10 @@ from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
+from roadproof.io.html import picture, png, table
 from roadproof.io.records import Form, RecordFile, plain
 from roadproof.paint import Conspicuousness
-from roadproof.patterns import Pattern, load_pattern, save_pattern
+from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.search_space import SearchSpace
 
 
@@ -108,6 +109,20 @@ class AttackResult:
     predicted_range_m: tuple[float, float] | None = None
     driven: Effect | None = None
     conspicuousness: Conspicuousness | None = None
+
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: the pattern, and what each kind of number says."""
+        low, high = self.predicted_range_m or (0.0, 0.0)
+        known = (
+            ("made large", f"{self.objective}, for {self.group}, by {self.method.word}"),
+            ("surrogate", None if self.surrogate_shift is None else f"{self.surrogate_shift:+.3f} steer a frame"),
+            ("predicted", self.predicted_m and f"{self.predicted_m:.2f} m of deviation ({low:.2f} to {high:.2f})"),
+            ("driven, to choose it", self.driven and f"{self.driven.deviation:.2f} m of deviation"),
+            ("took", f"{self.cost.seconds:.0f} s, {self.cost.simulator_calls} simulator calls"),
+            *(("look at", f"{each.name}: {each.finding}") for each in self.checks if not each.passed),
+        )
+        shown = picture(png(raster(self.pattern)), "the strongest pattern", 200)
+        return shown + table(("attack", ""), [(name, value) for name, value in known if value])
 
     def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.

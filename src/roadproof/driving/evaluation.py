@@ -27,6 +27,7 @@ from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
 from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.io.html import table
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
 from roadproof.scenarios import Scenario, load_scenarios, save_scenarios
@@ -150,6 +151,12 @@ class Evaluation:
         """The trial that stands for all in pictures: the first weather's, without traffic."""
         return self.of(traffic=False)[0]
 
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: a row for the drives of each weather, and of all of them."""
+        metres = "predicted m" if self.predicted else "driven m"
+        head = ("pattern", "weather", "traffic", "drives", f"{metres}: median (least–most)", "leave the lane", "points")
+        return table(head, map(_shown, self.rows()))
+
     def save(self, folder: AnyPath, paint: PatternImage) -> None:
         """Write everything but the episodes, which are there already.
 
@@ -233,6 +240,13 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
         failed=None if points is None else len(first) / len(trials),
         first_event_s=mean_95(first) if first else None,
     )
+
+
+def _shown(row: Row) -> tuple[object, ...]:
+    points = "not known" if row.points is None else f"{row.points.value:.1f}"
+    metres = f"{row.median_m:.2f} ({row.least_m:.2f}–{row.most_m:.2f})"
+    traffic = "yes" if row.traffic else "no"
+    return row.pattern, row.weather or "all", traffic, row.count, metres, f"{row.left_lane:.0%}", points
 
 
 def _save_scenario(scenario: Scenario, folder: Path) -> None:

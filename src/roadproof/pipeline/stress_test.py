@@ -29,6 +29,7 @@ from roadproof.controllers.checks import require_usable
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
+from roadproof.io.html import html_of, table
 from roadproof.io.locks import working_in
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
@@ -78,6 +79,13 @@ class StressTest:
     def pattern(self) -> Pattern:
         """The one that was chosen in the end."""
         return _chosen(self.attack, self.selection, self.rounds)
+
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: the search, its prediction beside the drive, and the drives that judge it."""
+        told = self.prediction
+        rows = [] if told is None else [(f"{told.predicted_m:.2f}", f"{told.driven_m:.2f}")]
+        search, judged = map(html_of, (self.attack, self.evaluation))
+        return search + table(("predicted m", "driven m, to verify"), rows) + judged
 
 
 def stress_test(
