@@ -33,8 +33,8 @@ def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: 
 
     Args:
         simulator: an open simulator of the kind that drove.
-        evaluation: the drives that were judged.
-        folder: where its episodes are.
+        evaluation: the evaluation with the drives that were judged.
+        folder: the folder with the evaluation's episodes.
         paint: the canvas as it was painted.
 
     Raises:

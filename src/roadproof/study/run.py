@@ -36,18 +36,18 @@ def run_study(
     cluster: str | None = None,
     on_job: OnJob = lambda _done, _job, _result: None,
 ) -> Frame:
-    """Do every job that is not done yet, and gather the rows.
+    """Do every job of a study that is not done yet, and gather the rows.
 
     A job that fails becomes a row that says why, and the others go on. Killed in the middle, the same call does what
     is left; a job that failed is tried again.
 
     Args:
-        study: what to compare.
-        folder: where results are kept; may hold those of a run before.
+        study: the study whose jobs are done.
+        folder: the folder where results are kept; may hold those of a run before.
         work: does one job; a function of a module, since it runs in other processes.
-        workers: processes on this machine, each with one thread.
-        cluster: address of a Ray cluster, "local" for one on this machine; None stays without Ray.
-        on_job: told of every job.
+        workers: how many processes work on this machine, each with one thread.
+        cluster: address of a Ray cluster, "local" for one on this machine; None does without Ray.
+        on_job: called after every job with how many are done, the job and its result.
 
     Raises:
         StudyError: an argument makes no sense, or an extra is missing.
