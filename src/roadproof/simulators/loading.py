@@ -37,10 +37,10 @@ def is_server(spec: str) -> bool:
 
 
 def is_elsewhere(spec: str) -> bool:
-    """Whether it is on another machine.
+    """Whether the simulator of a spec is on another machine.
 
     Raises:
-        SimulatorError: it is no address.
+        SimulatorError: the spec is no address.
     """
     return is_server(spec) and _address(spec)[0] not in ("localhost", "127.0.0.1", "::1")
 

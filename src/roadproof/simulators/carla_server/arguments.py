@@ -72,8 +72,8 @@ class Signature:
     """The arguments that a method takes from the wire.
 
     Args:
-        names: of its parameters.
-        decoders: each reads one argument as its annotation declares.
+        names: the names of the parameters.
+        decoders: for each parameter, what reads its argument as its annotation declares.
     """
 
     names: tuple[str, ...]
@@ -94,7 +94,7 @@ class Signature:
         """The arguments of a call.
 
         Raises:
-            SimulatorError: there are more or fewer, or one is of another type or out of range.
+            SimulatorError: there are more or fewer arguments, or one is of another type or out of range.
         """
         if len(arguments) != len(self.names):
             expected = f"{len(self.names)} ({', '.join(self.names)})" if self.names else "none"
@@ -104,10 +104,10 @@ class Signature:
 
 
 def read(what: str, decoder: Decoder[Any], sent: Raw) -> Value:
-    """One value as a client sent it.
+    """Read one value that a client sent.
 
     Raises:
-        SimulatorError: it is of another type, or out of range; the message says what it is and what was expected.
+        SimulatorError: the value is of another type or out of range; the message says what it is and what was expected.
     """
     try:
         return decoder.decode(sent)

@@ -40,7 +40,7 @@ class Screens:
         return screen
 
     def close(self) -> None:
-        """Give all back; they are made anew where they are asked for again."""
+        """Give all screens back; they are made anew where they are asked for again."""
         for screen in self._screens.values():
             screen.close()
         self._screens.clear()
