@@ -56,7 +56,7 @@ FORMAT = "roadproof-hardening"
 FORMAT_VERSION = 1
 WEIGHTS = "hardened.safetensors"
 _FRESH = 1000
-"""Between the seeds of training and those of judging."""
+"""Distance between the seeds of training and those of judging."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Hardened:
     """What came of a hardening.
 
     Args:
-        controller: the spec it began with.
+        controller: the spec of the controller that it began with.
         hardened: the spec of the hardened controller, for `load_controller` and every verb.
         rounds: the re-tests on the streets for training, round 0 first.
         best: number of the round whose controller is kept: the one after a tuning with the least mean deviation.
@@ -136,7 +136,7 @@ def harden(
         TrainingError: there are no rounds, streets for training and judging are not disjoint, the folder holds another
             hardening, or the training step gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
-        RoadproofError: a stage refuses.
+        RoadproofError: a stage refuses; the message says why.
     """
     folder = as_path(folder)
     check_streets(scenarios, judge_on)

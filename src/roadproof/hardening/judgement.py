@@ -191,7 +191,7 @@ class Judge:
         """Attack with every kind of search, and drive over what was found against the controller before.
 
         Raises:
-            RoadproofError: a stage refuses.
+            RoadproofError: a stage refuses; the message says why.
         """
         tested = stress_test(
             self.simulator,

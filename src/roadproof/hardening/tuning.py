@@ -57,7 +57,7 @@ TrainingStep: TypeAlias = Callable[[nn.Module, TuningBatch], Tensor]
 """The loss of a batch, differentiable in the controller's parameters; one of the user's own, or `training_step`."""
 
 OnStep: TypeAlias = Callable[[int, float], object]
-"""Told of the step and the mean loss since the last time."""
+"""Called with the step and the mean loss since the call before."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

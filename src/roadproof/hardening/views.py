@@ -29,7 +29,7 @@ AHEAD_M, LEFT_M, TURN_RAD = 1.5, 1.5, 0.4
 """A pose further from every recorded one is left out: its picture says little."""
 
 RECORDED_M = 1.5
-"""As far aside as drives are recorded; the law of steering is not believed beyond."""
+"""How far aside drives are recorded; the law of steering is not believed beyond."""
 
 
 class Views(NamedTuple):
@@ -63,7 +63,7 @@ class Street:
         device: the torch device on which pictures are made.
 
     Raises:
-        RecordingError: nobody can drive in these recordings.
+        RecordingError: the recordings cannot be driven in.
         ControllerError: the teacher raises, or answers wrongly.
     """
 
