@@ -46,7 +46,7 @@ Pictures: TypeAlias = bool | frozenset[int]
 """Which observations of a drive have the full camera picture: all, none, or those after so many steps."""
 
 PaintChoice: TypeAlias = Literal["inject", "native", "auto"]
-"""What can be asked of a CARLA server; "auto" is the second if it works there, else the first."""
+"""How a CARLA server may be asked to paint; "auto" is "native" where that works, else "inject"."""
 
 
 @runtime_checkable

@@ -30,7 +30,7 @@ from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.protocol import PatternImage
 
 ROAD = "road"
-"""In the names of the objects that may be pieces of road."""
+"""A part of the names of objects that may be pieces of road."""
 
 TEXTURE_PX = 512
 BEHIND_M, ABOVE_M = 8.0, 9.0

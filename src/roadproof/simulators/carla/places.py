@@ -98,7 +98,7 @@ def _kind(route: Route) -> Kind:
 
 
 def _canvas(roads: RoadMap, route: Route, at_m: float) -> CanvasPlacement:
-    """Over both lanes of the road where they are there, else over the own one."""
+    """A canvas over both lanes of the road where there are two, else over the car's own."""
     x, y, z, heading = route.at(at_m)
     lane = roads.lanes[roads.nearest_lane(x, y, heading).lane]
     half = lane.width_m / 2

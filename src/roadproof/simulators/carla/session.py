@@ -44,7 +44,7 @@ class Session:
         painted: whether objects have textures that are not the map's own.
 
     Raises:
-        SimulatorError: nobody answers there, or it is a server of another version.
+        SimulatorError: no server answers there, or it is one of another version.
     """
 
     def __init__(self, host: str, port: int, *, dt_s: float, patience_s: float, loading_s: float) -> None:

@@ -144,7 +144,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
             A drive over a canvas on it, and the piece.
 
         Raises:
-            RoadproofError: there is none; the message says what was seen.
+            RoadproofError: no such piece of road can be painted; the message says what was seen.
         """
         session = self.session
         name = session.map_name()

@@ -42,13 +42,13 @@ Place: TypeAlias = tuple[Metres, Metres, Metres]
 WirePose: TypeAlias = tuple[Place, tuple[Degrees, Degrees, Degrees]]
 Velocity: TypeAlias = tuple[Mps, Mps, Mps]
 Description: TypeAlias = tuple[Id, Text, Annotated[list[tuple[Text, Int32, Text]], Meta(max_length=64)]]
-"""Of an actor to spawn: the number and the name of its blueprint, and attributes as (name, type, value)."""
+"""An actor to spawn: the number and the name of its blueprint, and attributes as (name, type, value)."""
 
 VehicleControl: TypeAlias = tuple[Level, Level, Level, bool, bool, bool, Int32]
 """Throttle, steer, brake, hand brake, reverse, manual gear shift, gear."""
 
 WalkerControl: TypeAlias = tuple[tuple[Level, Level, Level], Mps, bool]
-"""Direction, m/s, jump."""
+"""A walker's direction, its speed in m/s, and whether it jumps."""
 
 Weather: TypeAlias = Annotated[tuple[Number, ...], Meta(min_length=14, max_length=14)]
 FixedStep: TypeAlias = Annotated[list[bool | Number], Meta(max_length=2)]
@@ -58,7 +58,7 @@ Texture: TypeAlias = tuple[Side, Side, list[tuple[Byte, Byte, Byte, Byte]]]
 """Width, height, and RGBA row by row."""
 
 Commands: TypeAlias = Annotated[list[tuple[tuple[Id, Raw]]], Meta(max_length=limits.ITEMS)]
-"""Which one of CARLA's commands, and its fields."""
+"""Commands of a batch: for each, which one of CARLA's commands it is, and its fields."""
 
 SpawnCommand: TypeAlias = tuple[
     Description, WirePose, Annotated[list[bool | Id], Meta(max_length=2)], int, Text, Commands

@@ -8,8 +8,8 @@ from roadproof.geometry import CameraModel
 from roadproof.simulators.town.engine import Screen
 
 KEPT, KEPT_PIXELS = 16, 1 << 23
-"""Screens, and pixels of all their pictures together. One alone may be larger; where more are in use, each is made anew
-for every picture."""
+"""Most screens, and most pixels of all their pictures together. One alone may be larger; where more are in use, each is
+made anew for every picture."""
 
 Lens = tuple[int, int, float]
 
