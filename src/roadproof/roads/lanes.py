@@ -48,8 +48,8 @@ class Lane:
 
     Args:
         index: its place in the map's list of lanes.
-        road: id of its road.
-        section: which section of the road.
+        road: id of the road that the lane belongs to.
+        section: index of its section along the road.
         number: OpenDRIVE's number of the lane; negative runs along the road, positive against it.
         kind: "driving", "sidewalk", "shoulder" …
         centre: points in the direction of travel, at most a metre apart, closer in bends, (N, 3), metres.

@@ -108,7 +108,7 @@ def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[i
     """Lanes from a place (lane, arc length) to another, by A* over lane lengths with the straight line as its bound.
 
     Raises:
-        ScenarioError: no way leads there.
+        ScenarioError: no way leads from the start to the goal.
     """
     (first, from_m), (last, to_m) = start, goal
     if first == last and to_m >= from_m - SPACING_M:
