@@ -89,7 +89,7 @@ def draw_road(axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: Bo
 
     Args:
         axes: the axes to draw on.
-        road: the map.
+        road: the map that is drawn.
         around: the function from world x, y to the plane of the axes (`around_canvas`, `in_world`).
         box: left, low, right and high edge of what is drawn, in metres of that plane.
         ground: the colours of the road.

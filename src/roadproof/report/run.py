@@ -75,7 +75,7 @@ class Run:
     """What a run folder holds; None for a stage that is not there.
 
     Args:
-        folder: the run folder.
+        folder: the run folder that was read.
         drives: the drives as they were recorded, before calibration.
         recordings: the calibrated set of recordings.
         calibration: what the calibration says of itself.
