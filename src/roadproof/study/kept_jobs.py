@@ -64,7 +64,7 @@ class KeptJob(_Stated):
     Args:
         id: the scenario, K, method and seed of the job.
         controller: spec of the controller that the pattern was found against.
-        scenario: its map and its canvas.
+        scenario: the map and the canvas of the scenario.
         method: how the pattern was searched.
         folder: the folder with the job's files.
     """

@@ -23,7 +23,7 @@ from roadproof.simulators.protocol import PatternImage, Simulator
 PICTURES = 6
 SIZE_PX = (240, 180)
 HORIZON_M = 14.0
-"""The first picture is taken so far before the canvas, the last at its end."""
+"""Distance before the canvas at which the first picture is taken; the last is taken at the canvas' end."""
 
 
 def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: PatternImage) -> dict[str, bytes]:
@@ -38,7 +38,7 @@ def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: 
         paint: the canvas as it was painted.
 
     Raises:
-        SimulatorError: as `rollout` does.
+        SimulatorError: as `rollout` raises it.
     """
     files: dict[str, bytes] = {}
     for weather, traffic in product(evaluation.weathers, (False, True)):

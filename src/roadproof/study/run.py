@@ -24,7 +24,7 @@ Work: TypeAlias = Callable[[Job, Path], JobResult]
 """Does a job; the folder is its own, and holds what a run before this one left there."""
 
 OnJob: TypeAlias = Callable[[int, Job, JobResult], object]
-"""Told how many jobs are done, and of the last one and its result."""
+"""Called with how many jobs are done, the last one, and its result."""
 
 
 def run_study(
@@ -82,7 +82,7 @@ def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
 
 
 def _compute_with_one_thread() -> None:
-    """From now on: where a search ends depends on it, and rows must not depend on how many jobs are done at once."""
+    """Use one thread from now on: where a search ends depends on it, and rows must not depend on how many jobs run."""
     # What is loaded already keeps to limits, what is loaded later to the variable.
     import_module("threadpoolctl").threadpool_limits(1)
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -16,7 +16,7 @@ class Estimate:
     """A mean that is shown with its interval.
 
     Args:
-        mean: the number.
+        mean: the mean and both ends of its interval.
         digits: how many digits stand after the point.
         best: whether the mean is the best of its row.
         unit: the unit behind the number; "%" for shares, which are in [0, 1].

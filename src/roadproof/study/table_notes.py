@@ -9,7 +9,7 @@ from roadproof.study.results import JOB, PENALTY, Block, Results
 
 SHOWN_GAPS = 3
 ENOUGH = 10
-"""Scenarios; with fewer a percentile bootstrap covers clearly less than it claims."""
+"""The least scenarios; with fewer a percentile bootstrap covers clearly less than it claims."""
 
 
 def table_note(results: Results, blocks: Sequence[Block], methods: Sequence[str], said: str) -> str:
