@@ -11,7 +11,7 @@ from PIL import Image
 from roadproof.errors import RoadproofError
 
 MOST_PIXELS = 40_000_000
-"""A picture that claims more is not unpacked."""
+"""A picture that claims more pixels is not unpacked."""
 
 
 def read_picture(

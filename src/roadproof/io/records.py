@@ -233,7 +233,7 @@ def _typed(stored: Any, kind: Any, name: str) -> object:  # noqa: ANN401
     """A field's value, from what a file holds of it.
 
     Raises:
-        ValueError: it is of another type; says which.
+        ValueError: the value is of another type; says which.
     """
     if _is_array(kind):
         return _array(np.asarray(stored), kind, name)
