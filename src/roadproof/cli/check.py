@@ -77,7 +77,7 @@ def check(
 
 
 def _estimate(plan: CheckPlan, who: Controller, processes: int) -> Estimate:
-    """Of all cases; a fresh attack is a whole stress test but for its evaluation."""
+    """The estimate of all cases; a fresh attack is a whole stress test but for its evaluation."""
     from roadproof.pipeline.budget import QUICK
     from roadproof.pipeline.estimate import of_drives, of_run
 

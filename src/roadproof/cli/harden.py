@@ -108,7 +108,7 @@ def harden(
 
 
 def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int) -> Estimate:
-    """Of attacks and tuning, and of judging before and after; streets of training and judging are driven clean."""
+    """The estimate of attacks, tuning and judging, where clean drives are those on all streets, before and after."""
     from roadproof.pipeline.estimate import Estimate, frame_seconds, of_drives, of_run, of_search
 
     tuning = budget.tuning

@@ -120,7 +120,7 @@ def check_simulator(simulator: str, processes: int = 1) -> None:
     """See that a simulator is named, and that several processes have one each.
 
     Raises:
-        RoadproofError: there is none of this name, or they would share one server.
+        RoadproofError: no simulator has this name, or several processes would share one server.
     """
     # The road map comes with it; `--help` is spared.
     from roadproof.simulators.loading import check_spec, is_server
@@ -133,10 +133,10 @@ def check_simulator(simulator: str, processes: int = 1) -> None:
 
 
 def choice(value: str, option: str, allowed: Sequence[Word]) -> Word:
-    """The allowed word that was given.
+    """The allowed word that an option's value is.
 
     Raises:
-        RoadproofError: it is none of them; the message names the nearest.
+        RoadproofError: the value is none of the allowed words; the message names the nearest.
     """
     for word in allowed:
         if value == word:
@@ -161,7 +161,7 @@ def scenario_of(name: str, file: Path | None) -> Scenario:
     """The scenario of a name, from a file or the built-in ones.
 
     Raises:
-        ScenarioError: the file is missing or damaged, or holds none of this name; the message names the nearest.
+        ScenarioError: the file is missing or damaged, or no scenario has this name; the message names the nearest.
     """
     from roadproof.scenarios import find_scenario
 
@@ -172,7 +172,7 @@ def weather_of(name: str, option: str = "weather") -> Weather:
     """The weather of a name.
 
     Raises:
-        RoadproofError: there is none of this name; the message names the nearest.
+        RoadproofError: no weather has this name; the message names the nearest.
     """
     from roadproof.datatypes import Weather
 
@@ -180,10 +180,10 @@ def weather_of(name: str, option: str = "weather") -> Weather:
 
 
 def weathers_of(names: str, option: str) -> tuple[Weather, ...]:
-    """The weathers of a list with commas between.
+    """The weathers whose names stand in a list, with commas between.
 
     Raises:
-        RoadproofError: one of them is none, where the message names the nearest, or is there twice.
+        RoadproofError: a name is no weather's, where the message names the nearest, or is there twice.
     """
     found = tuple(weather_of(name.strip(), option) for name in names.split(","))
     for weather in found:
@@ -196,7 +196,7 @@ def driver_of(spec: str, device: str) -> Controller | Callable[[MappedSimulator]
     """The expert, or the controller of a spec.
 
     Raises:
-        ControllerError: it is neither, or cannot be loaded.
+        ControllerError: the spec is neither of the expert nor of a controller, or the controller cannot be loaded.
     """
     from roadproof.controllers import load_controller, shipped_names
     from roadproof.controllers.loading import SPECS

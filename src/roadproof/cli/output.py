@@ -20,8 +20,8 @@ def table(words: tuple[str, ...], numbers: tuple[str, ...] = (), *, title: str |
     Args:
         words: the columns that hold text.
         numbers: the columns after them, which hold numbers.
-        title: a line above the table.
-        note: a line below it.
+        title: a line above the table; None for none.
+        note: a line below the table; empty for none.
     """
     made = Table(*words, box=box.SIMPLE, title=title, title_justify="left", caption=note, caption_justify="left")
     for column in numbers:

@@ -22,12 +22,12 @@ GROUP = "Paint that could be real"
 
 @dataclass(frozen=True, slots=True)
 class Paint:
-    """What the options say.
+    """What the options on paint say.
 
     Args:
-        limits: what paint may be; None where nothing is limited.
+        limits: limits on paint; None where nothing is limited.
         variation: what the search takes the mean over; None for paint and camera as recorded.
-        given: the options as words, to give the same command again.
+        given: the options that were given, by name, to give the same command again.
     """
 
     limits: PaintLimits | None

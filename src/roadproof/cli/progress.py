@@ -42,7 +42,7 @@ _loudness = Loudness.USUAL  # one command a process
 
 
 def speak(loudness: Loudness) -> None:
-    """Say so much from now on."""
+    """Set how much is said from now on."""
     global _loudness
     _loudness = loudness
 
@@ -59,14 +59,14 @@ def progress(
     """Show one stage, and give the function that says how far it is.
 
     Args:
-        title: what is going on.
-        total: steps there are.
-        value: how the number beside them is shown.
-        begun: how many of them were done before; they say nothing on the time left.
-        remember_s: how far back the steps go from which the time left is told; `HOURS_S` where each takes minutes.
+        title: the name of the stage.
+        total: how many steps the stage has.
+        value: format of the number that is shown beside the steps.
+        begun: how many steps were done before; they say nothing on the time left.
+        remember_s: how many seconds of past steps tell the time left; `HOURS_S` where each step takes minutes.
 
     Yields:
-        What to call with the steps done and that number.
+        The function to call with how many steps are done and the number beside them.
     """
     with _shown(remember_s) as show:
         show(title, begun, total, value.format(0.0))
@@ -78,7 +78,7 @@ def stages() -> Generator[Show]:
     """Show each of several stages, and give the function that says how far they are.
 
     Yields:
-        What to call with a stage's name, the steps done, how many there are, and what to show beside them.
+        The function to call with a stage's name, the steps done, how many there are, and what to show beside them.
     """
     with _shown(_SECONDS_S) as show:
         yield show
@@ -135,7 +135,7 @@ class _Lines:
             self._tell()
 
     def break_silence(self, ended: threading.Event) -> None:
-        """Say where the work is, so often, until it is done."""
+        """Say where the work is, every `EVERY_S` seconds of silence, until it is done."""
         while not ended.wait(max(self._told_s + EVERY_S - time.monotonic(), 0.01)):
             if time.monotonic() - self._told_s >= EVERY_S:
                 self._tell()

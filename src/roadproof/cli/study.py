@@ -76,7 +76,7 @@ def run(
 
 
 def _estimate(study: Study, who: Controller, workers: int) -> Estimate:
-    """Of all jobs, those that are done too."""
+    """The estimate of all jobs, also of those that are done already."""
     from roadproof.pipeline.estimate import Estimate, of_drives, of_evaluation, of_run
     from roadproof.study.methods import BlackBoxPlan, budget_of
 

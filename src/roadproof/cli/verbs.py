@@ -34,8 +34,8 @@ def verb(function: Callable[..., None], *, estimates: bool = False) -> Callable[
     """A verb with --quiet and --verbose, and --dry-run where it calls `begin`.
 
     Args:
-        function: the verb.
-        estimates: whether it does.
+        function: the function that does the verb's work.
+        estimates: whether the verb calls `begin`, and so takes --dry-run.
     """
 
     @functools.wraps(function)
@@ -73,8 +73,8 @@ def begin(estimate: Estimate, *folders: Path) -> None:
     """Work in folders until the command ends, and say what that takes where it takes long; a dry run ends here.
 
     Args:
-        estimate: of all the work, also of what the folders may hold already.
-        folders: for results.
+        estimate: the estimate of all the work, also of what the folders may hold already.
+        folders: the folders for results.
 
     Raises:
         OutputError: a folder cannot be written, or another process works in it.

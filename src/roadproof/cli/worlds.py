@@ -26,7 +26,7 @@ class Recorded:
 
     Args:
         folder: the folder of the set.
-        scenario: the scenario that was recorded, where the set lies in a run that says so.
+        scenario: the scenario that was recorded, where the set lies in a run that says so; else None.
         weather: the weather it was recorded in; a set alone does not say it, and its light is called clear-noon.
     """
 
@@ -41,9 +41,9 @@ class World:
 
     Args:
         spec: "town", "carla://HOST:PORT" or "recorded:FOLDER".
-        device: where a recorded world makes its pictures.
+        device: the torch device on which a recorded world makes its pictures.
         recorded: the recordings that are driven in; None in a simulator.
-        scenario: what is driven; None for the recorded stretch itself.
+        scenario: the scenario that is driven; None for the recorded stretch itself.
     """
 
     spec: str
@@ -53,7 +53,7 @@ class World:
 
     @contextmanager
     def open(self) -> Generator[tuple[MappedSimulator | RecordedSimulator, Scenario]]:
-        """Open it for a with-block, which gets the simulator and the scenario; a recorded one begins where the
+        """Open the world for a with-block, which gets the simulator and the scenario; a recorded one begins where the
         recordings do.
 
         Raises:
@@ -123,10 +123,10 @@ def open_world(spec: str, device: str = "cpu") -> Generator[MappedSimulator | Re
 
     Args:
         spec: "town", "carla://HOST:PORT" or "recorded:FOLDER".
-        device: where a recorded world makes its pictures.
+        device: the torch device on which a recorded world makes its pictures.
 
     Raises:
-        RoadproofError: there is none of this name, or what it needs is not there.
+        RoadproofError: no world has this name, or what it needs is not there.
     """
     from roadproof.recorded import RecordedSimulator
     from roadproof.recordings import load_recordings

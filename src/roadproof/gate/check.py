@@ -66,16 +66,16 @@ def run_check(
     """Drive every case of a plan, judge it by the plan's limits, and write what came of it.
 
     Args:
-        plan: what is driven, and what passes.
-        controller: that is checked.
-        folder: for results; an interrupted check goes on from what it holds.
+        plan: the cases to drive, and the limits that they are judged by.
+        controller: the controller that is checked.
+        folder: the folder for the results; an interrupted check goes on from what it holds.
         compare: whether to compare with the plan's reference.
-        device: where attacks and recorded worlds compute.
-        processes: drives made at once, each in a process with a world of its own.
-        on_progress: told of every stage, how much of it is done, of how much, and a word on it.
+        device: the torch device on which attacks and recorded worlds compute, such as "cpu" or "cuda".
+        processes: how many drives are made at once, each in a process with a world of its own.
+        on_progress: called in every stage with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
-        CheckError: the reference is missing, or of other conditions.
+        CheckError: the reference is missing, damaged, or was made under other conditions.
         ControllerError: the controller raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator is not there or stopped answering.
         OutputError: the folder cannot be written, or another process works in it.
@@ -107,7 +107,7 @@ def run_check(
 
 
 def clear(folder: Path) -> None:
-    """Take away what a check before left for others, so that nobody takes it for this one's."""
+    """Take away what an earlier check left for others, so that nobody takes it for this one's."""
     for name in OUTPUTS:
         (folder / name).unlink(missing_ok=True)
 
@@ -192,7 +192,7 @@ class _Run:
         )
 
     def _fresh(self, world: Simulator, scenario: Scenario, seed: int, size: tuple[int, int]) -> Paint:
-        """What a fresh attack finds; the folder is this controller's own."""
+        """The pattern that a fresh attack finds in a scenario; the attack's folder is this controller's own."""
         plan, name = self.plan, f"fresh-{seed}"
         who = identity_of(self.controller, size)
         found = stress_test(

@@ -22,9 +22,9 @@ class Stored:
     """A pattern of the plan's folder.
 
     Args:
-        name: its file's, without the ending.
-        path: of the file.
-        pattern: what it paints.
+        name: the pattern's name, which is its file's name without the ending.
+        path: the pattern's file.
+        pattern: the pattern that the file holds.
     """
 
     name: str
@@ -33,10 +33,10 @@ class Stored:
 
 
 def each_once(values: tuple[Any, ...], what: str) -> None:
-    """See that a list has something in it, and nothing twice.
+    """See that a list is not empty, and that nothing stands in it twice.
 
     Raises:
-        CheckError: it is not so.
+        CheckError: the list is empty, or something stands in it twice.
     """
     if not values:
         raise CheckError(f"{what} is empty, expected at least one")
@@ -47,18 +47,18 @@ def each_once(values: tuple[Any, ...], what: str) -> None:
 def stored_patterns(
     listed: str | None, folder: Path, scenarios: tuple[Scenario, ...], known: tuple[Scenario, ...]
 ) -> dict[str, tuple[Stored, ...]]:
-    """The patterns of each scenario by its name: those for all, then its own.
+    """The patterns of each scenario, by the scenario's name: those for all scenarios, then its own.
 
     Args:
         listed: the folder of patterns, as the plan names it; None for no patterns.
-        folder: of the plan.
-        scenarios: those that are driven.
-        known: all that a folder may be named after.
+        folder: the plan's folder.
+        scenarios: the scenarios that are driven.
+        known: all scenarios that a folder of patterns may be named after.
 
     Raises:
-        CheckError: there is no such folder, no pattern in it, or two of one name.
-        ScenarioError: a folder in it is named after no scenario.
-        PatternError: a file in it is no pattern.
+        CheckError: the folder is missing or holds no pattern, a name is too long, or a scenario has two of one name.
+        ScenarioError: a folder among the patterns is named after no scenario.
+        PatternError: a file among the patterns is no pattern.
     """
     if listed is None:
         return {}
@@ -93,18 +93,18 @@ def recordings_of(
     weathers: tuple[Weather, ...],
     controller: str,
 ) -> dict[tuple[str, Weather], Path]:
-    """The run in which each scenario is driven in each weather.
+    """The run folder in which each scenario was recorded in each weather, by (scenario's name, weather).
 
     Args:
-        folder: of the plan.
+        folder: the plan's folder.
         listed: the folders with runs, as the plan names them.
-        scenarios: those that are driven.
-        weathers: in which.
-        controller: its spec, for the advice where a recording is missing.
+        scenarios: the scenarios that are driven.
+        weathers: the weathers that each scenario is driven in.
+        controller: the controller's spec, for the advice where a recording is missing.
 
     Raises:
         CheckError: a recording is missing, or of another stretch of road.
-        RecordingError: one is damaged.
+        RecordingError: a recording is damaged.
     """
     found: dict[tuple[str, Weather], Path] = {}
     for place in (folder / listed for listed in listed):

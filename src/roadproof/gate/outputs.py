@@ -67,12 +67,12 @@ def write_junit(result: CheckResult, seconds: float, path: Path) -> None:
     """Write JUnit XML: a test case for each case, with a failure that says why it does not pass.
 
     Args:
-        result: of the check.
-        seconds: that it took; each case's time is its drives' share of them.
-        path: of the file.
+        result: the result of the check.
+        seconds: how long the check took; each case's time is its drives' share of it.
+        path: the XML file to write.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     counts = {"tests": str(len(result.cases)), "failures": str(len(result.not_passed)), "errors": "0"}
     counts["time"] = f"{seconds:.3f}"
@@ -97,12 +97,12 @@ def write_summary(result: CheckResult, pictured: Case | None, path: Path) -> Non
     """Write the Markdown summary.
 
     Args:
-        result: of the check.
-        pictured: the case that `WORST` beside it shows; None where there is no picture.
-        path: of the file.
+        result: the result of the check.
+        pictured: the case that the picture `WORST`, beside the summary, shows; None where there is no picture.
+        path: the Markdown file to write.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     lines = [f"## roadproof check: {heading(result)}", ""]
     lines += [_row(COLUMNS), _row(["---"] * len(COLUMNS)), *map(_row, rows_of(result))]
@@ -124,11 +124,11 @@ def write_worst(strip: Path, path: Path) -> None:
     """Write the picture of a passage: above without paint, below with it.
 
     Args:
-        strip: what `pipeline.film.film_trial` left.
-        path: of the JPEG.
+        strip: the file of pictures that `pipeline.film.film_trial` left.
+        path: the JPEG file to write.
 
     Raises:
-        EpisodeError: there is no strip, or it is damaged.
+        EpisodeError: the file of pictures is missing or damaged.
         OutputError: the picture cannot be written.
     """
     found = read_archive(strip, ("clean", "painted"), EpisodeError, "check again")

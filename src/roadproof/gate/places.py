@@ -44,8 +44,8 @@ def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
     """The places of a check, in the order of its plan.
 
     Args:
-        plan: of the check.
-        device: where recorded worlds make their pictures.
+        plan: the plan of the check.
+        device: the torch device on which recorded worlds make their pictures.
     """
     if plan.budget == "full":
         factory = partial(open_simulator, plan.simulator)

@@ -42,18 +42,18 @@ class CheckPlan:
         controller: the spec of the controller that is checked.
         scenarios: the scenarios that it is driven in.
         scenario_file: the file of these scenarios, where it is the user's own.
-        budget: "smoke" in recordings, "full" in a simulator with fresh attacks.
-        weathers: of that budget; a fresh attack is found in the first.
-        seeds: each has starts, random patterns and a fresh attack of its own.
-        starts: drives of each seed in each case.
-        random: patterns drawn for each seed, each driven once.
-        figures: of random patterns and fresh attacks.
-        paint: limits on those; None limits nothing.
-        variation: looks over which fresh attacks take the mean; None for paint and camera as recorded.
-        stored: patterns by name of the scenario that they are driven in.
-        recordings: run of each scenario and weather; of a smoke check.
-        simulator: its spec; of a full check.
-        limits: greatest values that pass, by kind of paint and measure.
+        budget: "smoke" drives in recordings; "full" drives in a simulator, with fresh attacks.
+        weathers: the weathers that this budget drives in; a fresh attack is found in the first.
+        seeds: the seeds; each has starts, random patterns and a fresh attack of its own.
+        starts: how many starts each seed has in each case, and the range that they are drawn from.
+        random: how many random patterns are drawn for each seed; each is driven once in each weather.
+        figures: how many figures a random pattern and a fresh attack's pattern have.
+        paint: limits on the paint of random patterns and fresh attacks; None limits nothing.
+        variation: what fresh attacks take the mean over; None for paint and camera as recorded.
+        stored: the stored patterns, by the name of the scenario that they are driven in.
+        recordings: the run folder of each (scenario's name, weather); empty in a full check.
+        simulator: spec of the simulator that a full check drives in.
+        limits: the greatest values that pass, by kind of paint and by measure.
         change: how much worse than the reference each measure may be.
         reference: where the check.json to compare with lies; None where nothing is compared.
     """
@@ -78,14 +78,14 @@ class CheckPlan:
 
     @property
     def start_range(self) -> StartRange:
-        """What starts are drawn from."""
+        """The range that starts are drawn from."""
         return StartRange(
             right_m=self.starts.right_m, turned_rad=self.starts.turned_rad, faster_mps=self.starts.faster_mps
         )
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """Every case."""
+        """The key of every case, scenario by scenario."""
         found: list[Key] = []
         for scenario in self.scenarios:
             painted = [(Kind.STORED, each.name) for each in self.stored.get(scenario.name, ())]
@@ -134,13 +134,13 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
     """Read a plan for one budget, with everything that it names; see the head of this module.
 
     Args:
-        path: of the TOML file; what it names lies beside it.
+        path: the plan's TOML file; the files and folders that it names are looked for beside it.
         budget: "smoke" or "full"; None for the plan's own.
-        trust: follow it also where it runs code or calls another machine: a plan may come from anyone.
+        trust: whether to follow a plan that runs code or calls another machine; a plan may come from anyone.
 
     Raises:
         CheckError: the file or something that it names is missing, damaged or unknown, a number is out of its range,
-            the drives are too few for the limits, or it is not trusted with what it asks for; the message says which.
+            the drives are too few for the limits, or the plan is not trusted with what it asks for; says which.
     """
     path = as_path(path)
     content = read_toml(path, CheckError)

@@ -23,14 +23,14 @@ class JudgedDrive:
     """One drive of a case.
 
     Args:
-        seed: that its start was drawn with.
-        start: how it began beside the scenario's start.
+        seed: the seed that the drive's start was drawn with.
+        start: where the drive began, relative to the scenario's start.
         wrong: what went wrong, in words; empty where nothing did.
-        clean: file of the drive on the bare road.
-        painted: file of the drive over paint; empty on the bare road, as the next.
-        paint: file of the pattern.
-        deviation_m: between the two; 0 on the bare road, as the next.
-        lateral_m: largest offset of the painted one from the other's path, left positive.
+        clean: the file name of the drive on the bare road.
+        painted: the file name of the drive over paint; empty in a case without paint.
+        paint: the file of the pattern; empty in a case without paint.
+        deviation_m: the deviation of the painted drive from the clean one, metres; 0 in a case without paint.
+        lateral_m: largest offset of the painted drive from the clean one's path, metres, left positive.
     """
 
     seed: int
@@ -53,16 +53,16 @@ class Case:
     """One scenario in one weather over one kind of paint.
 
     Args:
-        scenario: its name.
-        weather: of the drives.
-        kind: of the paint.
-        name: of the pattern or patterns, in words.
+        scenario: the scenario's name.
+        weather: the weather of the drives.
+        kind: the kind of paint, or "bare" for none.
+        name: the pattern's name, or words for all patterns of the kind, such as "random patterns".
         conditions: a hash of all that the drives depend on, apart from the controller.
-        measures: with their intervals.
-        status: whether it passes.
-        reasons: why not.
-        command: drives the worst of its drives again, and films it.
-        drives: all that were judged.
+        measures: the case's measures, each with its interval.
+        status: whether the case passes.
+        reasons: why the case does not pass; empty where it does.
+        command: the command that drives the worst of the drives again and films it.
+        drives: all drives that were judged.
     """
 
     scenario: str
@@ -78,7 +78,7 @@ class Case:
 
     @property
     def key(self) -> Key:
-        """What tells it from the other cases of a check."""
+        """What tells a case from the other cases of a check."""
         return self.scenario, self.weather, self.kind, self.name
 
     def __str__(self) -> str:
@@ -90,12 +90,12 @@ class CheckResult:
     """A whole check.
 
     Args:
-        roadproof: version that made it.
-        controller: its spec.
-        architecture: of the controller (`architecture_of`).
+        roadproof: the version of roadproof that made the check.
+        controller: the spec of the controller that was checked.
+        architecture: the architecture of the controller (`architecture_of`).
         budget: "smoke" or "full".
-        compared: whether there was a reference.
-        cases: in the order of the plan.
+        compared: whether there was a reference to compare with.
+        cases: the judged cases, in the order of the plan.
     """
 
     roadproof: str
@@ -125,7 +125,7 @@ class CheckResult:
         """Write check.json; the same bytes for the same result.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         CHECK_FILE.write(path, self, kind="predicted" if self.predicted else "closed loop", verdict=self.status)
 
@@ -137,12 +137,12 @@ def load_reference(path: Path, architecture: str, plan: CheckPlan) -> dict[Key, 
     """The cases of a stored check.json, which those of a check are compared with.
 
     Args:
-        path: of the file.
-        architecture: of the controller that is checked.
-        plan: of the check.
+        path: the stored check.json.
+        architecture: the architecture of the controller that is checked (`architecture_of`).
+        plan: the plan of the check.
 
     Raises:
-        CheckError: there is none, it is damaged, made by another version, architecture or budget, or has a case that
+        CheckError: the file is missing, damaged, made by another version, architecture or budget, or has a case that
             the plan leaves out.
     """
     if not path.is_file():

@@ -34,12 +34,12 @@ class Paint:
     """A pattern and the drives over it.
 
     Args:
-        name: tells it from the others of its scenario.
-        kind: where it comes from.
-        case: name of the case that its drives belong to.
-        pattern: what is painted.
-        path: its file.
-        drives: seed and number of the start of each drive.
+        name: a name that tells this pattern from the others of its scenario.
+        kind: where the pattern comes from: stored, random or fresh.
+        case: the name of the case that its drives belong to.
+        pattern: the pattern that is painted.
+        path: the pattern's file.
+        drives: (seed, number of the start) of each drive over the pattern.
     """
 
     name: str
@@ -54,8 +54,8 @@ def known_paints(plan: CheckPlan, scenario: Scenario, site: Site, folder: Path) 
     """The stored and the random patterns of a scenario; random ones are written to a folder.
 
     Raises:
-        PatternError: the plan's limits on paint leave none there.
-        OutputError: it cannot be written.
+        PatternError: the plan's limits on paint leave no pattern there.
+        OutputError: a random pattern cannot be written.
     """
     every = tuple((seed, k) for seed in plan.seeds for k in range(plan.starts.count))
     found = [
@@ -80,11 +80,11 @@ class Stretch:
     """A scenario in an open simulator, or in the recorded world, with all that is painted there.
 
     Args:
-        plan: of the check.
-        world: open.
-        weathers: that it is driven in here.
-        paints: on it.
-        episodes: keeps the drives.
+        plan: the plan of the check.
+        world: the open simulator, or the recorded world.
+        weathers: the weathers that the scenario is driven in here.
+        paints: the patterns that are painted here, with their drives.
+        episodes: the store that keeps the drives.
     """
 
     plan: CheckPlan
@@ -97,13 +97,13 @@ class Stretch:
         """Make the drives that are missing: past the bare road, then over paint where those went well.
 
         Args:
-            factory: opens one more world, for each of several processes.
-            processes: drives made at once.
-            on_drive: told how many are there, of how many.
+            factory: opens another world; each of several processes has one of its own.
+            processes: how many drives are made at once.
+            on_drive: called with how many drives are there, and of how many.
 
         Raises:
             SimulatorError, ControllerError: as `driving.rollout.rollout` does.
-            OutputError: they cannot be written.
+            OutputError: the drives cannot be written.
         """
         alone = [each for weather in self.weathers for each in self._alone(weather).values()]
         total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)

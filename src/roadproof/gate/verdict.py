@@ -45,7 +45,7 @@ class Estimate:
     Args:
         value: the median in metres, or the share of drives, 0 to 1.
         low: lower end of the interval; None where there are too few drives for one.
-        high: its upper end.
+        high: upper end of the interval; None where there are too few drives for one.
     """
 
     value: float
@@ -62,8 +62,8 @@ class Change:
     """How much worse than the reference a measure may be: it fails where both are exceeded.
 
     Args:
-        absolute: in the measure's own unit.
-        relative: as a share of the reference's value.
+        absolute: the largest increase that passes, in the measure's own unit.
+        relative: the largest increase that passes, as a share of the reference's value.
     """
 
     absolute: float
@@ -117,9 +117,9 @@ def judge(
     """Whether a case passes, and why not.
 
     Args:
-        measures: of the case; none at all where no drive could be judged.
-        limits: greatest values that pass, by measure.
-        changes: against the reference, by measure.
+        measures: the measures of the case; none at all where no drive could be judged.
+        limits: the greatest values that pass, by measure.
+        changes: how much worse than the reference each measure may be, by measure.
         before: the reference's measures; None where nothing is compared.
     """
     if not measures:

@@ -30,14 +30,14 @@ class HardeningBudget:
     """How much is spent.
 
     Args:
-        attack: on each street for training, in each round; its evaluation is the round's re-test.
-        tuning: after each attack.
+        attack: the attack on each street for training, in each round; its evaluation is the round's re-test.
+        tuning: the fine-tuning in each round, after the attacks.
         town_drives: drives of the controller through the built-in town, whose frames keep clean driving as it was;
             none are made in another simulator.
-        judge: the attack afresh on each street for judging.
+        judge: the fresh attack on each street for judging.
         unseen: a method that training did not use, for judging; its patterns are tried in the recorded world.
         unseen_shape: a shape that training did not use, for judging.
-        clean_weathers: in which drives over the bare road are counted.
+        clean_weathers: the weathers in which drives over the bare road are counted.
 
     Raises:
         TrainingError: the judging attack does not drive in the recorded world, or drives nothing.
@@ -61,7 +61,7 @@ class HardeningBudget:
             )
 
     def varied(self, variation: Variation | None) -> HardeningBudget:
-        """The same, with all searches in expectation over a variation; itself where there is none."""
+        """The same budget with all searches in expectation over a variation; this budget itself where there is none."""
         if variation is None:
             return self
         attack, judge = (
@@ -73,13 +73,13 @@ class HardeningBudget:
         """See that what judging needs is installed.
 
         Raises:
-            RoadproofError: the library of the black-box method is not.
+            RoadproofError: the library of the black-box method is not installed.
         """
         if isinstance(self.unseen, BlackBox):
             self.unseen.proposer(space, 0, 0)
 
     def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
-        """What judging searches besides `judge`, by name."""
+        """What judging searches besides `judge`: method and search space by the name of the kind."""
         shapes = SearchSpace(figures=space.figures, family="free", shape=self.unseen_shape, limits=space.limits)
         return {
             f"{self.unseen.word}, {self._calls} patterns tried": (self.unseen, space),
@@ -108,7 +108,7 @@ def check_streets(training: Sequence[Scenario], judging: Sequence[Scenario]) -> 
     """See that there is something to train on, and that no street is trained on and judged on.
 
     Raises:
-        TrainingError: there is none, one is given twice, or two canvases lie on one street.
+        TrainingError: there is no scenario to train on, one is given twice, or two canvases lie on one street.
     """
     if not training:
         raise TrainingError("there is no scenario to train on; give at least one")

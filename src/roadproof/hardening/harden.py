@@ -56,7 +56,7 @@ FORMAT = "roadproof-hardening"
 FORMAT_VERSION = 1
 WEIGHTS = "hardened.safetensors"
 _FRESH = 1000
-"""Between the seeds of training and those of judging."""
+"""Distance between the seeds of training and those of judging."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +64,9 @@ class Round:
     """What an attack afresh reached on the streets for training, driven.
 
     Args:
-        number: 0 before anything was learnt.
-        deviation_m: of each scenario, mean over the drives of its evaluation.
-        left_lane: share of these drives that leave their lane.
+        number: the round's number; 0 is the round before anything was learnt.
+        deviation_m: mean deviation over the drives of each scenario's evaluation, metres, by the scenario's name.
+        left_lane: share of all the evaluations' drives that leave their lane, 0 to 1.
     """
 
     number: int
@@ -75,7 +75,7 @@ class Round:
 
     @property
     def mean_m(self) -> float:
-        """Over the scenarios."""
+        """The mean deviation over the scenarios, metres."""
         return float(np.mean(list(self.deviation_m.values())))
 
 
@@ -84,10 +84,10 @@ class Hardened:
     """What came of a hardening.
 
     Args:
-        controller: the spec it began with.
-        hardened: the spec of what came out, for `load_controller` and every verb.
+        controller: the spec of the controller that it began with.
+        hardened: the spec of the hardened controller, for `load_controller` and every verb.
         rounds: the re-tests on the streets for training, round 0 first.
-        best: number of the round whose controller is kept: the least deviation there, of those after a tuning.
+        best: number of the round whose controller is kept: the one after a tuning with the least mean deviation.
         judgement: before and after on other streets; None where none were given.
     """
 
@@ -120,23 +120,23 @@ def harden(
         simulator: an open simulator.
         controller: spec of a `torch.nn.Module`, as `load_controller` takes it; it learns from its own answers to the
             bare road, and no weights but those of OUT are written.
-        scenarios: for training.
+        scenarios: the scenarios on the streets for training.
         folder: keeps everything; the same call goes on from it, also with more rounds or other streets for judging.
-        judge_on: scenarios on other streets.
+        judge_on: scenarios on other streets, for judging; without any, nothing is judged.
         clean_on: scenarios driven over the bare road before and after; by default those of training and judging.
-        rounds: of attack, tuning and re-test.
-        budget: how much is spent.
+        rounds: how many rounds of attack, tuning and re-test there are, at least 1.
+        budget: how much is spent on attacks, tuning and judging; `HardeningBudget()` by default.
         space: which patterns are searched; five rectangles of the published family by default.
         training_step: gives the loss of a batch; your own where the usual one does not fit your controller.
-        seed: of everything; judging has fresh ones.
-        device: where to search and learn.
-        on_progress: told of every step of every stage.
+        seed: the seed of everything random; judging has fresh ones.
+        device: the torch device on which to search and learn, such as "cpu" or "cuda".
+        on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
         TrainingError: there are no rounds, streets for training and judging are not disjoint, the folder holds another
             hardening, or the training step gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
-        RoadproofError: a stage refuses.
+        RoadproofError: a stage refuses; the message says why.
     """
     folder = as_path(folder)
     check_streets(scenarios, judge_on)
@@ -202,15 +202,15 @@ class _Run:
     on_progress: OnProgress
 
     def weights(self, number: int) -> Path:
-        """Of the controller of a round."""
+        """The weights file of a round's controller."""
         return self.folder / f"round-{number}" / WEIGHTS
 
     def spec_of(self, number: int) -> str:
-        """Of the controller of a round."""
+        """The spec of a round's controller."""
         return _spec(self.spec, self.weights(number)) if number else self.spec
 
     def name(self, number: int) -> str:
-        """Of the controller of a round, for reports; the same wherever the folder lies."""
+        """The name of a round's controller in reports; the same wherever the folder lies."""
         return f"{self.spec}, hardened in round {number}" if number else self.spec
 
     def under(self, title: str) -> OnProgress:
@@ -218,7 +218,7 @@ class _Run:
         return lambda stage, done, total, word: self.on_progress(title, done, total, f"{stage.lower()} {word}".strip())
 
     def controller(self, number: int) -> Controller:
-        """Of a round."""
+        """The controller of a round."""
         return load_controller(self.spec_of(number), device=self.device) if number else self.teacher
 
 

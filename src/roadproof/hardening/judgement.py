@@ -41,11 +41,11 @@ class Judged:
     """One kind of attack on one street against one controller.
 
     Args:
-        scenario: the street.
-        kind: of attack, in words.
-        after: against the hardened controller.
-        deviation_m: of each drive over the pattern.
-        left_lane: whether each of them left its lane.
+        scenario: the name of the street's scenario.
+        kind: the kind of attack, in words.
+        after: whether the controller is the hardened one, not the one before hardening.
+        deviation_m: deviation of each drive over the pattern, metres.
+        left_lane: whether each drive over the pattern left its lane.
     """
 
     scenario: str
@@ -56,7 +56,7 @@ class Judged:
 
     @property
     def mean_m(self) -> float:
-        """Mean deviation."""
+        """The mean deviation over the drives, metres."""
         return float(np.mean(self.deviation_m))
 
 
@@ -65,9 +65,9 @@ class Clean:
     """Drives over the bare road.
 
     Args:
-        drives: how many.
-        clean: those that arrived in time with nothing having happened.
-        failed: scenario and weather of the others.
+        drives: how many drives there were.
+        clean: how many drives arrived in time with nothing having happened.
+        failed: scenario and weather of each drive that was not clean.
     """
 
     drives: int
@@ -81,11 +81,13 @@ class Verdict:
 
     Args:
         outcome: "helped", "did not help" or "not shown".
-        change_m: deviation after less before, of the strongest attack on each street: mean with 95 % interval.
+        change_m: deviation after less before, metres, of the strongest attack on each street: mean with 95 % interval.
         over: what the interval is over: "streets", or with one street alone its "drives".
-        before_m: median over streets of the strongest attack's deviation, as after_m.
-        left_lane_before: share of the strongest attacks' drives that leave the lane, as left_lane_after.
-        clean_worse: whether fewer drives over the bare road are clean.
+        before_m: median over streets of the strongest attack's mean deviation before hardening, metres.
+        after_m: median over streets of the strongest attack's mean deviation after hardening, metres.
+        left_lane_before: share of the strongest attacks' drives that leave the lane before hardening, 0 to 1.
+        left_lane_after: share of the strongest attacks' drives that leave the lane after hardening, 0 to 1.
+        clean_worse: whether fewer drives over the bare road are clean after hardening.
     """
 
     outcome: str
@@ -99,7 +101,7 @@ class Verdict:
 
     @property
     def sentence(self) -> str:
-        """In words."""
+        """The verdict as a sentence for people."""
         c = self.change_m
         between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
         outcome = {"helped": "It helped", "did not help": "It did not help", "not shown": "That it helped is not shown"}
@@ -113,7 +115,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Before and after.
+    """All that was driven to judge a hardening, before and after it.
 
     Args:
         judged: every kind of attack on every street, before and after.
@@ -124,7 +126,7 @@ class Judgement:
     clean: tuple[Clean, Clean]
 
     def verdict(self) -> Verdict:
-        """Of the strongest attack on each street: attackers choose the kind; a mean over kinds would flatter."""
+        """The verdict on each street's strongest attack: attackers choose the kind; a mean over kinds would flatter."""
         names = list(dict.fromkeys(each.scenario for each in self.judged))
         before, after = ([self._strongest(name, after=after) for name in names] for after in (False, True))
         if len(names) > 1:
@@ -161,16 +163,16 @@ class Judge:
 
     Args:
         simulator: an open simulator.
-        controller: on `device`.
-        scenario: the street.
-        folder: keeps everything.
-        budget: gives the attack and the kinds.
-        space: patterns of the attack that training used.
-        seed: of everything; not one of training.
-        name: of the controller, for reports.
-        device: where to search.
-        before: folder of the same judgement of the controller before; None for that one itself.
-        on_progress: told of every step.
+        controller: the controller that is attacked, on `device`.
+        scenario: the scenario of the street.
+        folder: the folder that keeps everything.
+        budget: the attack to judge with, and the kinds of attack that training did not use.
+        space: the search space of the attack that training used.
+        seed: the seed of everything random; not one of training.
+        name: the controller's name in reports.
+        device: the torch device on which to search.
+        before: folder of the same judgement of the controller before hardening; None where that one is judged.
+        on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
     """
 
     simulator: Simulator
@@ -186,10 +188,10 @@ class Judge:
     on_progress: OnProgress
 
     def judge(self) -> list[Judged]:
-        """Every kind, and what was found before.
+        """Attack with every kind of search, and drive over what was found against the controller before.
 
         Raises:
-            RoadproofError: a stage refuses.
+            RoadproofError: a stage refuses; the message says why.
         """
         tested = stress_test(
             self.simulator,

@@ -20,7 +20,7 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
     """Write hardening.html beside what `harden` left; it needs no other file.
 
     Returns:
-        The page.
+        The path of the page.
 
     Raises:
         PatternError: a pattern of the judgement is missing or damaged.

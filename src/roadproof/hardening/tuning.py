@@ -42,9 +42,9 @@ class TuningBatch(NamedTuple):
 
     Args:
         frames: RGB in [0, 1], painted or bare.
-        speed_mps: speed of the car.
-        command: CARLA's codes.
-        target: steer, and throttle and brake where the controller answers with them: what it should answer.
+        speed_mps: speed of the car at each picture.
+        command: command at each picture, in CARLA's codes.
+        target: what the controller should answer: steer alone, or steer, throttle and brake where it answers with them.
     """
 
     frames: Float[Tensor, "b 3 h w"]
@@ -57,7 +57,7 @@ TrainingStep: TypeAlias = Callable[[nn.Module, TuningBatch], Tensor]
 """The loss of a batch, differentiable in the controller's parameters; one of the user's own, or `training_step`."""
 
 OnStep: TypeAlias = Callable[[int, float], object]
-"""Told of the step and the mean loss since the last time."""
+"""Called with the step and the mean loss since the call before."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,13 +65,13 @@ class Tuning:
     """How a controller is fine-tuned in each round.
 
     Args:
-        steps: batches.
-        batch: pictures a batch.
-        learning_rate: the largest of AdamW; it rises over the first steps and falls along a cosine to almost nothing.
+        steps: how many batches the controller learns from.
+        batch: how many pictures there are in a batch.
+        learning_rate: AdamW's largest; it rises over the first steps and falls along a cosine to almost nothing.
         bare: share of the street's pictures that stay without paint.
-        found: share of the patterns painted that were found by attacks; the others are random.
-        climbs: steps that patterns climb against the controller before they are painted.
-        climb: length of each, in units of each parameter's range.
+        found: share of the painted patterns that attacks found; the others are random.
+        climbs: how many steps a pattern climbs against the controller before it is painted.
+        climb: length of each climbing step, in units of each parameter's range.
 
     Raises:
         TrainingError: a number is out of range.
@@ -110,7 +110,7 @@ def answers(
     Those of a conditional network are its linear ones: the rules of its agent have no gradient where they cut.
 
     Raises:
-        ControllerError: it raises, or answers wrongly.
+        ControllerError: the controller raises, or answers wrongly.
     """
     with _mixed(frames.device):
         if isinstance(controller, ConditionalNetwork):
@@ -146,15 +146,15 @@ def tune(
     Args:
         network: a controller whose parameters want gradients, on `device`.
         teacher: the controller before, on `device`.
-        streets: with ways to draw poses from.
-        space: the patterns allowed.
-        found: patterns that attacks found, as its points.
-        town: frames of clean drives besides; None has none.
-        tuning: how.
-        seed: of everything drawn.
-        device: what it learns on.
-        step: gives the loss of a batch.
-        on_step: told every tenth step.
+        streets: the streets that pictures are drawn from, in turn; each already has ways (`Street.add_ways`).
+        space: the search space of the patterns.
+        found: patterns that attacks found, as points of the search space.
+        town: frames of clean drives through the town, learnt from besides; None for none.
+        tuning: how many batches there are, and what they are made of.
+        seed: the seed of everything drawn.
+        device: the torch device on which the controller learns.
+        step: the function that gives the loss of a batch.
+        on_step: called at every tenth step and at the last with the step and the mean loss since the call before.
 
     Raises:
         TrainingError: the training step gives anything but one finite number with a gradient.

@@ -29,7 +29,7 @@ AHEAD_M, LEFT_M, TURN_RAD = 1.5, 1.5, 0.4
 """A pose further from every recorded one is left out: its picture says little."""
 
 RECORDED_M = 1.5
-"""As far aside as drives are recorded; the law of steering is not believed beyond."""
+"""How far aside drives are recorded; the law of steering is not believed beyond."""
 
 
 class Views(NamedTuple):
@@ -37,10 +37,10 @@ class Views(NamedTuple):
 
     Args:
         frames: RGB in [0, 1].
-        speed_mps: speed of the car.
-        command: CARLA's codes.
-        place: where the car is beside the clean path.
-        canvas: the canvas' pixels; None where no picture shows it.
+        speed_mps: speed of the car at each picture.
+        command: command at each picture, in CARLA's codes.
+        place: where the car is at each picture, relative to the clean path.
+        canvas: where each picture shows the canvas; None where no picture shows it.
     """
 
     frames: Float[Tensor, "b 3 h w"]
@@ -58,12 +58,12 @@ class Street:
     """A recorded world, and the poses that matter there.
 
     Args:
-        recordings: calibrated, with a canvas and tracks.
-        teacher: whose law of steering on the bare road leads back to the clean path; on `device`.
-        device: where pictures are made.
+        recordings: a calibrated set of recordings with a canvas and tracks.
+        teacher: the controller whose law of steering on the bare road leads back to the clean path; on `device`.
+        device: the torch device on which pictures are made.
 
     Raises:
-        RecordingError: nobody can drive in these recordings.
+        RecordingError: the recordings cannot be driven in.
         ControllerError: the teacher raises, or answers wrongly.
     """
 
@@ -73,7 +73,7 @@ class Street:
         self._poses = torch.empty(0, 4, dtype=torch.float64, device=self.world.device)
 
     def add_ways(self, driver: Controller, patterns: Pattern) -> None:
-        """Drive over the bare road and over each pattern of a batch; the poses are drawn from from then on.
+        """Drive over the bare road and over each pattern of a batch; later poses are drawn from these drives too.
 
         Raises:
             ControllerError: the driver raises, or answers wrongly.
@@ -86,10 +86,10 @@ class Street:
                 self._poses = torch.cat([self._poses, torch.stack([column.flatten() for column in way], 1)])
 
     def draw(self, count: int, generator: torch.Generator) -> Views:
-        """So many pictures, or a few less: poses far from every recorded one are left out.
+        """Draw so many pictures, or a few less: poses far from every recorded one are left out.
 
         Args:
-            count: at least 1.
+            count: how many pictures to draw, at least 1.
             generator: where the randomness comes from, on the CPU.
         """
         chosen = self._poses[torch.randint(len(self._poses), (count,), generator=generator).to(self._poses.device)]

@@ -54,10 +54,10 @@ def write_archive(
     """Write arrays to one file, all or nothing.
 
     Args:
-        path: ends in ".npz".
-        arrays: numbers, by name.
-        header: what JSON can say about them; none for arrays alone.
-        level: of compression; 1 where there is much and time counts.
+        path: the file to write; its name ends in ".npz".
+        arrays: arrays of numbers, by name.
+        header: what JSON can say about the arrays; None writes the arrays alone.
+        level: the compression level of zip, 0 to 9; 1 where there is much data and time counts.
 
     Raises:
         OutputError: the file cannot be written.
@@ -67,7 +67,7 @@ def write_archive(
 
 
 def packed(arrays: Mapping[str, Any], header: Mapping[str, Any] | None = None, *, level: int = 6) -> bytes:
-    """What `write_archive` writes; the same bytes for the same arrays, whenever."""
+    """The bytes that `write_archive` writes; the same for the same arrays, whenever."""
     stated = {} if header is None else {HEADER: np.array(json.dumps(header, ensure_ascii=False))}
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w") as archive:
@@ -81,18 +81,18 @@ def packed(arrays: Mapping[str, Any], header: Mapping[str, Any] | None = None, *
 def read_archive(
     path: Path, names: Iterable[str], error: type[RoadproofError], remedy: str, *, most_bytes: int = MOST_BYTES
 ) -> dict[str, np.ndarray]:
-    """Arrays of numbers by name.
+    """Read arrays of numbers from an archive, by name.
 
     Args:
-        path: of the archive.
-        names: of the arrays wanted; others are not looked at.
-        error: what to raise.
-        remedy: what the user can do where it is missing or damaged.
-        most_bytes: that the whole archive may unpack to.
+        path: the archive to read.
+        names: the names of the wanted arrays; others are not looked at.
+        error: the type of error to raise.
+        remedy: what the user can do where the archive is missing or damaged.
+        most_bytes: how many bytes the whole archive may unpack to.
 
     Raises:
-        error: it is missing, lacks an array, is packed or filled in a way that roadproof never writes, or would unpack
-            to more.
+        error: the archive is missing, lacks an array, is packed or filled in a way that roadproof never writes, or
+            would unpack to more than `most_bytes`.
     """
     return read_record(path, names, error, remedy, header=None, most_bytes=most_bytes)[1]
 
@@ -107,19 +107,20 @@ def read_record(
     format_version: tuple[str, int] | None = None,
     most_bytes: int = MOST_BYTES,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of an archive.
+    """Read the header and the arrays of an archive.
 
     Args:
-        path: of the archive.
-        names: of the arrays wanted.
-        error: what to raise.
-        remedy: what the user can do where it is missing or damaged.
-        header: under which name the JSON object is; None where there is none.
-        format_version: what its "format" must be and the newest "version" understood, where it has them.
-        most_bytes: that the whole archive may unpack to.
+        path: the archive to read.
+        names: the names of the wanted arrays; others are not looked at.
+        error: the type of error to raise.
+        remedy: what the user can do where the archive is missing or damaged.
+        header: the name under which the archive has a JSON object; None where it has none.
+        format_version: the "format" that the header must name, and the newest "version" understood; None where it has
+            neither.
+        most_bytes: how many bytes the whole archive may unpack to.
 
     Raises:
-        error: as `read_archive`, or the header is no JSON object, or of another format or version.
+        error: as `read_archive` raises it, or the header is no JSON object, or of another format or version.
     """
     with _opened(path, error, remedy, most_bytes) as archive:
         stated = {} if header is None else parse_json(str(_member(archive, header, "U")))
@@ -133,12 +134,12 @@ def archive_names(path: Path, error: type[RoadproofError], remedy: str) -> froze
     """Names of the arrays that an archive holds; the arrays themselves are not read.
 
     Args:
-        path: of the archive.
-        error: what to raise.
-        remedy: what the user can do where it is missing or damaged.
+        path: the archive to read.
+        error: the type of error to raise.
+        remedy: what the user can do where the archive is missing or damaged.
 
     Raises:
-        error: it is missing, no archive, or packed in a way that roadproof never writes.
+        error: the file is missing, no archive, or packed in a way that roadproof never writes.
     """
     with _opened(path, error, remedy, MOST_BYTES) as archive:
         return frozenset(name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy"))
@@ -148,7 +149,7 @@ def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarr
     """The numbers of a .npy file.
 
     Raises:
-        error: it is missing, holds anything else, or more or less than it claims.
+        error: the file is missing, holds anything but numbers, or holds more or less than it claims.
     """
     try:
         with path.open("rb") as file:

@@ -33,7 +33,7 @@ def as_path(path: Any) -> Path:  # noqa: ANN401  # users without a type checker 
     """A path as users of the library give it.
 
     Raises:
-        OutputError: it is no path at all; the message says what came.
+        OutputError: the value is no path at all; the message says what came.
     """
     try:
         if os.fspath(path):
@@ -57,15 +57,15 @@ def is_plain_name(name: object) -> bool:
 
 
 def check_name(name: object, what: str, error: type[RoadproofError]) -> str:
-    """A name from a file, once it is plain.
+    """Check that a name from a file is plain, and return it.
 
     Args:
-        name: as it was read.
-        what: it names, for the message.
-        error: what to raise.
+        name: the name as it was read.
+        what: what the name stands for, for the message, such as "pattern".
+        error: the type of error to raise.
 
     Raises:
-        error: it is not plain (`is_plain_name`).
+        error: the name is not plain (`is_plain_name`).
     """
     if not is_plain_name(name):
         raise error(
@@ -79,10 +79,10 @@ def inside(folder: Path, name: object, what: str, error: type[RoadproofError]) -
     """The path of a name in a folder: the one way from a name in a file to a place on the disk.
 
     Args:
-        folder: it stays in.
-        name: of a file or folder there.
-        what: it names, for the message.
-        error: what to raise.
+        folder: the folder that the path stays in.
+        name: the name of a file or folder there.
+        what: what the name stands for, for the message, such as "pattern".
+        error: the type of error to raise.
 
     Raises:
         error: the name is not plain, or a link of this name leads out of the folder.
@@ -116,8 +116,8 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], object]) -> No
     """Let `write` fill a temporary folder beside `folder`, then move it into place.
 
     Args:
-        folder: must not exist yet, or be empty.
-        write: gets the temporary folder.
+        folder: the folder to make; it must not exist yet, or be empty.
+        write: called with the temporary folder.
 
     Raises:
         OutputError: the folder cannot be made or written, or the disk is full; nothing is left behind.
@@ -212,12 +212,12 @@ def _finite(text: str) -> float:
 
 
 def parse_json(text: str) -> dict[str, Any]:
-    """A JSON object.
+    """Read a JSON object from a text.
 
     Raises:
-        TypeError: it is something else.
-        ValueError, RecursionError: it is not JSON, is too deep, or has a number that is none (NaN, infinity, hundreds
-            of digits).
+        TypeError: the text is something else than an object.
+        ValueError, RecursionError: the text is not JSON, is too deep, or has a number that is none (NaN, infinity,
+            hundreds of digits).
     """
     content: object = json.loads(text, parse_int=_whole, parse_float=_finite, parse_constant=_finite)
     if not isinstance(content, dict):
@@ -231,14 +231,14 @@ def check_format(
     """See that a file says the format that is expected, in a version that is understood.
 
     Args:
-        fields: what it says, by name.
-        path: the file, for the message.
-        file_format: what its "format" must be.
-        version: the newest "version" understood.
-        error: what to raise.
+        fields: what the file says, by name.
+        path: the path of the file, for the message.
+        file_format: the "format" that the file must name.
+        version: the newest "version" that is understood.
+        error: the type of error to raise.
 
     Raises:
-        error: it is of another format, or of a newer version.
+        error: the file is of another format, or of a newer version.
     """
     if fields.get("format") != file_format:
         raise error(f"{path} has format {fields.get('format')!r:.60}, expected {file_format!r}")
@@ -250,11 +250,11 @@ def check_format(
 
 
 def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
-    """Read a plan of the user's.
+    """Read a TOML file of the user's, such as a plan.
 
     Args:
-        path: the TOML file.
-        error: what is raised.
+        path: the TOML file to read.
+        error: the type of error to raise.
 
     Raises:
         error: the file cannot be read, is not valid TOML, or has a text that can name nothing: of more than 1,000
@@ -289,10 +289,10 @@ def read_json(path: Path, file_format: str, version: int, error: type[RoadproofE
     """Read a JSON file that names its format and version.
 
     Args:
-        path: the file.
-        file_format: what its "format" must be.
-        version: the newest "version" understood.
-        error: what to raise.
+        path: the JSON file to read.
+        file_format: the "format" that the file must name.
+        version: the newest "version" that is understood.
+        error: the type of error to raise.
 
     Raises:
         error: the file is missing, is no JSON object (`parse_json`), or is of another format or a newer version.

@@ -32,12 +32,12 @@ def require_same(
     """Refuse to go on in a folder where something of other parts was begun.
 
     Args:
-        folder: that was begun.
-        what: it holds, for the message: "a run".
-        before: its parts, as JSON has them. A part that is not among them is not compared: the folder is older than
-            the word.
-        now: the parts of what is to be done in it.
-        error: what to raise.
+        folder: the folder in which something was begun.
+        what: what the folder holds, for the message, such as "a run".
+        before: the parts that were kept there, as JSON has them. A part of `now` that is not among them is not
+            compared: the folder is older than that part's name.
+        now: the parts of what is to be done in the folder.
+        error: the type of error to raise.
 
     Raises:
         error: a part differs; the message names the first, with what it was and what it is.

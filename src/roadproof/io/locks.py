@@ -28,10 +28,10 @@ def working_in(folder: Path) -> Generator[None]:
     The lock is the system's own and ends with its process, however that ends; it holds on one machine, for one user.
 
     Args:
-        folder: made where it is not there.
+        folder: the folder to work in; made where it is not there.
 
     Raises:
-        OutputError: it cannot be written, or another process works in it.
+        OutputError: the folder cannot be written, or another process works in it.
     """
     check_writable(folder)
     place = _place(folder)
@@ -62,13 +62,13 @@ def hold(folder: Path) -> None:
     """Work in a folder until this process ends (`working_in`): for a command, which does nothing else.
 
     Raises:
-        OutputError: it cannot be written, or another process works in it.
+        OutputError: the folder cannot be written, or another process works in it.
     """
     _held.enter_context(working_in(folder))
 
 
 def _place(folder: Path) -> Path:
-    """Where it is written who works in a folder: not in the folder, which holds results alone."""
+    """The file that says who works in a folder: outside of the folder, which holds results alone."""
     locks = (
         Path(tempfile.gettempdir()) / f"roadproof-locks-{getattr(os, 'getuid', int)()}"
     )  # a user may have no name, or no number

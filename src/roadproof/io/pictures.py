@@ -11,22 +11,22 @@ from PIL import Image
 from roadproof.errors import RoadproofError
 
 MOST_PIXELS = 40_000_000
-"""A picture that claims more is not unpacked."""
+"""A picture that claims more pixels is not unpacked."""
 
 
 def read_picture(
     path: Path, error: type[RoadproofError], remedy: str, *, mode: str = "RGB"
 ) -> UInt8[np.ndarray, "h w c"]:
-    """A picture's pixels.
+    """Read a picture's pixels.
 
     Args:
-        path: a PNG or JPEG.
-        error: what to raise.
-        remedy: what the user can do where it is missing or damaged.
-        mode: "RGB" or "RGBA".
+        path: the picture's file, a PNG or JPEG.
+        error: the type of error to raise.
+        remedy: what the user can do where the picture is missing or damaged.
+        mode: the channels to return, "RGB" or "RGBA".
 
     Raises:
-        error: it is missing, damaged, of another kind, or larger than any picture here.
+        error: the picture is missing, damaged, of another kind, or larger than any picture here.
     """
     try:
         # Pillow leaves a file open whose first bytes cannot be read.

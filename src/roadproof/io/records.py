@@ -38,9 +38,9 @@ class Form:
     """How a field is kept where a file has it in another form than the dataclass.
 
     Args:
-        kind: type of what the file holds.
-        stated: makes that of the field's value.
-        meant: makes the field's value of it; what it raises is damage of the file.
+        kind: the type of what the file holds.
+        stated: makes what the file holds from the field's value.
+        meant: makes the field's value from what the file holds; an error in it means that the file is damaged.
     """
 
     kind: Any
@@ -53,16 +53,16 @@ class RecordFile(Generic[T]):
     """How a dataclass is written to a file, and read from one that anyone may have made.
 
     Args:
-        kind: the dataclass.
-        name: the file's "format"; empty for an archive that names none.
+        kind: the dataclass that is written and read.
+        name: the "format" that the file names; empty for an archive that names none.
         version: the "version" that is written, and the newest that is read.
-        error: what is raised.
+        error: the type of error to raise.
         remedy: what the user can do where a file is missing or damaged.
-        elsewhere: fields that are not in this file; `read` takes them by name.
-        forms: fields that it has in a form of its own.
-        notes: what it says besides its fields, for people: units.
+        elsewhere: names of fields that are not in this file; `read` takes their values by name.
+        forms: the forms of fields that the file has otherwise than the dataclass, by the field's name.
+        notes: what the file says besides the fields, for people, such as units.
         header: name of an archive's JSON header; None where all its fields are arrays and numbers.
-        most_bytes: that an archive may unpack to.
+        most_bytes: how many bytes an archive may unpack to.
     """
 
     kind: type[T]
@@ -80,9 +80,9 @@ class RecordFile(Generic[T]):
         """Write a record, whole or not at all.
 
         Args:
-            path: of a JSON file where it ends in .json, else of an archive.
-            value: the record.
-            **more: keys besides its fields and notes.
+            path: the file to write: JSON where its name ends in .json, else an archive.
+            value: the record to write.
+            **more: what the file says besides the record's fields and notes, by key.
 
         Raises:
             OutputError: the file cannot be written.
@@ -111,8 +111,8 @@ class RecordFile(Generic[T]):
         """Read a record.
 
         Args:
-            path: of a JSON file where it ends in .json, else of an archive.
-            **elsewhere: the fields that are not in the file.
+            path: the file to read: JSON where its name ends in .json, else an archive.
+            **elsewhere: the values of the fields that are not in the file.
 
         Raises:
             error: the file is missing, damaged, of another format or a newer version; a field is missing or of another
@@ -140,7 +140,7 @@ class RecordFile(Generic[T]):
         return stated | arrays
 
     def made(self, path: Path, content: Mapping[str, Any], **elsewhere: object) -> T:
-        """The record of what a file holds; `path` and the errors are those of `read`, for what `content` gave."""
+        """The record in what `content` read from a file; `path`, `elsewhere` and the errors are those of `read`."""
         values = dict(elsewhere)
         try:
             for each in fields(cast("Any", self.kind)):
@@ -171,7 +171,7 @@ class Saved:
     FILE: ClassVar[RecordFile[Any]]
 
     def save(self, path: AnyPath) -> None:
-        """Write it to one file, all or nothing.
+        """Write the record to one file, all or nothing.
 
         Raises:
             OutputError: the file cannot be written.
@@ -202,14 +202,14 @@ def check_arrays(
     """See that arrays of a dataclass have one shape and finite values.
 
     Args:
-        value: the dataclass.
-        names: names of the fields that are looked at.
+        value: the dataclass that holds the arrays.
+        names: names of the fields that are checked.
         shape: the shape that each of them must have.
-        of: what they belong to, for the message: "of the episode".
-        error: what to raise.
+        of: what the arrays belong to, for the message, such as "of the episode".
+        error: the type of error to raise.
 
     Raises:
-        error: one has another shape, or NaN or infinite values.
+        error: an array has another shape, or NaN or infinite values.
     """
     for name in names:
         values: np.ndarray = getattr(value, name)
@@ -233,7 +233,7 @@ def _typed(stored: Any, kind: Any, name: str) -> object:  # noqa: ANN401
     """A field's value, from what a file holds of it.
 
     Raises:
-        ValueError: it is of another type; says which.
+        ValueError: the value is of another type; says which.
     """
     if _is_array(kind):
         return _array(np.asarray(stored), kind, name)

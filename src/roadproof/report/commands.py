@@ -54,7 +54,7 @@ def _evaluate(evaluation: Evaluation) -> list[str]:
 
 
 def _foresee(run: Run, evaluation: Evaluation) -> list[str]:
-    """Scenario and weather are those of the recordings; where these lay is not kept, if not in the run."""
+    """Options of an evaluation in recordings, which say scenario and weather; RECORDINGS where the run has none."""
     recordings = str(run.folder) if run.recordings is not None else "RECORDINGS"
     options = [*_starts(evaluation), *_random(evaluation)]
     return ["--controller", evaluation.controller, *options, "--simulator", f"recorded:{recordings}"]

@@ -32,12 +32,12 @@ class Compared:
 
     Args:
         name: what it is called: its folder's name, with the folder above where two have the same.
-        run: all of it.
-        judged: its evaluation.
-        verdict: what it shows.
-        whole: its drives over the pattern, all weathers together, alone on the road where it has such.
-        change: of the deviation against the first run, drive by drive alone on the road, metres; None where none of
-            their drives have weather and start in common.
+        run: everything that the run folder holds.
+        judged: the evaluation of the run.
+        verdict: what the run shows.
+        whole: the run's drives over the pattern, all weathers together; those alone on the road where it has such.
+        change: mean change of the deviation against the first run over drives alone on the road, metres; None for the
+            first run, and where no drive has weather and start in common with one of the first run's.
     """
 
     name: str
@@ -49,11 +49,11 @@ class Compared:
 
     @property
     def predicted(self) -> bool:
-        """Whether its drives are predicted."""
+        """Whether the run's drives are predicted."""
         return self.judged.evaluation.predicted
 
     def in_weather(self, weather: Weather) -> Row | None:
-        """Its drives in one weather, alone on the road; None where there are none."""
+        """The run's drives in one weather, alone on the road; None where there are none."""
         rows = self.judged.evaluation.rows()
         return next(
             (row for row in rows if row.pattern == "attack" and row.weather == weather and not row.traffic), None
@@ -67,8 +67,8 @@ def compared(folders: Sequence[AnyPath]) -> tuple[Compared, ...]:
         folders: two run folders or more, each with an evaluation; the first is what the others are compared with.
 
     Raises:
-        RoadproofError: there is one alone or more than `MOST_RUNS`, one twice, one without an evaluation, or a stage is
-            damaged; the message names it.
+        RoadproofError: only one run is given or more than `MOST_RUNS`, one is given twice, one has no evaluation, or a
+            stage is damaged; the message names it.
     """
     paths = [as_path(folder) for folder in folders]
     if not 2 <= len(paths) <= MOST_RUNS:
@@ -92,14 +92,14 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
     """Write one page on several runs; it needs no other file.
 
     Args:
-        folders: as `compared` takes them.
-        page: the HTML file.
+        folders: two run folders or more, each with an evaluation; the first is what the others are compared with.
+        page: the HTML file to write.
 
     Returns:
-        The runs, as compared.
+        The runs as they are compared, in the order of the folders.
 
     Raises:
-        RoadproofError: as `compared`.
+        RoadproofError: as `compared` raises it.
         OutputError: the page cannot be written.
     """
     runs = compared(folders)

@@ -52,12 +52,12 @@ def _picture(pixels: UInt8[np.ndarray, "h w 3"], *, kind: str) -> str:
 
 
 def encoded(image: Image.Image, kind: str) -> str:
-    """A picture as the address of itself, "PNG" or "JPEG"."""
+    """A picture as a data URL; `kind` is "PNG" or "JPEG"."""
     out = io.BytesIO()
     image.save(out, format=kind, quality=84, optimize=True)
     return data_url(f"image/{kind.lower()}", out.getvalue()) or ""
 
 
 def data_url(kind: str, content: bytes | None) -> str | None:
-    """A file as the address of itself; None where there is none."""
+    """A file's content as a data URL of its media type; None where there is no content."""
     return None if content is None else f"data:{kind};base64,{base64.b64encode(content).decode()}"

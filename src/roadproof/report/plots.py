@@ -24,8 +24,8 @@ def draw_attack(result: AttackResult, shown: Sequence[ShownDrive], folder: Path)
 
     Args:
         result: what the attack found.
-        shown: those drives without and with the pattern (`attacks.show_pattern`).
-        folder: where the pictures go.
+        shown: every drive of the winner's group, without and with the pattern (`attacks.show_pattern`).
+        folder: the folder that the pictures are written to.
 
     Raises:
         OutputError: a picture cannot be written.

@@ -56,7 +56,7 @@ def plan_of(box: Box, size_in: tuple[float, float], ground: str) -> tuple[Figure
     """A new figure, and the axes in metres that fill it.
 
     Args:
-        box: what is shown.
+        box: left, low, right and high edge of what is shown, in metres.
         size_in: width and height of the figure, in inches.
         ground: the colour below everything.
     """
@@ -89,10 +89,10 @@ def draw_road(axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: Bo
 
     Args:
         axes: the axes to draw on.
-        road: the map.
+        road: the map that is drawn.
         around: the function from world x, y to the plane of the axes (`around_canvas`, `in_world`).
-        box: what is shown, in that plane.
-        ground: the colours.
+        box: left, low, right and high edge of what is drawn, in metres of that plane.
+        ground: the colours of the road.
     """
     left, low, right, high = box
     colours = {"sidewalk": ground.sidewalk, "shoulder": ground.shoulder or ground.asphalt, "driving": ground.asphalt}
@@ -125,7 +125,7 @@ def draw_canvas(axes: Axes, canvas: CanvasPlacement, paint: PatternImage | None,
 
     Args:
         axes: the axes to draw on, in metres.
-        canvas: where it lies.
+        canvas: the canvas that is drawn, as it lies in the world.
         paint: the pattern; None for a bare canvas.
         ink: the colour of the outline.
         upright: whether the axes are the canvas' own (`around_canvas`), else they are the world's.

@@ -50,12 +50,12 @@ class Judged:
         paint: the canvas as it was painted.
         shown: the trial that is shown in pictures.
         clean: the shown drive without paint.
-        painted: the shown drive over the paint.
+        painted: the shown drive over the paint of the canvas.
         by_weather: the drives without others on the road, each with its weather, without and with paint.
         fidelity: composites against renders, where they were compared.
-        film: the two drives side by side as MP4, where there is a film.
-        poster: one image of it as JPEG.
-        strip: pictures of the passage.
+        film: the film of both shown drives side by side, as MP4; None where there is none.
+        poster: one image of the film, as JPEG; None where there is none.
+        strip: pictures of both shown drives passing the canvas; None where there are none.
     """
 
     evaluation: Evaluation
@@ -75,19 +75,19 @@ class Run:
     """What a run folder holds; None for a stage that is not there.
 
     Args:
-        folder: the run folder.
-        drives: the drives as they were recorded.
-        recordings: the calibrated set.
+        folder: the run folder that was read.
+        drives: the drives as they were recorded, before calibration.
+        recordings: the calibrated set of recordings.
         calibration: what the calibration says of itself.
-        attack: the attack's result.
+        attack: the result of the attack.
         selections: the candidates that were driven, of the search and of each round, in that order.
-        judged: the evaluation.
-        prediction: where the recorded world said the chosen pattern takes the car, beside where it went.
+        judged: the evaluation, with what is shown of it.
+        prediction: the path that the recorded world predicted for the chosen pattern, beside the path that was driven.
         pattern: the pattern that was chosen in the end; the attack's own where the run says nothing else.
         cost: what each stage took since the run began; empty where the run keeps no account of it.
         commands: the commands that made the run, where they were kept.
         cheapest: the least paint for a deviation, where it was looked for.
-        cheapest_driven: the drive over it.
+        cheapest_driven: the drive over the least paint, where it was driven over.
     """
 
     folder: Path

@@ -30,10 +30,10 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
     """Both drives past the canvas, from above.
 
     Args:
-        scenario: its canvas and its map; the road is drawn where the map can be read.
+        scenario: the scenario, with its canvas and its map; the road is drawn where the map can be read.
         paint: the pattern on the canvas.
         clean: the drive without paint.
-        painted: the drive over it.
+        painted: the drive over the pattern.
         name: a word that tells this chart from the page's others.
     """
     around = around_canvas(scenario.canvas)

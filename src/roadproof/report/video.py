@@ -49,8 +49,8 @@ def film_drive(
     Args:
         path: the film to write; it ends in .mp4, and appears when the block ends without an error.
         world: the open simulator that is driven in.
-        scenario: what is driven.
-        pattern: what is painted on the canvas; None for the bare road.
+        scenario: the scenario that is driven.
+        pattern: the pattern that is painted on the canvas; None for the bare road.
 
     Raises:
         OutputError: PyAV is not installed, or the file cannot be written.
@@ -86,8 +86,8 @@ class DriveView:
     Args:
         roads: the map driven on; None where it is not known.
         way: world x, y of the way from start to goal.
-        canvas: where the canvas lies.
-        pattern: what is painted on it; None for a bare canvas.
+        canvas: where the canvas lies in the world.
+        pattern: the pattern that is painted on the canvas; None for a bare canvas.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class DriveView:
 
         Args:
             seen: the observation; its full picture is shown where there is one, else the controller's frame.
-            control: what the driver did.
+            control: the control that the driver answered with.
             cars: world x, y of the other cars.
             people: world x, y of the people.
         """

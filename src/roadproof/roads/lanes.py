@@ -48,19 +48,19 @@ class Lane:
 
     Args:
         index: its place in the map's list of lanes.
-        road: id of its road.
-        section: which section of the road.
-        number: OpenDRIVE's lane number there; negative runs along the road, positive against it.
+        road: id of the road that the lane belongs to.
+        section: index of its section along the road.
+        number: OpenDRIVE's number of the lane; negative runs along the road, positive against it.
         kind: "driving", "sidewalk", "shoulder" …
         centre: points in the direction of travel, at most a metre apart, closer in bends, (N, 3), metres.
-        left: its left border, point by point, (N, 3).
-        right: its right border, (N, 3).
-        headings_rad: direction of travel at each point.
-        stations_m: arc length of the centre up to each point.
+        left: points of its left border, one for each point of the centre, (N, 3), metres.
+        right: points of its right border, one for each point of the centre, (N, 3), metres.
+        headings_rad: direction of travel at each point of the centre.
+        stations_m: arc length of the centre up to each of its points.
         left_mark: the mark that holds over most of the left border; None where there is none.
-        right_mark: the same for the right border.
+        right_mark: the mark that holds over most of the right border; None where there is none.
         successors: indices of the lanes that go on from its end.
-        junction: id of the junction it lies in.
+        junction: id of the junction it lies in; None outside junctions.
     """
 
     index: int

@@ -63,7 +63,7 @@ def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:
     """Refuse a canvas of which some part lies beside the carriageway.
 
     Raises:
-        ScenarioError: where, and on what.
+        ScenarioError: a part of the canvas lies off the road; the message says where, and what is there.
     """
     points = canvas_points(canvas)
     codes = road_map.surface_at(points)

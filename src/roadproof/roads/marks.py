@@ -13,7 +13,7 @@ from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 
 BESIDE_M = 5.0
-"""Marks so far from the canvas still count: figures may reach beyond it."""
+"""Marks within this distance of the canvas still count: figures may reach beyond it."""
 
 _USUAL_WIDTH_M, _NO_WIDTH_M = 0.15, 0.05
 
@@ -95,6 +95,6 @@ def marks_of(simulator: object, scenario: Scenario) -> tuple[LaneMark, ...] | No
 
     Raises:
         SimulatorError: the simulator does not answer.
-        ScenarioError: it has no such map.
+        ScenarioError: the simulator has no such map.
     """
     return marks_on(scenario.canvas, simulator.road_map(scenario.map_name)) if isinstance(simulator, Mapped) else None

@@ -1,4 +1,4 @@
-"""Reads the part of ASAM OpenDRIVE that towns use into the records of `road_records`.
+"""Reads the part of ASAM OpenDRIVE that towns use into the records of `roads.records`.
 
 Lines, arcs, spirals and parametric cubics; elevation; lane offsets, sections, widths and road marks; links, junctions
 and their lane links. What would change the shape of a road and is not read (superelevation, lane borders, `poly3`,

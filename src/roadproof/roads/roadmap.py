@@ -141,8 +141,8 @@ class RoadMap:
         """The shortest route from a pose to the place on a driving lane nearest to the goal, without lane changes.
 
         Args:
-            start: on a driving lane and turned along it.
-            goal_m: (x, y), on a driving lane; of two lanes as near, the one a shorter way leads to.
+            start: pose of the car at the start, on a driving lane and turned along it.
+            goal_m: (x, y) of the goal, on a driving lane; of two lanes as near, the one that a shorter way leads to.
 
         Raises:
             ScenarioError: start or goal is off the road, or no way leads to the goal.

@@ -48,9 +48,9 @@ class Route:
     """A way along lane centres.
 
     Args:
-        points: about half a metre apart, (N, 3), metres.
+        points: points of the way, about half a metre apart, (N, 3), metres.
         headings_rad: direction of travel at each point, unwrapped.
-        arclengths_m: distance driven up to each point.
+        arclengths_m: distance driven from the start up to each point.
         commands: codes of `Command`: a turn or straight on from 20 m before a junction to its end, else follow.
         lanes: indices of the lanes it takes, in order.
         crossings: the junctions it crosses, in order.
@@ -72,8 +72,8 @@ class Route:
         """Where a point is along the route.
 
         Args:
-            x_m: world x.
-            y_m: world y.
+            x_m: world x, metres.
+            y_m: world y, metres.
             near_m: the arc length where it was last, where that is known: only the 30 m around it are searched, so
                 that a route that meets itself is followed in order.
         """
@@ -108,7 +108,7 @@ def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[i
     """Lanes from a place (lane, arc length) to another, by A* over lane lengths with the straight line as its bound.
 
     Raises:
-        ScenarioError: no way leads there.
+        ScenarioError: no way leads from the start to the goal.
     """
     (first, from_m), (last, to_m) = start, goal
     if first == last and to_m >= from_m - SPACING_M:

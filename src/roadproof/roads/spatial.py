@@ -20,8 +20,8 @@ class TriangleIndex:
     """Which triangles hold a point; each triangle has a code, and the largest code wins.
 
     Args:
-        corners: of triangles of either winding.
-        codes: of the triangles, above 0.
+        corners: world x, y of each triangle's corners, metres, in either winding.
+        codes: the code of each triangle, above 0.
     """
 
     def __init__(self, corners: Float[np.ndarray, "t 3 2"], codes: Int[np.ndarray, " t"]) -> None:
@@ -57,14 +57,14 @@ class SegmentIndex:
     """The segments of polylines, those without length left out.
 
     Args:
-        lines: polylines; their place in the list is the owner of their segments.
+        lines: polylines, (n, 3) metres each; `owner` is a line's place in this list.
 
     Attributes:
         start: x and y of each segment's first point.
-        along: its direction, of length 1.
-        length_m: its length.
-        owner: the line it belongs to.
-        station_m: arc length of its line up to it.
+        along: direction of each segment, of length 1.
+        length_m: length of each segment.
+        owner: index of the line that each segment belongs to.
+        station_m: arc length from the beginning of its line up to each segment.
     """
 
     def __init__(self, lines: list[Float[np.ndarray, "_ 3"]]) -> None:
@@ -84,12 +84,14 @@ class SegmentIndex:
         self._half_m = 0.5 * float(self.length_m.max())
 
     def within(self, x_m: float, y_m: float, beyond_m: float) -> Int[np.ndarray, " k"]:
-        """Segments near a point, in rising order: all whose distance exceeds the nearest one's by no more than this.
+        """Indices of the segments near a point, in rising order: all with D² ≤ d² + beyond_m², and maybe a few others.
+
+        D is a segment's distance from the point, d that of the nearest segment.
 
         Args:
-            x_m: world x.
-            y_m: world y.
-            beyond_m: the nearest one's distance d and the others' D fulfil D² ≤ d² + this².
+            x_m: world x, metres.
+            y_m: world y, metres.
+            beyond_m: how far beyond the nearest segment others still count as near, by the rule above, metres.
         """
         nearest_m: float = self._tree.query((x_m, y_m))[0]
         reach_m = math.hypot(nearest_m, beyond_m) + self._half_m

@@ -84,8 +84,8 @@ def check_simulator(
 
     Args:
         simulator: entered, that is inside its with-block.
-        scenario: the canvas lies straight ahead of the start, 15 to 60 m away, on a free road.
-        steps: length of the short drives.
+        scenario: a scenario whose canvas lies straight ahead of the start, 15 to 60 m away, on a free road.
+        steps: how many steps each of the short drives has.
         only: names of the checks to run; all where it is empty.
 
     Returns:

@@ -26,7 +26,7 @@ class MappedSimulator(Simulator, OpenWorld, Protocol):
 
         Raises:
             SimulatorError: the simulator does not answer.
-            ScenarioError: it has no such map.
+            ScenarioError: the simulator has no such map.
         """
         ...
 
@@ -37,10 +37,10 @@ def is_server(spec: str) -> bool:
 
 
 def is_elsewhere(spec: str) -> bool:
-    """Whether it is on another machine.
+    """Whether the simulator of a spec is on another machine.
 
     Raises:
-        SimulatorError: it is no address.
+        SimulatorError: the spec is no address.
     """
     return is_server(spec) and _address(spec)[0] not in ("localhost", "127.0.0.1", "::1")
 
@@ -49,7 +49,7 @@ def check_spec(spec: str) -> None:
     """See that a spec names a simulator, before any work; whether it is there shows when it is opened.
 
     Raises:
-        SimulatorError: there is none of this name, or it is no address.
+        SimulatorError: no simulator has this name, or the spec is no address.
     """
     if spec.startswith("recorded:"):
         raise SimulatorError(f"simulator {spec!r} is a recorded world, which evaluate, select and drive alone drive in")
@@ -64,7 +64,7 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
     """Open the simulator of a spec for a with-block; leaving frees everything it holds.
 
     Raises:
-        SimulatorError: there is none of this name, or what it needs is not installed.
+        SimulatorError: no simulator has this name, or what it needs is not installed.
     """
     check_spec(spec)
     if spec == "town":

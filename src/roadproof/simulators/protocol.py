@@ -46,7 +46,7 @@ Pictures: TypeAlias = bool | frozenset[int]
 """Which observations of a drive have the full camera picture: all, none, or those after so many steps."""
 
 PaintChoice: TypeAlias = Literal["inject", "native", "auto"]
-"""What can be asked of a CARLA server; "auto" is the second if it works there, else the first."""
+"""How a CARLA server may be asked to paint; "auto" is "native" where that works, else "inject"."""
 
 
 @runtime_checkable
@@ -98,16 +98,16 @@ class Simulator(Protocol):
 
         Args:
             scenario: start, goal, canvas, time limit and map.
-            weather: one of the eight.
-            pattern: painted on the canvas; None leaves the road bare.
-            cars: other cars on the road.
-            pedestrians: people about.
-            seed: of the other cars and the people.
+            weather: one of the eight weathers.
+            pattern: RGBA of the canvas, painted on it; None leaves the road bare.
+            cars: how many other cars are on the road.
+            pedestrians: how many people are about.
+            seed: the seed of the other cars and the people.
             full_pictures: which observations have the full camera picture too; where steps are given, others may have
                 it as well.
 
         Raises:
-            SimulatorError: it is not open, or an argument does not fit.
+            SimulatorError: the simulator is not open, or an argument does not fit.
         """
         ...
 
@@ -139,12 +139,12 @@ class OpenWorld(Protocol):
 
     @property
     def cars(self) -> Agents:
-        """The others now."""
+        """The other cars as they are now."""
         ...
 
     @property
     def pedestrians(self) -> Agents:
-        """The people now."""
+        """The people as they are now."""
         ...
 
 
@@ -154,5 +154,5 @@ class Identified(Protocol):
 
     @property
     def identity(self) -> str:
-        """A text that is the same where its world is the same, and else another."""
+        """A text that is the same for every simulator with the same world, and another for every other."""
         ...

@@ -32,9 +32,9 @@ class Picture:
     """A figure and its words.
 
     Args:
-        name: of its file.
-        caption: what it shows.
-        figure: drawn.
+        name: the name of the picture's file, without the ending.
+        caption: what the picture shows.
+        figure: the figure, drawn.
     """
 
     name: str

@@ -34,7 +34,7 @@ def write_result(job: Job, result: JobResult, folder: Path) -> None:
     """Keep what came of a job; its rows last, since they say that it is finished.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: a file cannot be written.
         StudyError: a file would leave the job's folder.
     """
     place = folder / "jobs" / job.key
@@ -69,10 +69,10 @@ def is_done(job: Job, folder: Path) -> bool:
 
 
 def write_study(study: Study, folder: Path) -> None:
-    """Keep what the tables cannot know from the jobs.
+    """Keep what the tables need of a study's plan and cannot know from the jobs.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     _write_json(folder / "study.json", {"format": STUDY[0], "version": STUDY[1], "reference": study.reference})
 
@@ -92,8 +92,8 @@ def write_table(jobs: Iterable[Job], folder: Path) -> Frame:
     """Gather the rows of all jobs that have some, in the jobs' order, and write them as Parquet.
 
     Raises:
-        StudyError: there is none, or pandas and pyarrow are not installed.
-        OutputError: it cannot be written.
+        StudyError: no job has rows, or pandas and pyarrow are not installed.
+        OutputError: the file cannot be written.
     """
     rows = [row for job in jobs for row in read_rows(job, folder) or ()]
     if not rows:
@@ -107,14 +107,14 @@ def write_table(jobs: Iterable[Job], folder: Path) -> Frame:
 
 
 def read_table(folder: Path, name: str = "rows.parquet") -> Frame:
-    """Every row of a study.
+    """Read every row of a study.
 
     Args:
-        folder: of the study.
-        name: of the table in it; `study transfer` writes transfer.parquet.
+        folder: the folder of the study.
+        name: the name of the table's file in it; `study transfer` writes transfer.parquet.
 
     Raises:
-        StudyError: there is none, it is damaged, or pandas and pyarrow are not installed.
+        StudyError: the file is missing or damaged, or pandas and pyarrow are not installed.
     """
     path = folder / name
     if not path.is_file():
@@ -126,10 +126,10 @@ def read_table(folder: Path, name: str = "rows.parquet") -> Frame:
 
 
 def pandas() -> Any:  # noqa: ANN401  # the module
-    """The library for tables, an extra.
+    """The pandas library, which an extra installs.
 
     Raises:
-        StudyError: it is not installed, or pyarrow, by which it reads and writes Parquet.
+        StudyError: pandas is not installed, or pyarrow, by which it reads and writes Parquet.
     """
     try:
         import_module("pyarrow")

@@ -16,9 +16,9 @@ class Course:
     """A value as a search went on: three lists of equal length.
 
     Args:
-        calls: simulator calls when each value was known.
-        seconds: since the search began, of each.
-        best: the value of the best pattern so far.
+        calls: how many simulator calls had been made when each value was known.
+        seconds: seconds since the search began when each value was known.
+        best: value of the best pattern so far, as long as `calls`.
     """
 
     calls: tuple[int, ...]
@@ -36,9 +36,11 @@ class History(Course):
 
     Args:
         kind: whether the values come from drives, or from composited frames.
-        measure: what the search makes large.
-        deviation_m: of a search that drives: metres, by the pattern that was best by then in the search's measure.
-        driven: of a search on composited frames: metres, by the pattern that was driven in the end, if one was.
+        measure: name of the objective that the search maximises; empty where nobody said.
+        deviation_m: deviation of the pattern that was best by then in the search's own measure, metres; None where the
+            search does not drive.
+        driven: deviation of the pattern that was driven after a search on composited frames, metres; its lists are
+            empty where none was driven, and it is None for a search that drives.
     """
 
     kind: Literal["closed loop", "surrogate"]
@@ -54,7 +56,7 @@ class History(Course):
         return Course(calls=self.calls, seconds=self.seconds, best=self.deviation_m) if self.deviation_m else None
 
     def to_json(self) -> bytes:
-        """The file's content."""
+        """The content of history.json."""
         kept = {name: value for name, value in _FILE.stated(self).items() if value is not None}
         return (json.dumps({"format": _FILE.name, "version": _FILE.version, **kept}) + "\n").encode()
 

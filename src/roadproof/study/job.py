@@ -42,12 +42,12 @@ class _Found:
     """What a search gave.
 
     Args:
-        pattern: the pattern that it chose.
-        calls: drives of the simulator that it took.
-        seconds: that it took.
+        pattern: the pattern that the search chose.
+        calls: how many drives of the simulator the search took.
+        seconds: how long the search took.
         evaluation_s: seconds of drives made already that belong to the evaluation.
-        history: how it went.
-        site: the road under it.
+        history: how the search went.
+        site: the road under the pattern.
     """
 
     pattern: Pattern
@@ -66,8 +66,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     """Find a pattern and evaluate it; the `Work` of a study.
 
     Args:
-        job: what to do.
-        scratch: its own folder; what an interrupted run left there is gone on from.
+        job: the pattern to find, and the conditions to evaluate it in.
+        scratch: the job's own folder; what an interrupted run left there is gone on from.
 
     Raises:
         RoadproofError: the simulator or controller is not there, or a stage refuses; the message says why.

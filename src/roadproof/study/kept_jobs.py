@@ -28,10 +28,10 @@ class StatedMethod:
     """What tables need to know of a method.
 
     Args:
-        name: as in the rows.
-        search: "gradopt", or another; empty where nobody said.
-        trajectories: gradopt: T.
-        scheme: gradopt: "group", "group-all" or "random".
+        name: the method's name, as the rows have it.
+        search: "gradopt", or the word of another search; empty where nobody said.
+        trajectories: T, how many drives are recorded for a gradopt search; 0 where nobody said.
+        scheme: "group", "group-all" or "random": how a gradopt search groups its drives; empty where nobody said.
     """
 
     name: str
@@ -62,18 +62,18 @@ class KeptJob(_Stated):
     """A job of which there are rows, and its folder.
 
     Args:
-        id: the job, as people name it.
+        id: the scenario, K, method and seed of the job.
         controller: spec of the controller that the pattern was found against.
-        scenario: its map and its canvas.
+        scenario: the map and the canvas of the scenario.
         method: how the pattern was searched.
-        folder: with the job's files.
+        folder: the folder with the job's files.
     """
 
     id: JobId
     folder: Path
 
     def pattern(self) -> Pattern | None:
-        """What was found; None where the job has none.
+        """The pattern that the job found; None where the job has none.
 
         Raises:
             PatternError: the file is damaged.
@@ -122,11 +122,11 @@ def read_jobs(folder: Path, rows: Frame) -> dict[JobId, KeptJob]:
     """The jobs that rows belong to, of those that left a folder.
 
     Args:
-        folder: of the study; one with rows.parquet alone has no jobs.
-        rows: of the study; their jobs are found by their keys.
+        folder: the folder of the study; one with rows.parquet alone has no jobs.
+        rows: the rows of the study; their jobs are found by their keys.
 
     Raises:
-        StudyError: a job's file is damaged, or the rows are of before they had keys.
+        StudyError: a job's file is damaged, or the rows are so old that they have no keys.
     """
     if not (folder / "jobs").is_dir():
         return {}

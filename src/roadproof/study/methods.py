@@ -109,11 +109,11 @@ MethodPlan: TypeAlias = GradOptPlan | PublishedPlan | BlackBoxPlan
 
 
 def method_plan(values: Mapping[str, Any]) -> MethodPlan:
-    """A method from its table.
+    """Read a method from its table in a plan.
 
     Raises:
-        StudyError: it lacks a name or a known search, has a key that its search does not know, or a value makes no
-            sense.
+        StudyError: the table lacks a name or a known search, has a key that its search does not know, or a value makes
+            no sense.
     """
     for name in ("name", "search"):
         if name not in values:
@@ -164,7 +164,7 @@ def budget_of(method: MethodPlan, weather: Weather) -> Budget:
 
 
 def black_box(method: BlackBoxPlan) -> BlackBox:
-    """The search itself.
+    """The black-box search that a plan's method means.
 
     Raises:
         RoadproofError: a value of the method is out of its range.

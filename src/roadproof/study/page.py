@@ -33,13 +33,13 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     """Make every table and figure of a study.
 
     Args:
-        rows: the study's, see `folder.read_table`.
-        folder: of the study, for what its jobs left there.
-        out: where the files go; older ones of the same names are replaced.
+        rows: the rows of the study (`folder.read_table`).
+        folder: the folder of the study, for what its jobs left there.
+        out: the folder for the files; older ones of the same names are replaced.
         transfer: rows of the same patterns driven by other controllers; None where nobody drove them.
 
     Returns:
-        The page.
+        The path of the page, tables.html.
 
     Raises:
         StudyError: there is nothing to show, or a file of a job is damaged.

@@ -23,7 +23,7 @@ from roadproof.simulators.protocol import PatternImage, Simulator
 PICTURES = 6
 SIZE_PX = (240, 180)
 HORIZON_M = 14.0
-"""The first picture is taken so far before the canvas, the last at its end."""
+"""Distance before the canvas at which the first picture is taken; the last is taken at the canvas' end."""
 
 
 def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: PatternImage) -> dict[str, bytes]:
@@ -33,12 +33,12 @@ def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: 
 
     Args:
         simulator: an open simulator of the kind that drove.
-        evaluation: the drives that were judged.
-        folder: where its episodes are.
+        evaluation: the evaluation with the drives that were judged.
+        folder: the folder with the evaluation's episodes.
         paint: the canvas as it was painted.
 
     Raises:
-        SimulatorError: as `rollout` does.
+        SimulatorError: as `rollout` raises it.
     """
     files: dict[str, bytes] = {}
     for weather, traffic in product(evaluation.weathers, (False, True)):

@@ -40,8 +40,8 @@ def examples(results: Results, count: int) -> tuple[str, ...]:
     """Scenarios to be shown: of every kind some, evenly spread from the most to the least that GradOpt deviates there.
 
     Args:
-        results: of the study; deviations at the largest K decide.
-        count: how many at most.
+        results: the study's numbers; deviations at the largest K decide.
+        count: how many scenarios there are at most.
     """
     values = results.values(results.overall[0], results.reference.name, results.figures[-1])
     reached: dict[str, float] = dict.fromkeys(results.kinds, 0.0) | values.groupby(level=0).max().to_dict()

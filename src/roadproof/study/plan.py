@@ -40,13 +40,13 @@ def _check_range(name: str, value: int, least: int, most: int) -> None:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrafficPlan:
-    """Evaluation among others: seeded runs whose mean counts.
+    """Evaluation in traffic: seeded runs whose mean counts.
 
     Args:
-        cars: on the road, 0 to 500.
-        pedestrians: about, 0 to 500.
-        runs: in each weather, 1 to 10,000.
-        weathers: "all", or "first": the study's other weathers are driven alone.
+        cars: how many other cars are on the road, 0 to 500.
+        pedestrians: how many people are about, 0 to 500.
+        runs: how many runs there are in each weather, 1 to 10,000.
+        weathers: "all" has traffic in all of the study's weathers, "first" in the first alone.
 
     Raises:
         StudyError: a number is out of its range, or nobody is on the road.
@@ -70,7 +70,7 @@ class StartPlan(StartRange):
     """Where the drives begin that judge a pattern: not where it was chosen.
 
     Args:
-        count: drives alone in each weather, 1 to 1000.
+        count: how many drives alone there are in each weather, 1 to 1000.
 
     Raises:
         EpisodeError: a start is too far from the scenario's.
@@ -85,7 +85,7 @@ class StartPlan(StartRange):
 
     @property
     def range(self) -> StartRange:
-        """What the starts are drawn from, without how many there are."""
+        """The range that the starts are drawn from, without how many there are."""
         return StartRange(right_m=self.right_m, turned_rad=self.turned_rad, faster_mps=self.faster_mps)
 
 
@@ -95,12 +95,12 @@ class Conditions:
 
     Args:
         controller: spec of the controller (`controllers.loading`).
-        weathers: of the drives that judge; patterns are found in the first.
-        traffic: cars and people beside those drives; None for drives alone.
-        starts: where those drives begin.
+        weathers: the weathers of the drives that judge a pattern; patterns are found in the first.
+        traffic: cars and people in the evaluation; None for drives alone.
+        starts: how many drives alone judge a pattern in each weather, and where they begin.
         simulator: spec of the simulator (`simulators.loading`).
-        paint: limits on the patterns; None limits nothing.
-        variation: looks over which searches in recordings take the mean; None for paint and camera as recorded.
+        paint: limits on the paint of patterns; None limits nothing.
+        variation: what searches in recordings take the mean over; None for paint and camera as recorded.
     """
 
     controller: str
@@ -113,7 +113,7 @@ class Conditions:
 
     @property
     def shared(self) -> dict[str, Any]:
-        """The conditions alone, by name."""
+        """The conditions of a job or a study without its other fields, by name."""
         return {each.name: getattr(self, each.name) for each in fields(Conditions)}
 
 
@@ -122,12 +122,12 @@ class Job(Conditions):
     """One pattern to be found and evaluated; independent of every other.
 
     Args:
-        scenario: where it is painted.
-        figures: K, or "1-b" for one black figure.
-        method: how it is found.
-        seed: of the recording and the search.
-        weights: digest of the file that the controller's spec names, or of the source of a function of yours; empty
-            for one that comes with the package.
+        scenario: the scenario on whose canvas the pattern is painted.
+        figures: K, how many figures the pattern has, or "1-b" for one black figure.
+        method: the method by which the pattern is found.
+        seed: the seed of the recording and the search.
+        weights: digest of the file that the controller's spec names, or of the source of a function of the user's;
+            empty for a controller that comes with the package.
     """
 
     scenario: Scenario
@@ -155,9 +155,9 @@ class Study(Conditions):
 
     Args:
         scenarios: the stretches of road on which every method finds its patterns.
-        figures: K, or "1-b" for one black figure.
-        methods: how patterns are found.
-        seeds: of recording and search.
+        figures: the values of K, how many figures a pattern has, or "1-b" for one black figure.
+        methods: the methods by which patterns are found.
+        seeds: the seeds of recording and search.
         reference: name of the method that tables compare with the others; None for the first.
 
     Raises:
@@ -197,7 +197,7 @@ class Study(Conditions):
             raise StudyError(f"reference is {self.reference!r}, expected one of {', '.join(named['method'])}")
 
     def _check_paint(self) -> None:
-        """See that every method can keep to the limits and the variation."""
+        """See that every method can keep to the limits on paint and the variation."""
         for method in self.methods:
             driven = isinstance(method, BlackBoxPlan) and method.where == "simulator"
             if isinstance(method, PublishedPlan) and (self.paint or self.variation):
@@ -207,7 +207,7 @@ class Study(Conditions):
 
     @property
     def jobs(self) -> tuple[Job, ...]:
-        """Every combination, scenario by scenario."""
+        """The job of every combination, scenario by scenario."""
         more: dict[str, Any] = {"weights": _digest(self.controller), **self.shared}
         combinations = product(self.scenarios, self.figures, self.methods, self.seeds)
         return tuple(
@@ -217,15 +217,15 @@ class Study(Conditions):
 
 
 def load_study(path: AnyPath, *, trust: bool = False) -> Study:
-    """Read a study.
+    """Read a study from its plan.
 
     Args:
-        path: of the TOML file.
-        trust: follow it also where it runs code or calls another machine: a plan may come from anyone.
+        path: the plan's TOML file.
+        trust: whether to follow a plan that runs code or calls another machine; a plan may come from anyone.
 
     Raises:
-        StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or it is not trusted with
-            what it asks for; says which.
+        StudyError: the file is missing or damaged, a key is unknown, a value makes no sense, or the plan is not trusted
+            with what it asks for; says which.
     """
     path = as_path(path)
     content = read_toml(path, StudyError)
@@ -286,7 +286,7 @@ def _chosen(patterns: Iterable[str], scenarios: tuple[Scenario, ...]) -> tuple[S
 
 
 def _digest(controller: str) -> str:
-    """Of the file that a spec names, `cil:FILE.safetensors`, or that the module of a function is written in."""
+    """The digest of the file that a spec names, `cil:FILE.safetensors`, or that a function's module is written in."""
     module, _, name = controller.partition(":")
     path = Path(name or controller)
     if not path.suffix and name.isidentifier() and (found := _source(module)):

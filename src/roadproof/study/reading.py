@@ -73,7 +73,7 @@ def refuse_untrusted(controller: str, simulator: str | None) -> None:
         simulator: the spec of its simulator; None where it opens none.
 
     Raises:
-        StudyError: it would; the message names what, and how to allow it.
+        StudyError: it would; the message names what it would do, and how to allow that.
     """
     if runs_code(controller):
         raise StudyError(

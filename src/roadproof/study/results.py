@@ -38,11 +38,11 @@ class Block:
     """Columns of a table that belong together: one metric under one condition.
 
     Args:
-        heading: over them.
-        metric: what they hold.
-        weather: of the drives.
+        heading: the heading over the columns.
+        metric: the metric that the columns hold.
+        weather: the weather of the drives.
         traffic: whether there were others on the road.
-        kind: of the scenarios; None takes all.
+        kind: the kind of the scenarios; None takes all kinds.
     """
 
     heading: str
@@ -58,13 +58,13 @@ class Results:
 
     Args:
         drives: the rows of jobs that came to their end, one a drive.
-        failures: why a job did not come to its end.
-        methods: in the rows' order.
+        failures: why each job that did not come to its end failed.
+        methods: the methods, in the rows' order.
         named: the method that the plan compares with the others; None where it names none.
-        kinds: of each scenario.
-        figures: K, in order, one black figure first.
-        seeds: in order.
-        weathers: of the drives; patterns were found in the first.
+        kinds: the kind of each scenario, by the scenario's name.
+        figures: the values of K as text, in rising order, one black figure first.
+        seeds: the seeds, in rising order.
+        weathers: the weathers of the drives; patterns were found in the first.
     """
 
     drives: Frame
@@ -82,7 +82,7 @@ class Results:
         return self.weathers[0]
 
     def has(self, *, traffic: bool, weather: str | None = None) -> bool:
-        """Whether any drive, of a weather or at all, was in traffic, or alone."""
+        """Whether any drive was in traffic, or any alone, in one weather or in all."""
         drives = self.drives if weather is None else self.drives[self.drives["weather"] == weather]
         return bool((drives["traffic"] == traffic).any())
 
@@ -99,7 +99,7 @@ class Results:
 
     @property
     def reference(self) -> StatedMethod:
-        """What others are compared with: the plan's method, else GradOpt in groups of three, any GradOpt, the first."""
+        """The method others are compared with: the plan's, else GradOpt in groups of three, any GradOpt, the first."""
         named = [method for method in self.methods if method.name == self.named]
         gradopt = [method for method in self.methods if method.search == "gradopt"]
         usual = [method for method in gradopt if (method.scheme, method.trajectories) == ("group", 3)]
@@ -140,11 +140,11 @@ class Results:
     def gaps(
         self, methods: Collection[str] | None = None, conditions: Collection[tuple[str, bool]] | None = None
     ) -> dict[JobId, str]:
-        """What a table of these methods, weathers and traffic lacks, and why.
+        """The jobs that lack drives for a table of some methods, weathers and traffic, and why they do.
 
         Args:
-            methods: names; None takes all.
-            conditions: weather and whether in traffic; None takes all that occur.
+            methods: names of the methods in the table; None takes all.
+            conditions: (weather, whether in traffic) of the drives in the table; None takes all that occur.
         """
         counts = self.drives.groupby([*JOB, *CONDITION]).size().unstack(CONDITION, fill_value=0)
         kept = counts[[where for where in counts if conditions is None or where in conditions]]
@@ -169,9 +169,9 @@ def results_of(rows: Frame, methods: Iterable[StatedMethod] = (), named: str | N
     """Sort a study's rows into drives and failures.
 
     Args:
-        rows: of the study; the first weather is the one in which patterns were found.
-        methods: what is known of them besides their names.
-        named: the method that the plan compares with the others.
+        rows: the rows of the study; the first weather is the one in which patterns were found.
+        methods: what is known of the methods besides their names.
+        named: the method that the plan compares with the others; None where it names none.
 
     Raises:
         StudyError: there is no row, a column is missing, a number is not finite, or every job failed.
@@ -214,7 +214,7 @@ def check_finite(rows: Frame, column: str) -> None:
     """See that a column holds finite numbers.
 
     Raises:
-        StudyError: it does not; names the first that is none.
+        StudyError: a number is not finite; the message names the first.
     """
     try:
         wrong = rows[~np.isfinite(rows[column].astype(float))]

@@ -103,7 +103,7 @@ class JobResult:
     """What came of one job.
 
     Args:
-        rows: one for each drive that was judged, or a single one with an error.
+        rows: one row for each drive that was judged, or a single one with an error.
         files: small files by name, kept with the rows.
     """
 

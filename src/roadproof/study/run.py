@@ -24,7 +24,7 @@ Work: TypeAlias = Callable[[Job, Path], JobResult]
 """Does a job; the folder is its own, and holds what a run before this one left there."""
 
 OnJob: TypeAlias = Callable[[int, Job, JobResult], object]
-"""Told how many jobs are done, and of the last one and its result."""
+"""Called with how many jobs are done, the last one, and its result."""
 
 
 def run_study(
@@ -36,18 +36,18 @@ def run_study(
     cluster: str | None = None,
     on_job: OnJob = lambda _done, _job, _result: None,
 ) -> Frame:
-    """Do every job that is not done yet, and gather the rows.
+    """Do every job of a study that is not done yet, and gather the rows.
 
     A job that fails becomes a row that says why, and the others go on. Killed in the middle, the same call does what
     is left; a job that failed is tried again.
 
     Args:
-        study: what to compare.
-        folder: where results are kept; may hold those of a run before.
+        study: the study whose jobs are done.
+        folder: the folder where results are kept; may hold those of a run before.
         work: does one job; a function of a module, since it runs in other processes.
-        workers: processes on this machine, each with one thread.
-        cluster: address of a Ray cluster, "local" for one on this machine; None stays without Ray.
-        on_job: told of every job.
+        workers: how many processes work on this machine, each with one thread.
+        cluster: address of a Ray cluster, "local" for one on this machine; None does without Ray.
+        on_job: called after every job with how many are done, the job and its result.
 
     Raises:
         StudyError: an argument makes no sense, or an extra is missing.
@@ -82,7 +82,7 @@ def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
 
 
 def _compute_with_one_thread() -> None:
-    """From now on: where a search ends depends on it, and rows must not depend on how many jobs are done at once."""
+    """Use one thread from now on: where a search ends depends on it, and rows must not depend on how many jobs run."""
     # What is loaded already keeps to limits, what is loaded later to the variable.
     import_module("threadpoolctl").threadpool_limits(1)
     os.environ["OMP_NUM_THREADS"] = "1"

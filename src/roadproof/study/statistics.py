@@ -60,12 +60,12 @@ class Paired:
     """One method against another, over the cases that both have.
 
     Args:
-        ours: mean of the first, over these cases.
-        theirs: mean of the second.
-        difference: first less second, with its interval.
-        at_least: share of cases in which the first is at least the second, in [0, 1], with its interval.
-        ties: how many cases are equal.
-        by_scenario: mean difference of every scenario.
+        ours: mean of the first method, over the cases that both have.
+        theirs: mean of the second method, over the cases that both have.
+        difference: mean of the first less the second method, with its interval.
+        at_least: share of cases in which the first method is at least the second, in [0, 1], with its interval.
+        ties: how many cases are equal for both methods.
+        by_scenario: mean difference of each scenario.
     """
 
     ours: Mean

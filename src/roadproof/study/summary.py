@@ -9,7 +9,7 @@ def summary(rows: Frame) -> tuple[str, ...]:
     """A line for each method: means over its jobs, driven alone in the weather the patterns were found in.
 
     Args:
-        rows: of the study (`study.rows`).
+        rows: the rows of the study (`study.rows`).
     """
     good = rows[rows["error"].isna()]
     if good.empty:

@@ -16,10 +16,10 @@ class Estimate:
     """A mean that is shown with its interval.
 
     Args:
-        mean: the number.
-        digits: after the point.
-        best: whether it is the best of its row.
-        unit: stands behind the number; "%" for shares, which are in [0, 1].
+        mean: the mean and both ends of its interval.
+        digits: how many digits stand after the point.
+        best: whether the mean is the best of its row.
+        unit: the unit behind the number; "%" for shares, which are in [0, 1].
     """
 
     mean: Mean
@@ -34,7 +34,7 @@ class Estimate:
 
     @property
     def interval(self) -> tuple[str, str] | None:
-        """Both ends in words."""
+        """Both ends of the interval in words."""
         if self.mean.low is None or self.mean.high is None:
             return None
         return self._shown(self.mean.low), self._shown(self.mean.high)
@@ -66,11 +66,11 @@ class Table:
     """A table as people read it.
 
     Args:
-        name: of its file, and of its label in LaTeX.
-        title: what it shows.
-        note: how to read it, and what is not in it.
+        name: the name of the table's file without the ending, and of its label in LaTeX.
+        title: what the table shows.
+        note: how to read the table, and what is not in it.
         header: rows of headings, each as wide as the table.
-        rows: cells; an empty text continues the cell above.
+        rows: rows of cells; an empty text continues the cell above.
         left: how many columns from the left hold names.
 
     Raises:
@@ -94,7 +94,7 @@ class Table:
 
     @property
     def columns(self) -> int:
-        """How many."""
+        """How many columns the table has."""
         return sum(each.span for each in self.header[-1])
 
     @property

@@ -9,17 +9,17 @@ from roadproof.study.results import JOB, PENALTY, Block, Results
 
 SHOWN_GAPS = 3
 ENOUGH = 10
-"""Scenarios; with fewer a percentile bootstrap covers clearly less than it claims."""
+"""The least scenarios; with fewer a percentile bootstrap covers clearly less than it claims."""
 
 
 def table_note(results: Results, blocks: Sequence[Block], methods: Sequence[str], said: str) -> str:
     """The note of a table.
 
     Args:
-        results: of the study.
-        blocks: what the table shows.
-        methods: names of those in it.
-        said: what is particular to this table.
+        results: the numbers of the study.
+        blocks: the blocks of columns that the table shows.
+        methods: names of the methods in the table.
+        said: what is particular to this table, in sentences.
     """
     measured = dict.fromkeys(
         f"{block.metric.title} in {block.metric.unit}, {'in traffic' if block.traffic else 'alone on the road'}"

@@ -34,9 +34,9 @@ def transfer(
     """Drive every controller over the patterns of a study.
 
     Args:
-        study: whose patterns.
-        folder: where its results are kept; jobs that are not done are left out.
-        controllers: specs; the one the patterns were found against may be among them.
+        study: the study whose patterns are driven over.
+        folder: the folder with the study's results; jobs that are not done are left out.
+        controllers: specs of the controllers; the one the patterns were found against may be among them.
         on_pattern: told how many patterns have been driven over, and of how many, all controllers counted.
 
     Raises:

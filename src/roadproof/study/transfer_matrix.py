@@ -19,8 +19,8 @@ def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
     """The matrix with intervals; each controller's worst pattern source in bold, where there are several.
 
     Args:
-        rows: of transfer.parquet (`rows.TransferRow`), one a drive.
-        metric: deviation or penalty.
+        rows: the rows of transfer.parquet (`rows.TransferRow`), one a drive.
+        metric: the metric that the matrix holds, deviation or penalty.
 
     Raises:
         StudyError: there is no row, a column is missing, or a number is not finite.

@@ -22,12 +22,12 @@ class Agents:
     """Cars or people at one moment.
 
     Args:
-        x_m: world x of their middle.
-        y_m: world y.
-        yaw_rad: where they face.
-        speed_mps: how fast they go there.
-        travelled_m: how far they have come, for the turning of wheels and the swing of legs.
-        look: a number for colour and shape, 0 to 65535.
+        x_m: world x of each one's middle, metres.
+        y_m: world y of each one's middle, metres.
+        yaw_rad: direction in which each one faces.
+        speed_mps: speed of each one in the direction it faces.
+        travelled_m: how far each one has come, for the turning of wheels and the swing of legs.
+        look: a number that picks each one's colour and shape, 0 to 65535.
     """
 
     x_m: Float[np.ndarray, " n"]
@@ -88,8 +88,8 @@ def first_in_way(
     """How far each path is free, and how fast what ends it goes along it.
 
     Args:
-        path_x: x of points along each path.
-        path_y: y of them.
+        path_x: x of points along each path, metres.
+        path_y: y of points along each path, metres.
         ahead_m: how far along a path its points lie.
         things: what may stand in the way.
         own: index of the car on each path, which does not stand in its own way; −2 where there is none.
@@ -139,14 +139,14 @@ def idm_acceleration(
     """Acceleration of the intelligent driver model, m/s², not below −8.
 
     Args:
-        speed: own speed, m/s.
-        wanted: speed on a free road.
+        speed: own speed of each car, m/s.
+        wanted: speed that each car takes on a free road, m/s.
         gap_m: free distance to the leader; inf where there is none.
-        leader: its speed.
-        gain: acceleration on a free road from rest.
-        comfort: deceleration aimed at.
-        headway_s: time kept to the leader.
-        standstill_m: distance kept at rest.
+        leader: speed of the leader, m/s.
+        gain: acceleration on a free road from rest, m/s².
+        comfort: deceleration aimed at, m/s².
+        headway_s: time that is kept to the leader.
+        standstill_m: distance that is kept to the leader at rest.
 
     References:
         Treiber, Hennecke, Helbing (2000), Congested traffic states in empirical observations, eqs. 2 and 3.

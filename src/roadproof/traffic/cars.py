@@ -42,7 +42,7 @@ class Cars:
         """Place the cars.
 
         Raises:
-            SimulatorError: they do not fit on the map.
+            SimulatorError: so many cars do not fit on the map.
         """
         self._map = road_map
         self._tracks = Tracks(road_map, "driving")

@@ -96,7 +96,7 @@ class Pedestrians:
             self._cross(who, now, car_x, car_y, car_speed)
 
     def _go_round(self, who: int) -> None:
-        """Onto the next sidewalk, or back where there is none."""
+        """Go onto the next sidewalk, or back where there is none."""
         track, sense = int(self._track[who]), float(self._sense[who])
         onward = self._tracks.successors[track] if sense > 0 else self._tracks.predecessors[track]
         length = float(self._tracks.length_m[track])

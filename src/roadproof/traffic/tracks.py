@@ -18,11 +18,11 @@ class Tracks:
     """Lanes of a kind, joined where one way leads on.
 
     Attributes:
-        length_m: of each track.
-        successors: tracks that go on from the end of each.
-        predecessors: tracks that lead to its start.
-        junction: name of the junction a track crosses, or None.
-        place: for the index of a lane, its track and where on it the lane starts.
+        length_m: length of each track.
+        successors: for each track, the tracks that go on from its end.
+        predecessors: for each track, the tracks that lead to its start.
+        junction: for each track, the id of the junction that it crosses, or None.
+        place: for the index of each lane, its track and where on the track the lane starts, in metres.
     """
 
     def __init__(self, road_map: RoadMap, kind: str) -> None:
@@ -125,7 +125,7 @@ class Tracks:
         return self.chains[track][0], 0.0
 
     def conflicts(self, clear_m: float) -> Bool[np.ndarray, "t t"]:
-        """Whether two tracks that cross the same junction, from different arms, come nearer than this."""
+        """Whether two tracks that cross the same junction, from different arms, come nearer than `clear_m`."""
         count = len(self.chains)
         conflict = np.zeros((count, count), dtype=bool)
         lines = [

@@ -12,16 +12,16 @@ from torch.nn import functional
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Augmentation:
-    """How strongly pictures are varied: deviations, or shares of the pictures.
+    """How strongly pictures are varied, and how many of them.
 
     Args:
-        brightness: of the factor on all channels, as a power of e.
-        contrast: of the factor on the distance from the picture's mean, likewise.
-        tint: of the factor on each channel, likewise.
-        saturation: of the factor on the distance from grey, likewise.
-        noise: largest deviation of a pixel's noise.
-        noisy: share of the pictures with noise.
-        blurred: share of the pictures blurred over 3×3 pixels.
+        brightness: standard deviation of the logarithm of the factor on all channels.
+        contrast: standard deviation of the logarithm of the factor on the distance from the picture's mean.
+        tint: standard deviation of the logarithm of the factor on each channel.
+        saturation: standard deviation of the logarithm of the factor on the distance from grey.
+        noise: largest standard deviation of a pixel's noise, where levels are in [0, 1].
+        noisy: share of the pictures with noise, 0 to 1.
+        blurred: share of the pictures blurred over 3×3 pixels, 0 to 1.
     """
 
     brightness: float = 0.15

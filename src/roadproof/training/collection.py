@@ -44,13 +44,13 @@ class CollectionPlan:
     """Which drives to record.
 
     Args:
-        drives: how many.
-        seed: of everything: scenarios, weathers, traffic, disturbances, paint.
-        map_name: the map driven on.
-        controller: spec of who drives; None is the expert.
-        disturbed: share of the drives that start beside the lane's middle and are disturbed.
-        traffic: share of the drives with others on the road.
-        painted: share of the drives with a random pattern on the canvas.
+        drives: how many drives to record, at least 1.
+        seed: the seed of everything drawn: scenarios, weathers, traffic, disturbances, paint.
+        map_name: the name of the map driven on.
+        controller: spec of the controller that drives; None for the expert.
+        disturbed: share of the drives that start beside the lane's middle and are disturbed, 0 to 1.
+        traffic: share of the drives with others on the road, 0 to 1.
+        painted: share of the drives with a random pattern on the canvas, 0 to 1.
 
     Raises:
         TrainingError: a share is not in [0, 1], or there is no drive.
@@ -90,10 +90,10 @@ def collect(
     """Record the drives of a plan that the folder does not hold yet.
 
     Args:
-        plan: which drives.
-        folder: where the shards go, one a drive.
+        plan: the drives to record.
+        folder: the folder for the shards, one a drive.
         processes: how many simulators drive at once.
-        on_drive: told how many drives the folder holds, after each.
+        on_drive: called after each drive with how many drives the folder holds.
 
     Returns:
         The shards of the plan, in order.
@@ -114,16 +114,16 @@ def collect(
 
 
 def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, controller: Controller | None) -> Shard:
-    """One drive of a plan.
+    """Record one drive of a plan.
 
-    It ends at the goal, after its time, when something is hit, or when the car is too far off for the expert's answer
-    to mean anything.
+    The drive ends at the goal, after its time, when something is hit, or when the car is too far off for the expert's
+    answer to mean anything.
 
     Args:
         town: an open simulator.
-        plan: which drives.
-        number: of the drive in the plan.
-        controller: who drives; None is the expert.
+        plan: the plan that the drive belongs to.
+        number: the drive's number in the plan, from 0.
+        controller: the controller that drives; None for the expert.
     """
     given = _conditions(plan, number)
     rows: list[tuple[Observation, Control, float]] = []

@@ -25,9 +25,9 @@ class Batch(NamedTuple):
 
     Args:
         frames: RGB in [0, 1].
-        speed_mps: speed.
-        command: CARLA's codes.
-        expert: steer, throttle, brake.
+        speed_mps: speed of the car at each frame.
+        command: command at each frame, in CARLA's codes.
+        expert: steer, throttle and brake that the expert would give at each frame.
     """
 
     frames: Float[Tensor, "b 3 h w"]
@@ -41,10 +41,10 @@ class Dataset:
     """Frames and answers of many drives, one after the other.
 
     Args:
-        frames: RGB, uint8.
-        speed_mps: at each frame.
-        command: CARLA's codes.
-        expert: steer, throttle, brake.
+        frames: RGB, 0 to 255.
+        speed_mps: speed of the car at each frame.
+        command: command at each frame, in CARLA's codes.
+        expert: steer, throttle and brake that the expert would give at each frame.
     """
 
     frames: UInt8[np.ndarray, "n h w 3"]
@@ -54,10 +54,10 @@ class Dataset:
 
     @classmethod
     def load(cls, paths: Sequence[Path]) -> Dataset:
-        """Read shards.
+        """Read all frames of the drives in shards.
 
         Raises:
-            TrainingError: there is none, one is damaged, or their frames differ in size.
+            TrainingError: there is no shard, one is damaged, or their frames differ in size.
         """
         shards = [shard for shard in map(Shard.load, paths) if len(shard)]
         if not shards:
@@ -72,7 +72,11 @@ class Dataset:
         return len(self.frames)
 
     def weights(self) -> Float[Tensor, " n"]:
-        """How often each frame is to be drawn, so that commands come in their `SHARES`; sums to 1."""
+        """How often each frame is to be drawn, so that commands come in their `SHARES`; sums to 1.
+
+        Raises:
+            TrainingError: no frame has a known command.
+        """
         weight = np.zeros(len(self))
         for command, share in SHARES.items():
             chosen = self.command == int(command)
@@ -82,7 +86,7 @@ class Dataset:
         return torch.from_numpy(weight / weight.sum())
 
     def batch(self, chosen: Int[Tensor, " b"], device: torch.device | str = "cpu") -> Batch:
-        """These frames, as a network takes them."""
+        """The chosen frames, as a network takes them."""
         index = chosen.numpy()
         pictures = torch.from_numpy(self.frames[index]).to(device)
         return Batch(

@@ -45,11 +45,11 @@ class Manner:
     """How the expert drives.
 
     Args:
-        cruise_mps: speed on a free, straight road.
-        side_mps2: acceleration to the side that bends are taken with.
-        slow_mps2: how hard it slows before a bend.
+        cruise_mps: speed on a free, straight road, m/s.
+        side_mps2: lateral acceleration that bends are taken with, m/s².
+        slow_mps2: deceleration before a bend, m/s².
         sight_s: how far ahead of its rear axle it steers to, in seconds of travel.
-        sight_m: and at least so far.
+        sight_m: the least distance ahead of its rear axle that it steers to, metres.
     """
 
     cruise_mps: float = 7.5
@@ -78,9 +78,9 @@ class Expert:
         """What to do for the next step.
 
         Args:
-            state: the driven car now.
-            cars: the others now.
-            pedestrians: the people now.
+            state: pose and speed of the driven car now.
+            cars: the other cars as they are now.
+            pedestrians: the people as they are now.
         """
         place = self._route.locate(state.x_m, state.y_m, self._at_m)
         self._at_m = place.arclength_m

@@ -48,16 +48,17 @@ class TrainingPlan:
     """How a network learns.
 
     Args:
-        samples: how many frames it sees, repetitions counted.
-        batch: frames a step.
-        seed: of everything drawn.
-        learning_rate: the largest; it rises over the first steps and then falls along a cosine to almost nothing.
-        warm_up: share of the steps it rises for.
-        weight_decay: AdamW's.
+        samples: how many frames the network sees, repetitions counted.
+        batch: how many frames a batch has; every step learns from one.
+        seed: the seed of everything drawn.
+        learning_rate: the largest learning rate; it rises over the first steps and then falls along a cosine to almost
+            nothing.
+        warm_up: share of the steps over which the learning rate rises, 0 to 1.
+        weight_decay: the weight decay of AdamW.
         averaging: decay of the running average of the weights; the average is what is kept.
         dropout: factor on the network's own dropout; short training learns more with less.
-        pasted: share of the pictures with coloured rectangles pasted on the road.
-        loss: how much each answer counts.
+        pasted: share of the pictures with coloured rectangles pasted on the road, 0 to 1.
+        loss: how much each answer counts in the loss.
         augmentation: how the pictures are varied.
 
     Raises:
@@ -88,7 +89,7 @@ class TrainingPlan:
 
     @property
     def steps(self) -> int:
-        """How many batches that is."""
+        """How many batches the network learns from."""
         return self.samples // self.batch
 
     def rate(self, step: int) -> float:
@@ -101,7 +102,7 @@ class TrainingPlan:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Told now and then: the step, of how many, and the mean loss and error of steering since the last time."""
+    """How far a training is: the step, of how many, and the mean loss and steering error since the last report."""
 
     step: int
     steps: int
@@ -122,16 +123,16 @@ def imitate(
     """Train a network.
 
     Args:
-        network: where to start from; it is changed.
-        data: drives to learn from.
-        plan: how.
+        network: the network to start from; it is changed.
+        data: the drives to learn from.
+        plan: how the network learns.
         checkpoint: file to go on from where it is there, and to keep up to date; None keeps none.
         device: "cpu" or "cuda".
-        every: steps between two reports, and between two checkpoints.
-        on_progress: told of the reports.
+        every: how many steps lie between two reports, and between two checkpoints.
+        on_progress: called with every report.
 
     Returns:
-        The average of the weights, in eval mode.
+        The network with the running average of the weights, in eval mode.
 
     Raises:
         TrainingError: the loss is no longer finite, or the checkpoint is of another plan or damaged.

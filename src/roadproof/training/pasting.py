@@ -27,9 +27,9 @@ class PastedPaint:
     """Pastes one to five rectangles in a share of the pictures; half of them lie nearly along the road.
 
     Args:
-        share: of the pictures that get some.
+        share: share of the pictures that get rectangles, 0 to 1.
         camera: the camera the pictures are from.
-        input: how they were cut from its picture.
+        input: how the pictures were cut from the camera's.
     """
 
     def __init__(self, share: float, camera: CameraModel = CIL_CAMERA, input: CropResize = CIL_INPUT) -> None:  # noqa: A002

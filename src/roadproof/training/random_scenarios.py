@@ -29,14 +29,14 @@ _KINDS: dict[Command, Kind] = {Command.LEFT: "left", Command.RIGHT: "right"}
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Displacement:
-    """How far off the middle of its lane, and how turned, a car starts: deviations and limits.
+    """How far off the middle of its lane, and how turned, a car starts: standard deviations and limits.
 
     Args:
-        aside_m: deviation of the offset.
-        aside_limit_m: largest offset.
-        turn_rad: deviation of the heading.
-        turn_limit_rad: largest heading.
-        speed_mps: largest speed at the start; half of all cars start at rest.
+        aside_m: standard deviation of the offset from the lane's middle, metres.
+        aside_limit_m: largest offset from the lane's middle, metres.
+        turn_rad: standard deviation of the heading relative to the lane.
+        turn_limit_rad: largest heading relative to the lane.
+        speed_mps: largest speed at the start, m/s; half of all cars start at rest.
     """
 
     aside_m: float = 0.7
@@ -58,11 +58,11 @@ def random_scenario(
     """A random route through a map, 60 to 150 m long, with a canvas at a random place on it.
 
     Args:
-        roads: the map.
-        map_name: its name.
+        roads: the map that the route leads through.
+        map_name: the name of the map.
         generator: where the randomness comes from.
-        name: of the scenario.
-        command: one of the junctions on the route asks for it; follow asks for nothing.
+        name: the name of the scenario.
+        command: the command that one of the route's junctions asks for; `Command.FOLLOW` asks for none.
         displacement: how the car starts; None starts it at rest in the middle of its lane.
 
     Raises:
@@ -104,7 +104,7 @@ class Disturbance:
     """Disturbs the controls of one drive: triangles on the steering, steps on the pedals, with pauses between them.
 
     Args:
-        steps: how long the drive is at most.
+        steps: how many steps the drive has at most.
         dt_s: seconds per step.
         generator: where the randomness comes from.
 

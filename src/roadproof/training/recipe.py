@@ -50,21 +50,21 @@ class Recipe:
     """How a controller is made.
 
     Args:
-        network: "cil" or "pilotnet" (the conditional one).
-        width: CIL's factor on channels and units.
-        seed: of scenarios, traffic, disturbances, weights, batches.
+        network: "cil", or "pilotnet" for the conditional PilotNet.
+        width: factor on the channels and units of CIL.
+        seed: the seed of scenarios, traffic, disturbances, weights and batches.
         start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
-        drives: of the expert.
-        painted_drives: of the expert over random paint, besides.
-        pasted: share of the pictures learnt from with coloured rectangles pasted on the road.
+        drives: how many drives of the expert are recorded.
+        painted_drives: how many drives of the expert over random paint are recorded besides.
+        pasted: share of the pictures learnt from with coloured rectangles pasted on the road, 0 to 1.
         samples: frames seen in the first training, repetitions counted.
-        learning_rate: the largest of the first training; rounds take a third of it.
+        learning_rate: the largest learning rate of the first training; the rounds' is a third of it.
         rounds: how often the network then drives itself and learns from the expert's answers.
-        round_drives: of the network in each round.
+        round_drives: how many drives of the network are recorded in each round.
         round_samples: frames seen in the training after each round.
 
     Raises:
-        TrainingError: an unknown network, a number that makes no sense.
+        TrainingError: the network is unknown, or a number makes no sense.
     """
 
     network: str = "cil"
@@ -93,7 +93,7 @@ class Recipe:
             self.training_plan(number)
 
     def fresh(self) -> Learner:
-        """The network before it has seen anything of this recipe."""
+        """The network as a recipe begins with it, before it has learnt anything."""
         if self.start is not None:
             named = not self.start.endswith(".safetensors")
             return load_network(shipped_weights(self.start) if named else Path(self.start))
@@ -102,14 +102,14 @@ class Recipe:
         return ConditionalPilotNet(seed=self.seed)
 
     def expert_plans(self) -> dict[str, CollectionPlan]:
-        """The expert's drives, by the name of their folder."""
+        """The plans of the expert's drives, by the name of their folder."""
         plans = {"expert": CollectionPlan(drives=self.drives, seed=self.seed)}
         if self.painted_drives:
             plans["painted"] = CollectionPlan(drives=self.painted_drives, seed=self.seed + 500, painted=0.8)
         return plans
 
     def round_plan(self, number: int, controller: Path) -> CollectionPlan:
-        """The network's own drives of a round."""
+        """The plan of the network's own drives in a round."""
         return CollectionPlan(
             drives=self.round_drives,
             seed=self.seed + 1000 * number,
@@ -119,7 +119,7 @@ class Recipe:
         )
 
     def training_plan(self, number: int) -> TrainingPlan:
-        """The training after a round; round 0 is the expert's."""
+        """The plan of the training after a round; round 0 learns from the expert's drives alone."""
         first = number == 0
         return TrainingPlan(
             samples=self.samples if first else self.round_samples,
@@ -133,7 +133,7 @@ def gather(recipe: Recipe, folder: Path, *, processes: int = 1, on_stage: OnStag
     """Record the expert's drives of a recipe; what can be done on another machine than the training.
 
     Returns:
-        The shards.
+        The files of the expert's drives.
 
     Raises:
         TrainingError: the folder belongs to another recipe.
@@ -153,14 +153,14 @@ def follow(
     """Carry a recipe out, as far as the folder does not hold it yet.
 
     Args:
-        recipe: what to do.
-        folder: where everything is kept.
+        recipe: how the controller is made.
+        folder: the folder that keeps everything.
         processes: how many simulators drive at once.
-        device: what the network learns on.
-        on_stage: called with how far it is.
+        device: the torch device on which the network learns, such as "cpu" or "cuda".
+        on_stage: called with a stage's name, the steps done, their number, and a word on them.
 
     Returns:
-        The controller's weights file.
+        The path of the controller's weights file.
 
     Raises:
         TrainingError: the folder belongs to another recipe, or nothing can be learnt.

@@ -26,11 +26,11 @@ class Trial:
     """One drive to be scored.
 
     Args:
-        scenario: what to drive.
-        weather: of the drive.
-        cars: others on the road.
-        pedestrians: people about.
-        seed: of cars and people.
+        scenario: the scenario to drive.
+        weather: the weather of the drive.
+        cars: how many other cars are on the road.
+        pedestrians: how many people are about.
+        seed: the seed of cars and people.
     """
 
     scenario: Scenario
@@ -45,14 +45,14 @@ class DrivingScore:
     """What came of a trial.
 
     Args:
-        arrived: the goal was reached in time.
-        events: what happened, in order.
-        seconds: how long it drove.
-        lateral_m: largest distance from the route.
-        mean_lateral_m: mean of it.
+        arrived: whether the goal was reached in time.
+        events: what went wrong, in order.
+        seconds: how long the car drove, simulated seconds.
+        lateral_m: largest distance from the route, metres.
+        mean_lateral_m: mean distance from the route, metres.
         steer_change: mean change of the steering from step to step, the smoothness of the drive.
-        turns: junctions that were reached.
-        turns_taken: those that were left where the command said.
+        turns: how many junctions were reached.
+        turns_taken: how many junctions were left where the command said.
         failed_at_m: (x, y) of the first event, or of the end where it did not arrive; None when all went well.
     """
 
@@ -68,7 +68,7 @@ class DrivingScore:
 
     @property
     def clean(self) -> bool:
-        """Arrived, and nothing happened."""
+        """Whether the car arrived, and nothing happened."""
         return self.arrived and not self.events
 
     @property
@@ -83,8 +83,8 @@ def score_drives(
     """Drive trials and score them, as they come.
 
     Args:
-        trials: what to drive.
-        spec: of the controller; None is the expert.
+        trials: the drives to be scored.
+        spec: spec of the controller that drives; None for the expert.
         processes: how many simulators drive at once.
 
     Raises:
@@ -98,8 +98,8 @@ def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial
 
     Args:
         town: an open simulator.
-        controller: who drives; None is the expert.
-        trial: what to drive.
+        controller: the controller that drives; None for the expert.
+        trial: the drive to be scored.
     """
     alone = trial.cars + trial.pedestrians == 0
     track: list[tuple[float, float]] = []

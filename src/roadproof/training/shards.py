@@ -26,15 +26,15 @@ class Shard:
     """What was seen on one drive, and the expert's answer to it.
 
     Args:
-        frames: RGB at the controller's resolution.
-        speed_mps: speed at each frame.
-        command: CARLA's codes (`datatypes.Command`).
-        expert: steer, throttle and brake the expert would give there; never what disturbed the drive.
-        lateral_m: offset from the route, left positive.
+        frames: (n, h, w, 3) RGB at the controller's resolution.
+        speed_mps: (n,) speed of the car at each frame.
+        command: (n,) command at each frame, in CARLA's codes (`datatypes.Command`).
+        expert: (n, 3) steer, throttle and brake the expert would give there; never what disturbed the drive.
+        lateral_m: (n,) offset of the car from the route, metres, left positive.
         about: scenario, weather, traffic, seed, who drove: for people and statistics.
 
     Raises:
-        TrainingError: lengths differ, or a value is not finite.
+        TrainingError: shapes do not fit each other, or a value is not finite.
     """
 
     frames: UInt8[np.ndarray, "..."]

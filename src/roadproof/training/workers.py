@@ -23,7 +23,7 @@ class Worker:
     """What a process drives with: a simulator and a controller, each made when first wanted and then kept.
 
     Args:
-        controller_spec: of the controller, or None for none.
+        controller_spec: spec of the controller; None for no controller.
         dt_s: seconds per step of the simulator.
     """
 
@@ -38,7 +38,7 @@ class Worker:
 
     @cached_property
     def controller(self) -> Controller | None:
-        """The controller."""
+        """The controller, or None where there is none."""
         return None if self.controller_spec is None else load_controller(self.controller_spec)
 
     def close(self) -> None:
@@ -57,10 +57,10 @@ def spread(
         function: a module's own function; it gets the worker of its process and a piece of work.
         works: the pieces; they travel between processes.
         worker: what every process gets a copy of; must be unused so far.
-        processes: how many at once.
+        processes: how many processes work at once.
 
     Yields:
-        Pieces of work and results, as they come.
+        Each piece of work with its result, in the order in which they are finished.
 
     Raises:
         SimulatorError: a process died.

@@ -38,7 +38,7 @@ def spawn_driven(session: Session, start: VehicleState) -> carla.Vehicle:
     """The car that is driven, above where it starts.
 
     Raises:
-        SimulatorError: it cannot stand there, or the server has none of the cars known.
+        SimulatorError: the car cannot stand there, or the server has none of the cars known.
     """
     library = session.library()
     known = {blueprint.id for blueprint in library}
@@ -59,10 +59,10 @@ def place_driven(session: Session, car: carla.Actor, start: VehicleState, back_m
     """Put the car, once it has settled, where a drive starts, at the height where it settled.
 
     Args:
-        session: the connection.
-        car: that is driven.
-        start: place, direction and speed.
-        back_m: how far behind that place it is put.
+        session: the connection to the server.
+        car: the car that is driven.
+        start: the pose and speed that the drive starts with.
+        back_m: how far behind that pose the car is put.
 
     Raises:
         SimulatorError: the server refuses or does not answer.

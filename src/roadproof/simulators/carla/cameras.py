@@ -21,10 +21,10 @@ class Camera:
     """One camera.
 
     Args:
-        session: keeps it until the end of the drive.
-        kind: rgb, depth or semantic_segmentation.
-        model: size, field of view and place.
-        carrier: the car it is fixed to, or where it stands in the town's world as if it were on a car there.
+        session: the connection, which keeps the camera until the end of the drive.
+        kind: "rgb", "depth" or "semantic_segmentation".
+        model: the camera's size, field of view and place on the car.
+        carrier: the car that the camera is fixed to, or where such a car would stand in the town's world.
     """
 
     def __init__(self, session: Session, kind: str, model: CameraModel, carrier: carla.Actor | VehicleState) -> None:
@@ -57,7 +57,7 @@ class Camera:
         """Tick until pictures come: those before the stream was open are lost.
 
         Raises:
-            SimulatorError: none comes.
+            SimulatorError: no picture comes.
         """
         for _ in range(FIRST_TICKS):
             frame = self._session.tick()
@@ -75,7 +75,7 @@ class Camera:
         """The picture of a tick; older ones, which come late or twice, are dropped.
 
         Raises:
-            SimulatorError: it does not come in time.
+            SimulatorError: the picture does not come in time.
         """
         left_s = self._session.patience_s
         while left_s > 0:

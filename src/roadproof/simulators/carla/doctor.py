@@ -27,7 +27,7 @@ def examine(simulator: CarlaSimulator, on_check: Callable[[Check], object] = lam
     """Drive a server, not yet connected, over a straight stretch of the map it has loaded.
 
     Args:
-        simulator: not yet entered.
+        simulator: a simulator that is not yet entered.
         on_check: called with each check as it is made.
 
     Returns:

@@ -34,10 +34,10 @@ class Scene:
     """What one camera sees at one moment.
 
     Args:
-        picture: (h, w, 3) RGB.
-        height_m: of the scene's point above the plane of the canvas, (h, w).
-        road: asphalt or a line on it.
-        asphalt: asphalt alone.
+        picture: (h, w, 3) RGB of the camera.
+        height_m: (h, w) height of the point that each pixel shows above the plane of the canvas, metres.
+        road: (h, w) whether each pixel shows asphalt or a line on it.
+        asphalt: (h, w) whether each pixel shows asphalt alone.
     """
 
     picture: UInt8[np.ndarray, "h w 3"]
@@ -50,7 +50,7 @@ class Paint:
     """A pattern made ready to be put into one picture after another.
 
     Args:
-        pattern: of the canvas.
+        pattern: RGBA of the canvas.
     """
 
     def __init__(self, pattern: PatternImage) -> None:
@@ -90,7 +90,7 @@ class Paint:
     def _averaged(
         self, canvas_from_image: Homography, rows: Int[np.ndarray, " p"], columns: Int[np.ndarray, " p"]
     ) -> Float[np.ndarray, "p 4"]:
-        """Mean of the levels over each pixel."""
+        """Mean levels of the pattern over each pixel."""
         paint, alike = self._looked_up(canvas_from_image, rows, columns)
         # Most pixels see one colour alone; only the others are worth the samples.
         mixed = np.flatnonzero(~alike)

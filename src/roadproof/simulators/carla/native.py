@@ -30,7 +30,7 @@ from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.protocol import PatternImage
 
 ROAD = "road"
-"""In the names of the objects that may be pieces of road."""
+"""A part of the names of objects that may be pieces of road."""
 
 TEXTURE_PX = 512
 BEHIND_M, ABOVE_M = 8.0, 9.0
@@ -56,9 +56,9 @@ class Ground:
     """The piece of road under a canvas.
 
     Args:
-        name: of the object.
-        texture_from_canvas: u and v from canvas pixels (x, y, 1).
-        rms_stripes: how far the stripes seen at places on the canvas are from where the fit has them, in stripes; a
+        name: the name of the object on the server.
+        texture_from_canvas: (2, 3) matrix that gives u and v of a canvas pixel (x, y, 1).
+        rms_stripes: root mean square distance of stripes seen on the canvas from where the fit has them, in stripes; a
             perfect fit leaves 1/√12.
     """
 
@@ -76,7 +76,7 @@ def find_ground(session: Session, canvas: CanvasPlacement) -> Ground:
     Raises:
         SimulatorError: the server has no such object, its texture does not change, or
             the texture is repeated or bent there; or the server does not answer.
-        SeveralPiecesError: the canvas lies on several.
+        SeveralPiecesError: the canvas lies on several pieces of road.
     """
     try:
         return _found(session, canvas)
@@ -160,7 +160,7 @@ class _Watch:
     """A camera above a canvas, and places on it that it looks at.
 
     Attributes:
-        points: canvas px, all over the canvas but its rim.
+        points: (p, 2) canvas px, all over the canvas but its rim.
     """
 
     def __init__(self, session: Session, canvas: CanvasPlacement) -> None:

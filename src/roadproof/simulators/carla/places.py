@@ -31,15 +31,15 @@ def scenario_between(
     """A drive from one place to another with a canvas on the way, as wide as the road allows.
 
     Args:
-        roads: the map.
-        map_name: its name on the server.
-        start: along a lane.
-        goal: on a lane.
-        canvas_at_m: from the start to the middle of the canvas.
-        name: of the scenario.
+        roads: the server's map.
+        map_name: the map's name on the server.
+        start: pose to start from, along a lane.
+        goal: pose to drive to, on a lane.
+        canvas_at_m: distance along the way from the start to the middle of the canvas.
+        name: the name of the scenario.
 
     Raises:
-        ScenarioError: no way leads there, or the canvas does not fit on it.
+        ScenarioError: no way leads to the goal, or the canvas does not fit on the way.
     """
     route = roads.route(start, (goal.x_m, goal.y_m))
     if not CANVAS_LENGTH_M / 2 < canvas_at_m < route.length_m - CANVAS_LENGTH_M / 2:
@@ -62,7 +62,7 @@ def straight_stretch(roads: RoadMap, places: list[VehicleState], length_m: float
     """The first of some places from which a lane leads straight on so far outside of junctions, and its end.
 
     Raises:
-        ScenarioError: there is none.
+        ScenarioError: no place has such a stretch ahead.
     """
     for start in places:
         here = roads.nearest_lane(start.x_m, start.y_m, start.yaw_rad)
@@ -82,7 +82,7 @@ def spawn_places(session: Session) -> list[VehicleState]:
     """The server's spawn points in the town's world, in its order.
 
     Raises:
-        SimulatorError: it does not answer.
+        SimulatorError: the server does not answer.
     """
     points = session.ask("its map", session.world.get_map).get_spawn_points()
     return [_place(point) for point in points]
@@ -98,7 +98,7 @@ def _kind(route: Route) -> Kind:
 
 
 def _canvas(roads: RoadMap, route: Route, at_m: float) -> CanvasPlacement:
-    """Over both lanes of the road where they are there, else over the own one."""
+    """A canvas over both lanes of the road where there are two, else over the car's own."""
     x, y, z, heading = route.at(at_m)
     lane = roads.lanes[roads.nearest_lane(x, y, heading).lane]
     half = lane.width_m / 2

@@ -33,18 +33,18 @@ class Session:
     """A connection in synchronous mode.
 
     Args:
-        host: of the server.
-        port: of its calls.
-        dt_s: simulated seconds a step.
-        patience_s: longest wait for a call, and for a picture.
-        loading_s: longest wait where a map is loaded or the weather changes.
+        host: name or address of the server.
+        port: the server's port for calls.
+        dt_s: simulated seconds per step.
+        patience_s: longest wait for a call and for a picture, seconds.
+        loading_s: longest wait where a map is loaded or the weather changes, seconds.
 
     Attributes:
         where: HOST:PORT of the server.
         painted: whether objects have textures that are not the map's own.
 
     Raises:
-        SimulatorError: nobody answers there, or it is a server of another version.
+        SimulatorError: no server answers there, or it is one of another version.
     """
 
     def __init__(self, host: str, port: int, *, dt_s: float, patience_s: float, loading_s: float) -> None:
@@ -71,7 +71,7 @@ class Session:
         """The answer to a call.
 
         Raises:
-            SimulatorError: there was none in time, or the server refused.
+            SimulatorError: no answer came in time, or the server refused.
         """
         if self._lost:
             raise SimulatorError(f"the connection to the CARLA server at {self.where} is lost; open it again")
@@ -89,7 +89,7 @@ class Session:
 
     @property
     def lost(self) -> bool:
-        """A call found no answer, or the session is closed."""
+        """Whether a call found no answer, or the session is closed."""
         return self._lost
 
     def patiently(self, what: str, call: Callable[[], Result]) -> Result:
@@ -102,7 +102,7 @@ class Session:
             self.client.set_timeout(self.patience_s)
 
     def tick(self) -> int:
-        """Take a step; its frame."""
+        """Take a step, and return the number of its frame."""
         return self.ask("a tick", self.world.tick)
 
     def map_name(self) -> str:
@@ -133,7 +133,7 @@ class Session:
         self.painted, self._last_paint = False, None
 
     def library(self) -> carla.BlueprintLibrary:
-        """What can be spawned."""
+        """The blueprints of everything that can be spawned."""
         return self.ask("its blueprints", self.world.get_blueprint_library)
 
     def object_names(self) -> list[str]:
@@ -172,14 +172,14 @@ class Session:
         return texture
 
     def keep(self, actor: carla.Actor) -> None:
-        """Destroy an actor at the end of the drive."""
+        """Keep an actor until the end of the drive, which destroys it."""
         self._actors.append(actor)
 
     def batch(self, what: str, commands: Sequence[carla.command.Command], *, tick: bool = False) -> list[int]:
-        """Send commands; the ids of the actors.
+        """Send commands, and return the ids of their actors.
 
         Raises:
-            SimulatorError: one of them is refused; the actors that the others made are destroyed again.
+            SimulatorError: a command is refused; the actors that the others made are destroyed again.
         """
         answers = self.ask(what, lambda: self.client.apply_batch_sync(list(commands), tick))
         refused = next((answer.error for answer in answers if answer.error), None)

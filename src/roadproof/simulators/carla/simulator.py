@@ -51,13 +51,13 @@ class CarlaSimulator(RouteSimulator[_Drive]):
     server's own road ("native").
 
     Args:
-        host: of the server.
-        port: of its calls; sensor data comes through the next.
+        host: name or address of the server.
+        port: the server's port for calls; sensor data comes through the next.
         camera: the camera on the car.
-        input: how the controller's frame is cut from its picture.
-        dt_s: seconds per step.
-        patience_s: longest wait for a call or a picture.
-        loading_s: longest wait where a map is loaded or the weather changes.
+        input: how the controller's frame is cut from the camera picture.
+        dt_s: simulated seconds per step.
+        patience_s: longest wait for a call or a picture, seconds.
+        loading_s: longest wait where a map is loaded or the weather changes, seconds.
         paint: "inject", "native", or "auto": native if it works on a straight stretch of the map that is loaded.
     """
 
@@ -73,7 +73,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         loading_s: float = 300.0,
         paint: PaintChoice = "inject",
     ) -> None:
-        """Nothing is connected before the simulator is entered.
+        """Make a simulator; nothing is connected before it is entered.
 
         Raises:
             SimulatorError: the crop leaves the camera picture.
@@ -100,7 +100,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         """The connection.
 
         Raises:
-            SimulatorError: there is none.
+            SimulatorError: the simulator is not entered.
         """
         if self._session is None:
             raise SimulatorError("the simulator is closed; use it in a with-block")
@@ -110,8 +110,8 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         """What the cameras saw last, before paint.
 
         Raises:
-            SimulatorError: there was no reset with a pattern to be painted into pictures, so that there is but one
-                camera.
+            SimulatorError: there was no reset, or none with a pattern to be painted into pictures: only for such a
+                pattern depth and kinds are seen too.
         """
         drive = self._running()
         if drive.inject is None:
@@ -123,7 +123,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
 
         Raises:
             SimulatorError: the server does not answer.
-            ScenarioError: it has no such map.
+            ScenarioError: the server has no such map.
         """
         return self.session.road_map(name)
 
@@ -144,7 +144,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
             A drive over a canvas on it, and the piece.
 
         Raises:
-            RoadproofError: there is none; the message says what was seen.
+            RoadproofError: no such piece of road can be painted; the message says what was seen.
         """
         session = self.session
         name = session.map_name()

@@ -28,12 +28,12 @@ def image_from_world(camera: CameraModel, image: carla.Image) -> Float[np.ndarra
 
 
 def scene(camera: CameraModel, images: Mapping[str, carla.Image], canvas_z_m: float) -> Scene:
-    """What the three cameras say together.
+    """What the three cameras see together at one moment.
 
     Args:
-        camera: the optics of all three.
-        images: of one moment, under rgb, depth and semantic_segmentation.
-        canvas_z_m: heights are counted from there.
+        camera: the optics of all three cameras.
+        images: the pictures of one moment by camera: "rgb", "depth" and "semantic_segmentation".
+        canvas_z_m: world z of the canvas, from which heights are counted.
     """
     depth_m = levels(images["depth"]).astype(np.float64) @ (1.0, 256.0, 65536.0) * (FARTHEST_M / (2**24 - 1))
     tags = levels(images["semantic_segmentation"])[..., 0]

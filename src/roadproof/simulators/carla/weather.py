@@ -14,7 +14,7 @@ PRESETS = {
     Weather.WET_NOON: "WetNoon",
     Weather.HARD_RAIN_NOON: "HardRainNoon",
 }
-"""By name, since CARLA has no preset with fog."""
+"""Names of CARLA's presets by weather; CARLA has none with fog."""
 
 
 def set_weather(session: Session, weather: Weather) -> None:

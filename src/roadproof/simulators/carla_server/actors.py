@@ -28,18 +28,18 @@ class Actor:
     """A vehicle, a walker or a sensor.
 
     Attributes:
-        id: never used twice.
+        id: number of the actor; never used twice.
         uid: number of its blueprint in the library.
-        name: of its blueprint.
-        attributes: as (name, type, value), as they came.
-        pose: in the world, or relative to the parent of a sensor.
+        name: name of its blueprint.
+        attributes: its attributes as (name, type, value), as they came.
+        pose: its pose in the world, or relative to its parent where it is a sensor with one.
         parent: id of the vehicle it is fixed to, 0 for none.
-        stream: where a sensor's data is sent, 0 for none.
-        velocity: m/s in the town's right-handed world.
+        stream: the stream that a sensor's data is sent to, 0 for none.
+        velocity: velocity in the town's right-handed world, m/s.
         control: a vehicle's throttle, steer, brake, hand brake, reverse, manual, gear.
-        walk: a walker's direction in CARLA's world, and m/s.
+        walk: a walker's direction in CARLA's world, and its speed in m/s.
         physics: whether it moves by itself.
-        walked_m: how far it has come.
+        walked_m: how far the actor has come, metres.
     """
 
     id: int
@@ -86,7 +86,7 @@ class Actor:
         self.velocity = (state.speed_mps * c, state.speed_mps * s, 0.0)
 
     def wire(self, port: int) -> Value:
-        """As the client takes it; `port` is where its stream is served."""
+        """The actor as the client takes it; `port` is where its stream is served."""
         label = LABELS.get(self.kind)
         return [
             self.id,
@@ -99,7 +99,7 @@ class Actor:
 
     @property
     def box(self) -> Value:
-        """Middle and half extents, metres."""
+        """Middle and half extents of the actor's box, metres."""
         middle, half = {"vehicle": CAR_BOX, "walker": WALKER_BOX}.get(self.kind, ((0.0,) * 3, (0.0,) * 3))
         return [list(middle), list(half)]
 

@@ -42,13 +42,13 @@ Place: TypeAlias = tuple[Metres, Metres, Metres]
 WirePose: TypeAlias = tuple[Place, tuple[Degrees, Degrees, Degrees]]
 Velocity: TypeAlias = tuple[Mps, Mps, Mps]
 Description: TypeAlias = tuple[Id, Text, Annotated[list[tuple[Text, Int32, Text]], Meta(max_length=64)]]
-"""Of an actor to spawn: the number and the name of its blueprint, and attributes as (name, type, value)."""
+"""An actor to spawn: the number and the name of its blueprint, and attributes as (name, type, value)."""
 
 VehicleControl: TypeAlias = tuple[Level, Level, Level, bool, bool, bool, Int32]
 """Throttle, steer, brake, hand brake, reverse, manual gear shift, gear."""
 
 WalkerControl: TypeAlias = tuple[tuple[Level, Level, Level], Mps, bool]
-"""Direction, m/s, jump."""
+"""A walker's direction, its speed in m/s, and whether it jumps."""
 
 Weather: TypeAlias = Annotated[tuple[Number, ...], Meta(min_length=14, max_length=14)]
 FixedStep: TypeAlias = Annotated[list[bool | Number], Meta(max_length=2)]
@@ -58,7 +58,7 @@ Texture: TypeAlias = tuple[Side, Side, list[tuple[Byte, Byte, Byte, Byte]]]
 """Width, height, and RGBA row by row."""
 
 Commands: TypeAlias = Annotated[list[tuple[tuple[Id, Raw]]], Meta(max_length=limits.ITEMS)]
-"""Which one of CARLA's commands, and its fields."""
+"""Commands of a batch: for each, which one of CARLA's commands it is, and its fields."""
 
 SpawnCommand: TypeAlias = tuple[
     Description, WirePose, Annotated[list[bool | Id], Meta(max_length=2)], int, Text, Commands
@@ -72,8 +72,8 @@ class Signature:
     """The arguments that a method takes from the wire.
 
     Args:
-        names: of its parameters.
-        decoders: each reads one argument as its annotation declares.
+        names: the names of the parameters.
+        decoders: for each parameter, what reads its argument as its annotation declares.
     """
 
     names: tuple[str, ...]
@@ -94,7 +94,7 @@ class Signature:
         """The arguments of a call.
 
         Raises:
-            SimulatorError: there are more or fewer, or one is of another type or out of range.
+            SimulatorError: there are more or fewer arguments, or one is of another type or out of range.
         """
         if len(arguments) != len(self.names):
             expected = f"{len(self.names)} ({', '.join(self.names)})" if self.names else "none"
@@ -104,10 +104,10 @@ class Signature:
 
 
 def read(what: str, decoder: Decoder[Any], sent: Raw) -> Value:
-    """One value as a client sent it.
+    """Read one value that a client sent.
 
     Raises:
-        SimulatorError: it is of another type, or out of range; the message says what it is and what was expected.
+        SimulatorError: the value is of another type or out of range; the message says what it is and what was expected.
     """
     try:
         return decoder.decode(sent)

@@ -34,7 +34,7 @@ class Attribute:
 
     @property
     def wire(self) -> Value:
-        """As the client takes it."""
+        """The attribute as the client takes it."""
         return [self.name, int(self.kind), self.default, list(self.recommended), self.settable, False]
 
     def takes(self, value: str) -> bool:
@@ -64,15 +64,15 @@ class Blueprint:
     attributes: tuple[Attribute, ...]
 
     def wire(self, uid: int) -> Value:
-        """As the client takes it."""
+        """The blueprint as the client takes it."""
         tags = ",".join(reversed(self.name.split(".")))
         return [uid, self.name, tags, [attribute.wire for attribute in self.attributes]]
 
     def filled(self, given: Sequence[tuple[str, int, str]]) -> list[Value]:
-        """All its attributes as (name, kind, value), from what a client gave; the others have their defaults.
+        """All attributes of an actor as (name, kind, value), from what a client gave; the others have their defaults.
 
         Raises:
-            SimulatorError: it has no such attribute, or the value is of another kind.
+            SimulatorError: the blueprint has no such attribute, or the value is of another kind.
         """
         values = {name: value for name, _, value in given}
         own = {attribute.name: attribute for attribute in self.attributes}

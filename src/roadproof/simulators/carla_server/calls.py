@@ -78,9 +78,9 @@ class Calls:
     """Answers calls on one world.
 
     Args:
-        world: what is served.
-        port: of the calls; streams are on the next.
-        advance: takes a step.
+        world: the world that is served.
+        port: the port for calls; streams are on the next.
+        advance: the function that takes a step of the world.
     """
 
     def __init__(self, world: World, port: int, advance: Callable[[], None]) -> None:

@@ -21,7 +21,7 @@ class Connection:
     """One client's connection.
 
     Attributes:
-        heard_s: when it last said or took something whole, by the event loop's clock.
+        heard_s: when the client last sent or took something whole, by the event loop's clock.
     """
 
     def __init__(self, everyone: Connections, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -49,10 +49,10 @@ class Connection:
         """What comes in next; nothing at the end.
 
         Args:
-            unread: bytes of a message that has begun; its end is waited for until `limits.MESSAGE_S` after that.
+            unread: bytes of a message that has begun; its end may come until `limits.MESSAGE_S` after its beginning.
 
         Raises:
-            TimeoutError: it did not end.
+            TimeoutError: the message did not end in time.
         """
         self._unread = unread
         self._everyone.bound()
@@ -65,10 +65,10 @@ class Connection:
             return await self._reader.read(READ_BYTES)
 
     async def read_exactly(self, count: int, within_s: float) -> bytes:
-        """So many bytes.
+        """Read so many bytes.
 
         Raises:
-            TimeoutError: they did not come in time.
+            TimeoutError: the bytes did not come in time.
             EOFError: the client is gone.
         """
         async with asyncio.timeout(within_s):
@@ -78,7 +78,7 @@ class Connection:
         """Send a message and wait until the client takes it.
 
         Raises:
-            TimeoutError: it does not.
+            TimeoutError: the client does not take it in time.
         """
         self._writer.write(message)
         self._everyone.bound()
@@ -98,12 +98,12 @@ class Connection:
         self._everyone.bound()
 
     def drop(self) -> None:
-        """Close it now; what waits is thrown away."""
+        """Close the connection now; what waits is thrown away."""
         self._unread = 0
         self._writer.transport.abort()
 
     async def end(self) -> None:
-        """Close it once the client has taken the last words, or does not."""
+        """Close the connection once the client has taken the last words, or does not."""
         with contextlib.suppress(OSError):
             async with asyncio.timeout(limits.FAREWELL_S):
                 if not self._writer.transport.is_closing():
@@ -139,7 +139,7 @@ class Connections:
         self._begin(self._accept(listening, handle))
 
     def bound(self) -> None:
-        """While too much waits in all together, drop the one that holds most."""
+        """Drop the connection that holds most, while too much waits in all together."""
         while sum(connection.held for connection in self._open) > limits.HELD_BYTES:
             max(self._open, key=lambda connection: connection.held).drop()
 

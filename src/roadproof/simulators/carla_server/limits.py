@@ -10,40 +10,40 @@ QUIET_S = 10.0
 """When all connections are in use, the one that has been quiet for longest gives way, if for at least this long."""
 
 MESSAGE_BYTES = 16 << 20
-"""Of one call; room for a texture of about 1300×1300 pixels."""
+"""Bytes of one call; room for a texture of about 1300×1300 pixels."""
 
 MESSAGE_S = 30.0
-"""From the first byte of a call to its last, and for a client to take the answer."""
+"""Time from the first byte of a call to its last, and time for a client to take the answer."""
 
 STREAM_ID_S = 10.0
-"""For a client that connects to the port of streams to say which one it wants."""
+"""Time for a client that connects to the port of streams to say which one it wants."""
 
 UNKNOWN_STREAM_S = 1.0
-"""Before a connection to a stream that does not exist is closed: CARLA's client connects again without a pause."""
+"""Time until a connection to a stream that does not exist is closed: CARLA's client connects again without a pause."""
 
 LISTENER_BYTES = 64 << 20
-"""That may wait for one listener; a single message may be larger."""
+"""Bytes that may wait for one listener; a single message may be larger."""
 
 HELD_BYTES = 256 << 20
-"""That may wait in all connections together, calls and sensor data."""
+"""Bytes that may wait in all connections together, calls and sensor data."""
 
 FAREWELL_S = 2.0
-"""For a client to take the last words before its connection is closed."""
+"""Time for a client to take the last words before its connection is closed."""
 
 ACTORS = 2000
-"""In the world at once."""
+"""Actors in the world at once."""
 
 VEHICLE_PAIRS = 40_000
 """Vehicles that move by themselves times all vehicles, since each meets all others: 200, or 80 among 500."""
 
 CAMERA_PIXELS = 1 << 24
-"""Of all cameras together: one of 4096×4096, or 34 of 800×600."""
+"""Pixels of all cameras together: one of 4096×4096, or 34 of 800×600."""
 
 ITEMS = 10_000
-"""In one list: commands of a batch, ids, names of objects."""
+"""Entries of one list: commands of a batch, ids, names of objects."""
 
 TEXT_CHARACTERS = 256
-"""In a name, an address, the value of an attribute."""
+"""Characters of a name, an address or the value of an attribute."""
 
 POSITION_M = 100_000.0
 """Coordinates, to either side of the origin."""

@@ -29,8 +29,8 @@ class Piece:
     """A straight piece of road, over all its driving lanes.
 
     Args:
-        name: of the object.
-        placement: where it is; its far edge is the end of the piece along the road.
+        name: the name of the object.
+        placement: where the piece is; its far edge is the end of the piece along the road.
         turns: quarter turns of its picture, counter-clockwise as seen from above.
         mirrored: whether the picture is mirrored before it is turned.
     """

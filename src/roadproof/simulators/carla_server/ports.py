@@ -23,9 +23,9 @@ class Ports:
     """Sockets that listen.
 
     Args:
-        number: port of the calls; streams are on the next.
-        calls: a socket for each address of the host.
-        streams: the same on the next port.
+        number: the port for calls; streams are on the next.
+        calls: a socket for each address of the host, on the port for calls.
+        streams: a socket for each address of the host, on the next port.
     """
 
     number: int
@@ -39,7 +39,7 @@ def open_ports(host: str, port: int, *, allow_remote: bool = False) -> Generator
 
     Args:
         host: name or address to listen on.
-        port: of the calls, 0 to 65534; 0 for any that is free with the next one.
+        port: the port for calls, 0 to 65534; 0 takes any that is free with the next one.
         allow_remote: whether the host may be another than this machine's loopback.
 
     Raises:

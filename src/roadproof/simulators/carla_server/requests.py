@@ -32,8 +32,8 @@ class NotARequestError(SimulatorError):
     """What came in is no request, so where the next one begins is not known.
 
     Args:
-        text: what is wrong.
-        call_id: of the call, where that can be read.
+        text: what is wrong, for the client.
+        call_id: id of the call; None where it cannot be read.
 
     Attributes:
         answer: what to tell the client. One that waits for the call raises the text; without a number it cannot.
@@ -49,9 +49,9 @@ class Request:
     """One call.
 
     Args:
-        id: chosen by the client; its answer carries it.
-        name: of the call.
-        arguments: not yet read.
+        id: number that the client chose; the answer carries it.
+        name: name of the call.
+        arguments: the arguments, not yet read.
         answered: whether the client waits for an answer.
     """
 
@@ -78,7 +78,7 @@ class Requests:
         """Take what came in; only after all requests before were taken out.
 
         Raises:
-            NotARequestError: a text in it is too large.
+            NotARequestError: a text in the bytes is too large.
         """
         self._bytes += data
         try:
@@ -90,7 +90,7 @@ class Requests:
         """The requests that are whole; in place of one that is too large, what to answer.
 
         Raises:
-            NotARequestError: something else came.
+            NotARequestError: the bytes are no request.
         """
         while self._bytes:
             try:
@@ -117,7 +117,7 @@ class Requests:
             yield found
 
     def refusal(self, text: str) -> NotARequestError:
-        """What to raise over the message that has begun; with its id, where that is there."""
+        """What to raise over the message that has begun; with the message's id, where that is there."""
         # [0, id, …: an array of four, the type, the number.
         head = bytes(self._bytes[2:HEAD_BYTES])
         for size in range(1, len(head) + 1 if self._bytes.startswith(b"\x94\x00") else 0):

@@ -63,12 +63,12 @@ def _optics(sensor: Actor) -> tuple[int, int, float]:
 
 
 def pose_in_world(world: World, sensor: Actor) -> wire.Pose6:
-    """Where a sensor is."""
+    """The pose of a sensor in the world."""
     return attached(world.actors[sensor.parent].pose, sensor.pose) if sensor.parent else sensor.pose
 
 
 def picture_message(world: World, sensor: Actor) -> bytes:
-    """What a camera sends now."""
+    """The message with what a camera sees now."""
     assert world.town is not None
     pose = pose_in_world(world, sensor)
     x, y, z, pitch, yaw, _ = pose

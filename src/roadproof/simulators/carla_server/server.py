@@ -27,8 +27,8 @@ class Server:
     """Serves one world to any number of clients, from one thread.
 
     Args:
-        world: with a map loaded.
-        ports: that listen.
+        world: the world that is served, with a map loaded.
+        ports: the two ports, which already listen.
     """
 
     def __init__(self, world: World, ports: Ports) -> None:
@@ -144,13 +144,13 @@ def serve(
     """Serve the embedded town to CARLA's clients until interrupted or asked to end (SIGINT, SIGTERM).
 
     Args:
-        host: address to listen on.
-        port: of the calls, 0 to 65534; streams are on the next. 0 takes any two that are free.
+        host: name or address to listen on.
+        port: the port for calls, 0 to 65534; streams are on the next. 0 takes any two that are free.
         maps: OpenDRIVE files to offer besides the built-in towns, by the names of the files.
-        first: the map at the start.
+        first: the name of the map at the start.
         allow_remote: whether the host may be another than this machine's loopback. Nobody is asked for a password, so
             whoever reaches the ports can drive, spawn and load maps.
-        ready: called with the port of the calls once clients are answered.
+        ready: called with the port for calls once clients are answered.
 
     Raises:
         SimulatorError: a port is out of range or taken, the host is not loopback and `allow_remote` is not given, the

@@ -43,7 +43,7 @@ class Town:
     """One map with all that stands on it.
 
     Args:
-        last_look: from where and when it was last seen as kinds and distances, and what was seen.
+        last_look: the pose and time of the last look at kinds and distances, and what was seen; None before the first.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Town:
     last_look: tuple[tuple[object, ...], LabelledPicture] | None = None
 
     def labels(self) -> LabelScene:
-        """The map as kinds and distances; made when first asked for."""
+        """The scene that shows the map as kinds and distances; made when first asked for."""
         if self.labelled is None:
             self.labelled = LabelScene(self.roads, self.scenery)
         return self.labelled
@@ -69,7 +69,7 @@ class Town:
             self.labelled.forget_views()
 
     def close(self) -> None:
-        """Give everything back."""
+        """Give back everything that the town holds."""
         self.renderer.close()
         if self.labelled is not None:
             self.labelled.close()
@@ -90,16 +90,16 @@ class World:
         maps: OpenDRIVE files to offer besides the built-in towns.
 
     Attributes:
-        episode: counts the maps loaded.
-        frame: counts the steps taken.
+        episode: how many maps have been loaded.
+        frame: how many steps have been taken.
         time_s: simulated seconds since the map was loaded.
-        settings: CARLA's, as they came.
-        weather: CARLA's parameters.
-        actors: by id, in order of their spawning.
-        town: the map.
+        settings: CARLA's settings, as they came.
+        weather: CARLA's weather parameters.
+        actors: the actors by id, in order of their spawning.
+        town: the map that is loaded; None before the first.
 
     Raises:
-        SimulatorError: a map's file has another ending, or two have the same name.
+        SimulatorError: two maps have the same name.
     """
 
     def __init__(self, maps: Sequence[Path] = ()) -> None:
@@ -132,7 +132,7 @@ class World:
 
         Raises:
             SimulatorError: there is no such map.
-            ScenarioError: it cannot be read.
+            ScenarioError: the map cannot be read.
         """
         if name not in self.maps:
             raise SimulatorError(f"there is no map {name!r}, expected one of {', '.join(self.maps)}")
@@ -160,7 +160,7 @@ class World:
             self.destroy(key)
 
     def close(self) -> None:
-        """Give everything back."""
+        """Give back everything that the world holds."""
         self.clear()
         if self.town is not None:
             self.town.close()
@@ -196,10 +196,10 @@ class World:
         self.settings = settings
 
     def actor(self, key: int, *kinds: str) -> Actor:
-        """An actor by its number.
+        """The actor with a number.
 
         Raises:
-            SimulatorError: it is not there, or of none of these kinds.
+            SimulatorError: there is no such actor, or it is of none of these kinds.
         """
         if key not in self.actors:
             raise SimulatorError(f"there is no actor {key}")
@@ -218,10 +218,10 @@ class World:
         """Make an actor.
 
         Args:
-            name: of its blueprint.
-            attributes: as (name, type, value); others have their defaults.
-            pose: in the world, or relative to the parent.
-            parent: a vehicle or walker that carries a sensor.
+            name: the name of the actor's blueprint.
+            attributes: the attributes that are given, as (name, type, value); others have their defaults.
+            pose: the actor's pose in the world, or relative to the parent.
+            parent: id of the vehicle or walker that carries a sensor; None for no parent.
 
         Raises:
             SimulatorError: another vehicle is in the place, the blueprint is unknown, an attribute does not fit it, the
@@ -252,7 +252,7 @@ class World:
         return actor
 
     def destroy(self, key: int) -> bool:
-        """Take an actor away, and the sensors on it; whether it was there."""
+        """Take an actor away, and the sensors on it; say whether it was there."""
         if self.actors.pop(key, None) is None:
             return False
         self._stop_physics(key)
@@ -280,7 +280,7 @@ class World:
         """Let a vehicle move by itself, or only as it is told to.
 
         Raises:
-            SimulatorError: it is not there, or too many would move.
+            SimulatorError: the vehicle is not there, or too many would move.
         """
         actor = self.actor(key)
         before, actor.physics = actor.physics, enabled
@@ -295,7 +295,7 @@ class World:
             self._stop_physics(key)
 
     def step(self) -> list[Collision]:
-        """Go on for one step; what vehicles with a collision sensor touch afterwards."""
+        """Go on for one step, and return what vehicles with a collision sensor touch afterwards."""
         self.frame += 1
         self.time_s += self.dt_s
         for walker in self._all("walker"):

@@ -38,7 +38,7 @@ class AgentNodes:
         self._lit: LitGround
 
     def relight(self, lit: LitGround) -> None:
-        """The weather has changed: colour everybody anew."""
+        """Colour everybody anew after a change of weather."""
         self._lit = lit
         self._models.clear()
 
@@ -53,15 +53,15 @@ class AgentNodes:
         self.move(cars, people)
 
     def move(self, cars: Agents, people: Agents) -> None:
-        """Where they are now; nothing is done before they are looked at."""
+        """Take note of where everybody is now; nothing is moved before it is looked at."""
         self._cars, self._people = cars, people
 
     def see(self, state: VehicleState, *, everybody: bool = False) -> None:
         """Put everybody in view of the camera of a vehicle where they are, and leave out the rest.
 
         Args:
-            state: of the vehicle.
-            everybody: leave out nobody; for other cameras than the vehicle's own.
+            state: where the vehicle is now.
+            everybody: whether to show everybody, as cameras other than the vehicle's own need.
         """
         for agents, figures, on_foot in (
             (self._cars, self._nodes[0], False),
@@ -132,7 +132,7 @@ class _Figure:
         self._model: Node = None
 
     def show(self, model: Node, x_m: float, y_m: float, yaw_rad: float, *, raised: bool) -> None:
-        """Stand here, looking like this; `raised` is on the pavement rather than on the road."""
+        """Show a model at a place; `raised` stands it on the pavement rather than on the road."""
         self._path.set_pos_hpr(x_m, y_m, KERB_M if raised else 0.0, math.degrees(yaw_rad), 0.0, 0.0)
         if raised != self._raised:
             self._raised = raised
@@ -147,11 +147,11 @@ class _Figure:
             self._path.show()
 
     def hide(self) -> None:
-        """Be left out."""
+        """Leave the figure out of what is seen."""
         if self._visible:
             self._visible = False
             self._path.hide()
 
     def remove(self) -> None:
-        """Leave the scene."""
+        """Take the figure out of the scene."""
         self._path.remove_node()

@@ -40,9 +40,9 @@ class RoadPatch:
     """The road under a canvas in one weather, in levels.
 
     Args:
-        bare: the road with its lane marks.
-        gain: what a painted level is multiplied with.
-        offset: what is mirrored on the paint.
+        bare: levels of the road with its lane marks.
+        gain: factor on a painted level: light, damp, a third of the stones' roughness, and what water leaves of it.
+        offset: levels of the sky that is mirrored on the paint.
     """
 
     bare: Levels
@@ -75,9 +75,9 @@ def road_patch(lit: LitGround, placement: CanvasPlacement, grain: UInt8[np.ndarr
 
     Args:
         lit: the ground in one weather.
-        placement: of the canvas.
-        grain: of the asphalt, one repeat of `GRAIN_TILE_M`.
-        paint: the painted lines of the streets.
+        placement: where the canvas lies.
+        grain: the asphalt's grain, one repeat of `GRAIN_TILE_M`.
+        paint: mesh of the streets' painted lines.
     """
     step = CANVAS_SIZE_PX / PATCH_PX
     to_world = placement.world_from_canvas[:2]
@@ -154,9 +154,9 @@ class Raster:
     """The pixels that one screen renders, and which copy of a patch suits which of its rows.
 
     Args:
-        raster_from_camera: scale and crop, pixel centres at integers on both sides.
-        width_px: columns rendered.
-        height_px: rows rendered.
+        raster_from_camera: homography of scale and crop, pixel centres at integers on both sides.
+        width_px: how many columns are rendered.
+        height_px: how many rows are rendered.
         first_rows: for each copy but the coarsest, the first row that shows it or a finer one; decreasing.
     """
 
@@ -170,9 +170,9 @@ class Raster:
         """The raster of a crop, `magnified` times as fine as the crop's output.
 
         Args:
-            camera: the pinhole.
-            crop: what is seen of its picture.
-            magnified: pixels rendered per pixel of the output.
+            camera: the pinhole camera whose picture is cropped.
+            crop: the part of the camera's picture that is seen.
+            magnified: pixels rendered per pixel of the output, along each side.
             texel_m: length of the patch's finest pixel along the road.
             copies_made: how many copies there are, each twice as coarse along the road.
         """

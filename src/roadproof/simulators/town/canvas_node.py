@@ -41,7 +41,7 @@ class CanvasNode:
             path.hide()
 
     def forget(self) -> None:
-        """The light has changed: bake anew."""
+        """Forget what was baked, since the light has changed."""
         self._placement = None
 
     def lay(self, placement: CanvasPlacement, bake: Callable[[], RoadPatch]) -> None:
@@ -74,12 +74,12 @@ class CanvasNode:
             fill_texture(texture, copy)
 
     def close(self) -> None:
-        """Take it out of the world."""
+        """Take the canvas out of the world."""
         for path in self._paths:
             path.remove_node()
 
     def hide(self) -> None:
-        """Not to be seen until the next `see`."""
+        """Hide the canvas until the next `see`."""
         self._shown = [False] * len(self._paths)
         for path in self._paths:
             path.hide()

@@ -56,7 +56,7 @@ def make_pipe() -> Pipe:
     """The software renderer's pipe.
 
     Raises:
-        SimulatorError: it cannot be loaded, which means that libX11 is missing.
+        SimulatorError: the renderer cannot be loaded, which means that libX11 is missing.
     """
     # Panda3D's configuration is the whole process's.
     global _configured
@@ -125,10 +125,10 @@ def make_texture(
     """A texture whose first row is the upper edge (v = 1).
 
     Args:
-        rgba: three or four channels; sides are powers of two.
-        repeat: tile it; otherwise the edge goes on for ever.
-        mipmaps: choose a coarser copy in the distance.
-        smooth: always interpolate between texels, at about six times the cost per pixel.
+        rgba: pixels of three or four channels; the sides are powers of two.
+        repeat: whether to tile the texture; otherwise its edge goes on for ever.
+        mipmaps: whether to choose a coarser copy in the distance.
+        smooth: whether to interpolate between texels everywhere, at about six times the cost per pixel.
     """
     texture = core.Texture()
     height, width, channels = rgba.shape
@@ -156,15 +156,15 @@ class Screen:
     """An offscreen buffer that sees the crop of a camera, magnified by a whole number and reduced again by a box.
 
     Args:
-        pipe: from `make_pipe`.
+        pipe: the software renderer's pipe (`make_pipe`).
         root: the node of the world that is shown.
-        camera: the pinhole.
-        crop: what is seen of its picture, and the size of what comes out.
+        camera: the pinhole camera that sees the world.
+        crop: the part of the camera's picture that is seen, and the size of what comes out.
         magnified: pixels rendered per pixel that comes out, along each side.
         anywhere: whether the camera may be so high that sky and ground leave pixels free; these are black.
 
     Attributes:
-        camera: may be replaced by one of the same size and field of view that looks from elsewhere.
+        camera: the pinhole camera; may be replaced by one of the same size and field of view that looks from elsewhere.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class Screen:
         return x, y, z
 
     def shoot(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Render the world."""
+        """Render the world, and return the picture."""
         self._buffer.set_active(True)
         self._engine.render_frame()
         self._buffer.set_active(False)

@@ -45,9 +45,9 @@ class Ground:
 
     Args:
         low_m: world x, y of the planes' lower corner.
-        size_m: their extent in x and y.
-        albedo: colour in display levels, RGB, `FINE_M` a pixel.
-        hard: 255 where it is paved, 0 on lawn, `FINE_M` a pixel.
+        size_m: extent of the planes in x and y.
+        albedo: colour of the ground in display levels, RGB, `FINE_M` a pixel.
+        hard: 255 where the ground is paved, 0 on lawn, `FINE_M` a pixel.
         hollows: how low the ground lies, 0 to 255: where water collects first, `COARSE_M` a pixel.
         open_sky: share of the sky that is seen, 0 to 255, `COARSE_M` a pixel.
     """
@@ -207,10 +207,10 @@ class LitGround:
     """The ground in one weather.
 
     Args:
-        ground: what it is made of.
-        sky: the weather.
+        ground: what the ground is made of.
+        sky: the sky of the weather.
         sunlit: 255 in the sun, 0 in full shadow, `COARSE_M` a pixel.
-        colour: dry or damp, before light, RGB, `FINE_M` a pixel.
+        colour: colour of the dry or damp ground before light, RGB, `FINE_M` a pixel.
         light: what colours are multiplied with, 255 for 1, RGB, `COARSE_M` a pixel.
         water: share of mirrored sky in what is seen, 255 for 1, `COARSE_M` a pixel; on paved ground only.
         mirrored: the sky that is mirrored, RGB levels.
@@ -270,12 +270,12 @@ class LitGround:
         """A plane seen in a turned square of pixels.
 
         Args:
-            plane: one of this ground's.
-            pixel_m: its resolution.
+            plane: one of this ground's planes.
+            pixel_m: the plane's resolution, metres a pixel.
             corner: world x, y of the square's upper left corner.
-            per_column: world step from a column to the next.
-            per_row: world step from a row to the next.
-            pixels: rows and columns of the square.
+            per_column: world step from a column to the next, metres.
+            per_row: world step from a row to the next, metres.
+            pixels: how many rows and columns the square has.
         """
         x0, y0 = (corner - np.array(self.ground.low_m)) / pixel_m
         (ax, ay), (bx, by) = per_column / pixel_m, per_row / pixel_m
@@ -287,7 +287,7 @@ class LitGround:
 
 
 def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> LitGround:
-    """Cast the shadows of one weather."""
+    """The ground in one weather, with the shadows that fall on it."""
     canvas = _Canvas(ground.low_m, ground.size_m, COARSE_M)
     image = canvas.blank()
     pen = ImageDraw.Draw(image)

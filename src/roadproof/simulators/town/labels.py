@@ -128,7 +128,7 @@ class LabelScene:
         self._moving: list[_Moving] = []
 
     def close(self) -> None:
-        """Give everything back."""
+        """Give back everything that the scene holds."""
         self._screens.close()
         self._root.remove_node()
 

@@ -39,7 +39,7 @@ class Mesh:
         normals: (n, 3), unit length.
         uv: (n, 2) texture coordinates.
         albedo: (n, 3) display levels / 255.
-        triangles: (t, 3) indices.
+        triangles: (t, 3) indices of the points, counter-clockwise seen from outside.
     """
 
     points: Points
@@ -123,10 +123,10 @@ class MeshBuilder:
         """A flat face with repeats of a texture, each repeat its own quad so that textures can share one picture.
 
         Args:
-            corners: counter-clockwise from the lower left.
-            across: repeats along the lower edge.
-            up: repeats along the left edge.
-            albedo: one for all, or one per corner.
+            corners: the four corners, counter-clockwise from the lower left.
+            across: how many repeats lie along the lower edge.
+            up: how many repeats lie along the left edge.
+            albedo: one colour for the whole face, or one for each corner.
         """
         if across == up == 1.0:
             self.quad(corners, albedo=albedo)
@@ -154,12 +154,12 @@ class MeshBuilder:
         """A box in the axes of `pose`.
 
         Args:
-            low: its lower corner.
-            high: its upper corner.
-            pose: from its axes to the world.
-            albedo: of all faces.
-            tile_m: where given, the size of one repeat of the texture; whole repeats fit each side.
-            faces: which: x, X, y, Y, z, Z for the low and high sides.
+            low: the box's lower corner in its own axes, metres.
+            high: the box's upper corner in its own axes, metres.
+            pose: the pose of the box's axes in the world.
+            albedo: the colour of all faces.
+            tile_m: size of one repeat of the texture, of which whole ones fit each side; None puts one on each face.
+            faces: the faces to make: x, X, y, Y, z, Z for the low and high sides.
         """
         share = BOX[[BOX_FACES.index(face) for face in faces]]
         corners = np.array(low) * (1.0 - share) + np.array(high) * share
@@ -203,7 +203,7 @@ class MeshBuilder:
         self.add(points, np.concatenate([normal, normal]), coordinates, albedo, triangles)
 
     def build(self) -> Mesh:
-        """The whole, rounded so that it is the same on every machine."""
+        """The mesh of all faces, rounded so that it is the same on every machine."""
         if not self._parts:
             empty = np.zeros((0, 3))
             return Mesh(empty, empty, np.zeros((0, 2)), empty, np.zeros((0, 3), int))

@@ -168,8 +168,8 @@ def person(kind: int, stride: float) -> Mesh:
     """Someone on foot, 1.75 m tall.
 
     Args:
-        kind: picks clothes, skin and hair.
-        stride: where in the step, −1 to 1; 0 has the feet together.
+        kind: a number that picks clothes, skin and hair.
+        stride: phase of the step, −1 to 1; 0 has the feet together.
     """
     rng = np.random.default_rng(900 + kind)
     cloth, jeans = rng.uniform(0.18, 0.66), rng.uniform(0.12, 0.32)

@@ -38,8 +38,8 @@ class Physics:
     """One drive: a car on flat ground among solid things and moving cars.
 
     Args:
-        solids: what stands about.
-        start: pose and speed of the car.
+        solids: the things that stand about and can be hit.
+        start: pose and speed of the driven car.
         cars: poses of the other cars.
     """
 
@@ -102,7 +102,7 @@ class Physics:
             self._cars[i].set_pos_hpr(x, y, HEIGHT_M / 2, math.degrees(yaw), 0.0, 0.0)
 
     def state(self) -> VehicleState:
-        """Pose and forward speed."""
+        """Pose and forward speed of the driven car."""
         position, forward = self._path.get_pos(), self._path.get_quat().get_forward()
         velocity = self._chassis.get_linear_velocity()
         flat = math.hypot(forward.x, forward.y)
@@ -128,7 +128,7 @@ class Physics:
         return sorted(found, key=lambda contact: contact.name)
 
     def close(self) -> None:
-        """Take everything out of the world."""
+        """Take everything out of the physics world."""
         self._world.remove(self._vehicle)
         for body in self._world.get_rigid_bodies():
             self._world.remove(body)

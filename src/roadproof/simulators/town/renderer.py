@@ -131,7 +131,7 @@ class Renderer:
         return screen.shoot()
 
     def close(self) -> None:
-        """Give everything back."""
+        """Give back everything that the renderer holds."""
         for screen in self._screens.values():
             screen.close()
         self._screens.clear()

@@ -60,10 +60,10 @@ class Scenery:
     """All that stands beside the roads.
 
     Args:
-        meshes: by the name of their texture.
-        trees: cut-outs, of which the trunk is solid.
-        solids: what one can hit, and what casts shadows.
-        paved: outlines of drives and forecourts.
+        meshes: the meshes by the name of their texture.
+        trees: the trees, cut-outs of which the trunk is solid.
+        solids: the things that one can hit, or that cast shadows.
+        paved: outlines of drives and forecourts, world x, y in metres.
     """
 
     meshes: dict[str, Mesh]

@@ -8,8 +8,8 @@ from roadproof.geometry import CameraModel
 from roadproof.simulators.town.engine import Screen
 
 KEPT, KEPT_PIXELS = 16, 1 << 23
-"""Screens, and pixels of all their pictures together. One alone may be larger; where more are in use, each is made anew
-for every picture."""
+"""Most screens, and most pixels of all their pictures together. One alone may be larger; where more are in use, each is
+made anew for every picture."""
 
 Lens = tuple[int, int, float]
 
@@ -40,7 +40,7 @@ class Screens:
         return screen
 
     def close(self) -> None:
-        """Give all back; they are made anew where they are asked for again."""
+        """Give all screens back; they are made anew where they are asked for again."""
         for screen in self._screens.values():
             screen.close()
         self._screens.clear()

@@ -41,9 +41,9 @@ class TownSimulator(RouteSimulator[_Drive]):
 
     Args:
         camera: the camera on the car.
-        input: how the controller's frame is cut from its picture; it is rendered at twice its resolution and reduced
-            by a box, so the simulator's own `input` says "area", whatever this one said.
-        dt_s: seconds per step, a multiple of 0.01.
+        input: how the controller's frame is cut from the camera picture; it is rendered at twice its resolution and
+            reduced by a box, so the simulator's own `input` says "area", whatever this one said.
+        dt_s: simulated seconds per step, a multiple of 0.01.
 
     Raises:
         SimulatorError: `dt_s` is not a positive multiple of 0.01, or the crop leaves the camera picture.
@@ -64,7 +64,7 @@ class TownSimulator(RouteSimulator[_Drive]):
 
     @property
     def paint(self) -> PaintKind:
-        """How patterns are put on the road: rendered with it."""
+        """How patterns are put on the road: rendered with the road."""
         return PaintKind.RENDERED
 
     def road_map(self, name: str) -> RoadMap:

@@ -32,7 +32,7 @@ class Streets:
 
     Args:
         pavement: tops of the sidewalks, at kerb height; their albedo is in the ground's picture.
-        kerbs: kerb stones.
+        kerbs: the kerb stones.
         paint: everything painted, flat on the road.
     """
 

@@ -26,12 +26,12 @@ def fractal_noise(
     """Smooth noise in [0, 1] that tiles without a seam.
 
     Args:
-        height: rows.
-        width: columns.
-        seed: of the lattice.
+        height: rows of the picture.
+        width: columns of the picture.
+        seed: the seed of the noise.
         cells: lattice cells down the picture in the coarsest octave.
-        octaves: each twice as fine as the one before, while the lattice is coarser than the picture.
-        persistence: amplitude of an octave against the one before.
+        octaves: how many octaves are added at most, each twice as fine as the one before; none is finer than a pixel.
+        persistence: amplitude of an octave as a share of the amplitude of the one before.
     """
     rng = np.random.default_rng(seed)
     total, weight, amplitude = np.zeros((height, width), np.float32), 0.0, 1.0

@@ -29,15 +29,15 @@ class Sky:
         sunlight: linear light of the sun on a surface that faces it.
         skylight: linear light of the open sky from all around.
         shadow: how much of the sunlight a shadow takes, in [0, 1].
-        shadow_blur_m: softness of a shadow's edge.
+        shadow_blur_m: softness of a shadow's edge, metres.
         haze: colour of the air.
-        density_per_m: how fast things fade into it.
+        density_per_m: how fast things fade into the haze, per metre.
         zenith: colour of the sky above.
         horizon: colour of the sky at the horizon.
-        clouds: share of the sky they cover, in [0, 1].
+        clouds: share of the sky that clouds cover, in [0, 1].
         cloud_light: colour of a lit cloud.
-        wetness: 0 dry, 1 puddles everywhere.
-        drops: rain streaks in front of the lens.
+        wetness: how wet the ground is: 0 dry, 1 puddles everywhere.
+        drops: how many rain streaks are in front of the lens.
     """
 
     sun: Rgb

@@ -40,9 +40,9 @@ class DriveTracker:
         dt_s: seconds per step.
 
     Attributes:
-        scenario: that is driven.
+        scenario: the scenario that is driven.
         state: where the car is now; the simulator keeps it up to date.
-        steps: how many were taken.
+        steps: how many steps were taken.
     """
 
     def __init__(self, request: Request, dt_s: float) -> None:
@@ -76,11 +76,11 @@ class DriveTracker:
         """What the simulator answers after this step.
 
         Args:
-            frame: what the controller sees.
-            picture: the full camera picture, or None where it is not asked for.
-            command: that holds now.
-            ending: why the drive is over now, or None.
-            events: that began now.
+            frame: the controller's input.
+            picture: the full camera picture; None where it is not asked for.
+            command: the command that holds now.
+            ending: why the drive is over; None where it goes on.
+            events: the events that began in this step.
         """
         return Observation(
             frame=frame,
@@ -104,8 +104,8 @@ class RouteTracker(DriveTracker):
 
     Attributes:
         route: the way to the goal.
-        place: where the car is along it.
-        traffic: the others; None where nobody was asked for.
+        place: where the car is along the route.
+        traffic: the other cars and the people; None where nobody was asked for.
 
     Raises:
         ScenarioError: the scenario does not fit its map.
@@ -143,10 +143,10 @@ class RouteTracker(DriveTracker):
         """The observation of this step, with the command, the events and the ending that the state makes.
 
         Args:
-            frame: what the controller sees.
-            picture: the full camera picture, or None where it is not asked for.
+            frame: the controller's input.
+            picture: the full camera picture; None where it is not asked for.
             contacts: what the car touches, people aside.
-            signals: red lights and stop signs that it runs now.
+            signals: the red lights and stop signs that the car runs in this step.
         """
         near_m = self.place.arclength_m if self.steps else None
         self.place = self.route.locate(self.state.x_m, self.state.y_m, near_m)

@@ -44,7 +44,7 @@ class Contact:
 
 
 class Judge:
-    """Watches one drive.
+    """Watches one drive for events.
 
     A collision counts once per object and drive. Wrong lane, sidewalk and off road count when they begin, and again
     only after a second without.
@@ -61,8 +61,8 @@ class Judge:
         """Events that begin now.
 
         Args:
-            state: of the car.
-            time_s: now.
+            state: where the car is now.
+            time_s: seconds since the start.
             contacts: what the car touches.
             people: world x, y of everyone on foot.
         """
@@ -99,7 +99,7 @@ class Judge:
 
 
 class Endings:
-    """Watches one drive.
+    """Watches one drive for the reason why it is over.
 
     It is over at the goal, when its time is up, 15 m beside the route, three seconds after the car has come to stand
     where it had hit something static, and when it has not moved for half a minute, whatever the reason.
@@ -114,13 +114,13 @@ class Endings:
         self._hit, self._moved_s = False, 0.0
 
     def watch(self, state: VehicleState, place: RoutePosition, time_s: float, events: Sequence[Event]) -> Ending | None:
-        """Why the drive is over now, or None.
+        """Why the drive is over now; None where it goes on.
 
         Args:
-            state: of the car.
-            place: where it is along the route.
-            time_s: now.
-            events: that began now.
+            state: where the car is now.
+            place: where the car is along the route.
+            time_s: seconds since the start.
+            events: the events that begin now.
         """
         self._hit |= any(event.kind is EventKind.COLLISION_STATIC for event in events)
         if abs(state.speed_mps) > STANDS_MPS:

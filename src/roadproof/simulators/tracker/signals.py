@@ -35,12 +35,12 @@ class TriggerVolume:
     """The box on the road in which a traffic light or a stop sign concerns a car.
 
     Args:
-        x_m: its middle.
-        y_m: its middle.
-        z_m: its middle.
+        x_m: world x of its middle, metres.
+        y_m: world y of its middle, metres.
+        z_m: world z of its middle, metres.
         yaw_rad: direction of its own x axis.
-        half_x_m: half its extent along its own x axis.
-        half_y_m: half its extent along its own y axis.
+        half_x_m: half its extent along its own x axis, metres.
+        half_y_m: half its extent along its own y axis, metres.
     """
 
     x_m: float
@@ -93,8 +93,8 @@ class RedLights:
     counts two lights of one line by turns, step after step; here each counts once.
 
     Args:
-        roads: the map.
-        lights: the trigger volumes of all its lights.
+        roads: the map that is driven on.
+        lights: the trigger volumes of all lights on the map.
     """
 
     def __init__(self, roads: RoadMap, lights: Sequence[TriggerVolume]) -> None:
@@ -108,8 +108,8 @@ class RedLights:
         """Red lights that are run now.
 
         Args:
-            state: of the car.
-            time_s: now.
+            state: where the car is now.
+            time_s: seconds since the start.
             red: whether the light of this index is red; asked only of lights whose line the car is crossing.
         """
         near = _near(self._middles, (state.x_m, state.y_m, state.z_m), LIGHT_REACH_M)
@@ -133,8 +133,8 @@ class StopSigns:
     axes; here they lie as they stand.
 
     Args:
-        roads: the map.
-        signs: the trigger volumes of all its stop signs.
+        roads: the map that is driven on.
+        signs: the trigger volumes of all stop signs on the map.
     """
 
     def __init__(self, roads: RoadMap, signs: Sequence[TriggerVolume]) -> None:
@@ -147,8 +147,8 @@ class StopSigns:
         """Stop signs that have been run now.
 
         Args:
-            state: of the car.
-            time_s: now.
+            state: where the car is now.
+            time_s: seconds since the start.
         """
         near = _near(self._middles, (state.x_m, state.y_m), SIGN_REACH_M)
         ahead = places_ahead(self._roads, state) if near else np.zeros((0, 2))
@@ -215,10 +215,10 @@ def _entry(roads: RoadMap, lane: Lane, station_m: float) -> tuple[Lane, float]:
 
 
 def _near(middles: Float[np.ndarray, "n d"], place: tuple[float, ...], reach_m: float) -> list[int]:
-    """Indices of the middles within reach."""
+    """Indices of the middles within reach of a place."""
     return np.flatnonzero(((middles - place) ** 2).sum(axis=1) <= reach_m**2).tolist()
 
 
 def _named(what: str, volume: TriggerVolume) -> str:
-    """By its place, which stays the same when a server gives its actors other numbers."""
+    """A name for a light or sign by its place, which stays the same when a server renumbers its actors."""
     return f"{what} at ({volume.x_m:.1f}, {volume.y_m:.1f})"

@@ -28,7 +28,7 @@ class TrackedSimulator(ABC, Generic[DriveT]):
 
     Args:
         camera: the camera on the car.
-        input: how the controller's frame is cut from its picture.
+        input: how the controller's frame is cut from the camera picture.
         dt_s: seconds per step.
 
     Raises:
