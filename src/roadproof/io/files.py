@@ -70,7 +70,7 @@ def check_name(name: object, what: str, error: type[RoadproofError]) -> str:
     if not is_plain_name(name):
         raise error(
             f"{what} {name!r:.120} is not a plain name; expected letters, digits, blanks and ._+-=,()[] alone, "
-            "beginning with a letter or digit"
+            "beginning with a letter, a digit or _"
         )
     return str(name)
 
