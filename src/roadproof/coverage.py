@@ -55,11 +55,11 @@ _CORNERS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprints:
-    """The canvas under P picture pixels; leading dimensions, where there are any, belong to patterns of their own.
+    """The footprints of P picture pixels on the canvas; leading dimensions count patterns with pixels of their own.
 
     Args:
-        centre: canvas coordinates of the pixel centres, px, (P, 2).
-        jacobian: canvas px per picture px, (P, 2, 2).
+        centre: canvas coordinates of the pixel centres, px, (*v, P, 2).
+        jacobian: canvas px per picture px, (*v, P, 2, 2).
         features: (6, P): x, y, 1 and the entries xx, 2·xy, yy of footprint² · J Jᵀ; a figure's u, v, σ²(e_u), σ²(e_v)
             are linear in them.
         variance: footprint², the value of `FOOTPRINT_VARIANCE` for the picture's resampling.
@@ -90,7 +90,7 @@ class Footprints:
     def made(
         centre: Float[Tensor, "*v p 2"], jacobian: Float[Tensor, "*v p 2 2"], resampling: Resampling
     ) -> Footprints:
-        """Footprints from canvas coordinates and Jacobians, where and as precise as they are."""
+        """Footprints from canvas coordinates and Jacobians, on their device and in their precision."""
         variance = FOOTPRINT_VARIANCE[resampling]
         x, y = centre.unbind(-1)
         (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
@@ -138,12 +138,12 @@ def coverage(shape: Shape, box: Float[Tensor, "*b 5"], footprints: Footprints) -
     """Share of every footprint that lies inside every figure.
 
     Args:
-        shape: what fills the boxes.
-        box: centre x, centre y, width, length in canvas px, rotation in degrees clockwise.
-        footprints: of the pixels to cover.
+        shape: shape that fills the boxes.
+        box: centre x, centre y, width, length in canvas px, and rotation in degrees clockwise, (*b, 5).
+        footprints: footprints of the pixels.
 
     Returns:
-        In [0, 1]; the mask M of the paper, antialiased.
+        Shares in [0, 1], (*b, P): the mask M of the paper, antialiased.
     """
     match shape:
         case Shape.RECTANGLE:

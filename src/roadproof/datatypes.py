@@ -48,9 +48,9 @@ class Control:
     """What a driver does to the car for one step.
 
     Args:
-        steer: −1 (full left) to 1 (full right).
-        throttle: 0 to 1.
-        brake: 0 to 1.
+        steer: steering, from −1 (full left) to 1 (full right).
+        throttle: throttle, 0 to 1.
+        brake: brake, 0 to 1.
 
     Raises:
         SimulatorError: a value is not finite. Values outside their range are the caller's to clip (`clipped`).
@@ -102,7 +102,7 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One event of a drive: what, with whom or where (free text), and when."""
+    """One event of a drive: its kind, when it happened, and what or who was involved, or where, as free text."""
 
     kind: EventKind
     time_s: float
@@ -127,13 +127,13 @@ class Observation:
 
     Args:
         frame: the controller's input, (H, W, 3) uint8 RGB.
-        state: the vehicle's state in the world.
-        command: what the route asks next.
+        state: state of the vehicle in the world.
+        command: what the route asks at the next junction.
         time_s: seconds since the reset.
         events: what happened since the last observation.
-        done: the drive is over.
-        picture: the full camera picture, where it was asked for.
-        ending: why the drive is over; where a simulator does not say, it is the goal or the time limit.
+        done: whether the drive is over.
+        picture: full camera picture, RGB; None where it was not asked for.
+        ending: why the drive is over; if a simulator does not say, it is the goal or the time limit.
     """
 
     frame: UInt8[np.ndarray, "h w 3"]
@@ -147,5 +147,5 @@ class Observation:
 
     @property
     def shown(self) -> UInt8[np.ndarray, "hs ws 3"]:
-        """The most there is to see: the full camera picture, or the frame where there is none."""
+        """The most detailed picture there is: the full camera picture, or the frame without one."""
         return self.frame if self.picture is None else self.picture

@@ -50,7 +50,7 @@ _log = logging.getLogger("roadproof")
 
 @dataclass(slots=True, eq=False)
 class _Call:
-    """One that has not come back yet; `waited_s` counts the time since then in which the watch ran."""
+    """A call that has not come back yet; `waited_s` counts the time since then in which the watch ran."""
 
     what: str
     thread: int = field(default_factory=threading.get_ident)
@@ -66,17 +66,17 @@ _limit_s = math.inf
 
 
 def call(what: str, function: Callable[Arguments, Answer], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Answer:
-    """What a foreign function returns.
+    """Call a foreign function and return what it returns.
 
     Args:
-        what: the function in words, for messages.
-        function: is called with the other arguments.
-        args: of the function.
-        kwargs: of the function.
+        what: name of the function in words, for messages.
+        function: function to call with the other arguments.
+        args: positional arguments of the function.
+        kwargs: keyword arguments of the function.
 
     Raises:
-        ControllerError: it raised something, or was ended for its time. A `RoadproofError` of ours that no line of the
-            user's led to passes as it is; `KeyboardInterrupt` passes.
+        ControllerError: the function raised something, or was ended for its time. A `RoadproofError` of ours to which
+            no line of the user's led passes as it is; so does `KeyboardInterrupt`.
     """
     this = _Call(what)
     _calls[id(this)] = this
@@ -119,7 +119,7 @@ def place_of(error: BaseException) -> str | None:
 
 
 def end_calls_after(limit_s: float) -> None:
-    """End foreign calls of this process after some seconds, infinite for never: for a command, not for a library."""
+    """End foreign calls of this process after some seconds (infinite for never); for a command, not for a library."""
     global _limit_s  # one process, one limit
     _limit_s = limit_s
 

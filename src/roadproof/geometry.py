@@ -32,13 +32,13 @@ class CameraModel:
     """A pinhole camera without distortion, and where it sits on the car.
 
     Args:
-        width_px: columns of the picture.
-        height_px: rows of the picture.
+        width_px: number of columns of the picture.
+        height_px: number of rows of the picture.
         fov_deg: horizontal field of view, degrees, in (0, 180).
-        forward_m: metres ahead of the vehicle's origin.
-        left_m: metres to its left.
-        up_m: metres above the ground.
-        pitch_deg: positive looks up; CARLA's imitation agent looks down by −15.
+        forward_m: distance ahead of the vehicle's origin, metres.
+        left_m: distance to the left of the vehicle's origin, metres.
+        up_m: height above the ground, metres.
+        pitch_deg: pitch in degrees, positive looking up; CARLA's imitation agent looks down by −15.
 
     Raises:
         GeometryError: a size is not positive or the field of view is outside (0, 180).
@@ -73,7 +73,7 @@ class CameraModel:
         """Projection of homogeneous world points (X, Y, Z, 1), in metres; the third coordinate is the depth in metres.
 
         Args:
-            state: the pose of the vehicle that carries the camera.
+            state: pose of the vehicle that carries the camera.
         """
         sy, cy = math.sin(state.yaw_rad), math.cos(state.yaw_rad)
         sp, cp = math.sin(math.radians(self.pitch_deg)), math.cos(math.radians(self.pitch_deg))
@@ -94,17 +94,17 @@ class CropResize:
     """How a controller's input is made from the camera picture: cut a box, then resize it.
 
     Args:
-        left_px: first column kept.
-        top_px: first row kept.
-        right_px: one past the last column kept.
-        bottom_px: one past the last row kept.
-        width_px: columns of the input.
-        height_px: rows of the input.
+        left_px: first column of the camera picture that is kept.
+        top_px: first row of the camera picture that is kept.
+        right_px: one past the last column that is kept.
+        bottom_px: one past the last row that is kept.
+        width_px: number of columns of the input.
+        height_px: number of rows of the input.
         resampling: "antialiased-bilinear" (Pillow's BILINEAR: a tent as wide as two input pixels) or "area" (a box as
             wide as one).
 
     Raises:
-        GeometryError: the box or the input is empty.
+        GeometryError: the box or the input has no pixels.
     """
 
     left_px: int
@@ -163,12 +163,12 @@ class CanvasPlacement:
     """Where the canvas lies on the road.
 
     Args:
-        x_m: world x of its centre.
-        y_m: world y of its centre.
-        z_m: height of the road there.
-        yaw_rad: direction of travel, towards the canvas' far edge (y = 0).
-        width_m: extent across the road.
-        length_m: extent along the road.
+        x_m: world x of the canvas' centre, metres.
+        y_m: world y of the canvas' centre, metres.
+        z_m: height of the road at the canvas' centre, metres.
+        yaw_rad: direction of travel, radians, towards the canvas' far edge (y = 0).
+        width_m: extent across the road, metres.
+        length_m: extent along the road, metres.
 
     Raises:
         GeometryError: an extent is not positive.
@@ -225,11 +225,11 @@ def homography_from_points(
     """`image_from_canvas` from corresponding points, by the normalised direct linear transform.
 
     Args:
-        canvas: points on the canvas, px.
-        image: where they were seen, camera px; all of them in front of the camera.
+        canvas: points on the canvas, px, (N, 2).
+        image: camera px at which each was seen, (N, 2); all points lie in front of the camera.
         outlier_px: where given, correspondences further than this from the best of 500 seeded four-point fits are
             left out (RANSAC); otherwise all count, as in the paper.
-        seed: of the four-point draws.
+        seed: seed of the four-point draws.
 
     Returns:
         The homography, scaled to unit Frobenius norm, with a positive third coordinate at the points.

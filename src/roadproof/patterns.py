@@ -36,7 +36,7 @@ class Pattern:
     """K figures, painted in order; leading dimensions, where there are any, count patterns of the same shapes.
 
     Args:
-        shapes: what each figure is, K of them.
+        shapes: shape of each figure, K in all.
         boxes: centre x, centre y, width, length in canvas px, rotation in degrees clockwise, (*b, K, 5).
         colours: RGB of the paint in [0, 1], (*b, K, 3).
 
@@ -101,7 +101,7 @@ def boxes_from_published(
 def published_from_boxes(
     boxes: Float[Tensor, "*b k 5"], *, rotate_about: Literal["figure", "canvas"] = "figure"
 ) -> Float[Tensor, "*b k 4"]:
-    """The published parameters of boxes that `boxes_from_published` made."""
+    """The published parameters of boxes that `boxes_from_published` made, (*b, K, 4)."""
     x, y, width, length, rotation_deg = boxes.unbind(-1)
     arm = x - _MIDDLE
     if rotate_about == "canvas":
@@ -117,7 +117,7 @@ def rectangles_from_published(
 
     Args:
         values: per rectangle rotation, position, width, length and, where it is not black, r, g, b in 0…255.
-        rotate_about: see `boxes_from_published`.
+        rotate_about: "figure" or "canvas", as in `boxes_from_published`.
 
     Raises:
         PatternError: a row has neither 4 nor 7 values.
@@ -179,7 +179,7 @@ def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray,
 
 @dataclass(frozen=True, slots=True)
 class _Figure:
-    """A figure as its file has it."""
+    """A figure as the pattern file stores it."""
 
     shape: Shape
     x_px: float
@@ -203,7 +203,7 @@ class _Figure:
 
 @dataclass(frozen=True, slots=True)
 class _Figures:
-    """A pattern as its file has it."""
+    """A pattern as its file stores it."""
 
     figures: tuple[_Figure, ...]
     canvas_px: int = CANVAS_SIZE_PX
@@ -249,10 +249,10 @@ def load_pattern(path: AnyPath) -> Pattern:
 
 
 def read_paint(path: AnyPath) -> UInt8[np.ndarray, "s s 4"]:
-    """What a file says to paint, as RGBA of the canvas: the raster of a pattern (.json), or a picture as it is.
+    """Read what a file says to paint, as RGBA of the canvas: the raster of a pattern (.json), or a picture as it is.
 
     Raises:
-        PatternError: it is neither a pattern nor a picture of the canvas' size.
+        PatternError: the file is neither a pattern nor a picture of the canvas' size.
     """
     path = as_path(path)
     if path.suffix == ".json":

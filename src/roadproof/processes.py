@@ -26,9 +26,9 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
     controllers that travel; foreign calls end as in this process.
 
     Args:
-        count: how many.
-        begin: called in each before its first work; a function of a module.
-        arguments: of it.
+        count: number of processes, at least 1.
+        begin: function of a module that each process calls before its first work; None for none.
+        arguments: arguments of `begin`.
     """
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(
@@ -40,7 +40,7 @@ def require_picklable(driver: object) -> None:
     """Refuse a controller, or another driver, that cannot travel to processes beside this one.
 
     Raises:
-        ControllerError: pickling it raises; the message says why and what to do.
+        ControllerError: the driver cannot be pickled; the message says why and what to do.
     """
     try:
         foreign.call("pickling the controller", pickle.dumps, driver)

@@ -34,13 +34,13 @@ class Scenario:
     """One stretch of road to be driven.
 
     Args:
-        name: for people and folders, for instance "left-03".
+        name: name for people and folders, for instance "left-03".
         kind: whether the route keeps straight or veers to a side, in a bend or at a junction.
         map_name: a map the simulator knows by name ("town"), or the path of an OpenDRIVE file.
-        start: where the car stands, and how fast it goes when the drive begins.
-        goal_m: (x, y) the route leads to.
+        start: pose of the car and its speed when the drive begins.
+        goal_m: world (x, y) at which the route ends, metres.
         canvas: the stretch of road that can be painted.
-        time_limit_s: after this many seconds the drive ends.
+        time_limit_s: time after which the drive ends, seconds.
 
     Raises:
         ScenarioError: the name cannot name a folder, or a value is missing, not finite or out of range.
@@ -79,10 +79,10 @@ class Scenario:
 
 
 def identity(scenario: Scenario) -> dict[str, Any]:
-    """What tells a scenario from others, wherever its map lies; for JSON.
+    """What identifies a scenario, wherever its map lies, for JSON.
 
     Raises:
-        OSError: the map's file cannot be read.
+        OSError: the file of the map cannot be read.
     """
     file = Path(scenario.map_name)
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
@@ -95,14 +95,14 @@ def builtin_scenarios() -> tuple[Scenario, ...]:
 
 
 def find_scenario(name: str, scenarios: Sequence[Scenario] | None = None) -> Scenario:
-    """The scenario of a name.
+    """The scenario with a given name.
 
     Args:
-        name: such as "left-03".
-        scenarios: among which it is looked for; the built-in ones by default.
+        name: name of the scenario, such as "left-03".
+        scenarios: scenarios to search; the built-in ones by default.
 
     Raises:
-        ScenarioError: there is none; the message names the nearest.
+        ScenarioError: no scenario has this name; the message names the nearest.
     """
     scenarios = builtin_scenarios() if scenarios is None else scenarios
     for scenario in scenarios:

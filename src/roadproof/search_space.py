@@ -68,21 +68,21 @@ class SearchSpace:
     """All patterns of K figures that an attack may paint.
 
     Args:
-        figures: K, how many figures.
+        figures: number K of figures.
         family: "published", the paper's rectangles centred along the road, rotated about themselves as in the
             released code (4 parameters); "published-canvas-centre", rotated about the canvas' centre as in the text;
             "published-bo", the same rectangles in the bounds of the authors' Bayesian optimisation, which depend on K;
             "free", any centre on the canvas (5 parameters).
-        shape: what every figure is; the published families are rectangles.
-        colour: whether the paint's colour is searched (3 parameters more); otherwise all figures are black.
-        albedo: lowest and highest value of a colour channel; real paint is neither 0 nor 1.
-        max_painted_share: where given, widths shrink together until the figures' areas sum to at most this share of
-            the canvas.
-        limits: what paint may be, in metres and colours; None limits nothing.
-        site: the road that the limits are about; `on` sets it.
+        shape: shape of every figure; the published families are rectangles.
+        colour: whether the paint's colour is searched (three parameters more); otherwise all figures are black.
+        albedo: lowest and highest value of a colour channel, in [0, 1]; real paint reaches neither end.
+        max_painted_share: largest share of the canvas that the figures' areas may sum to, for which widths shrink
+            together; None for no limit.
+        limits: limits on paint, in metres and colours; None limits nothing.
+        site: stretch of road to which the limits apply; `on` sets it.
 
     Raises:
-        PatternError: a bound makes no sense.
+        PatternError: a field is out of its range, or two fields do not fit each other.
     """
 
     figures: int
@@ -114,10 +114,10 @@ class SearchSpace:
         return f"SearchSpace({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
     def on(self, site: Site) -> SearchSpace:
-        """The same patterns as far as the limits leave them on a stretch of road; unlimited ones are left as they are.
+        """The space with its limits applied to a stretch of road; a space without limits is unchanged.
 
         Raises:
-            PatternError: the limits leave no pattern there, or need something that is not known of it.
+            PatternError: the limits leave no pattern there, or need something of the road that is not known.
         """
         if self.limits is None:
             return self
@@ -127,12 +127,12 @@ class SearchSpace:
 
     @property
     def unlimited(self) -> SearchSpace:
-        """All patterns, whatever the limits."""
+        """The space without its limits."""
         return replace(self, limits=None, site=None)
 
     @property
     def stated(self) -> dict[str, Any]:
-        """What tells it from another, for files: limits are not named where there are none."""
+        """The fields that identify the space, for files; limits are named only if there are any."""
         told = cast("dict[str, Any]", plain(replace(self, site=None)))
         return {name: value for name, value in told.items() if value is not None or name not in ("limits", "site")}
 
@@ -144,7 +144,7 @@ class SearchSpace:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters of one figure, in order."""
+        """Names of one figure's parameters, in order."""
         return tuple(p.name for p in self._shape_parameters) + (_COLOUR_NAMES if self.colour else ())
 
     @property
@@ -170,7 +170,7 @@ class SearchSpace:
         return torch.cat([clipped[..., :4], unit[..., 4:5] % 1.0, clipped[..., 5:]], -1)
 
     def pattern(self, unit: Float[Tensor, "*b k n"]) -> Pattern:
-        """The pattern at a point, differentiable in it."""
+        """The pattern at a point of the space, differentiable in it."""
         parameters = self._shape_parameters
         low = unit.new_tensor([p.low for p in parameters])
         natural = low + unit[..., : len(parameters)] * unit.new_tensor(self.shape_ranges)
@@ -188,10 +188,10 @@ class SearchSpace:
         return pattern if self.max_painted_share is None else shrunk(pattern, self.max_painted_share)
 
     def point(self, pattern: Pattern) -> Float[Tensor, "*b k n"]:
-        """The point of a pattern: what `pattern` makes it from; the nearest one where the pattern is outside.
+        """The point of a pattern; the nearest point if the pattern is outside of the space.
 
         Raises:
-            PatternError: it has other figures.
+            PatternError: the pattern has other figures than this space.
         """
         if pattern.shapes != (self.shape,) * self.figures:
             names = ", ".join(pattern.shapes)

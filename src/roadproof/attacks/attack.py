@@ -53,25 +53,26 @@ def attack(
     Args:
         recordings: the drives, with their view of the canvas and its colours; or a stretch of road in a simulator,
             where every pattern takes a drive, and the method has to do without gradients.
-        controller: on `device`.
-        space: the patterns allowed.
+        controller: the controller that is attacked; it computes on `device`.
+        space: the search space: the patterns that are allowed.
         objective: what is made large: `SteeringShift()` by default, as published, or `PathDeviation()`, which drives
             in the recordings and needs their tracks; or one of your own.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
-        groups: recorded drives attacked together. By default, with gradients and drives pushed to both sides, the
-            paper's two sides, of which the stronger is kept; else all drives, to whichever side they give way.
-        seed: of everything random.
-        device: where to search.
-        random_patterns: random patterns a group that the self-check on recordings compares with; 0 for none.
-        starts: of an earlier search, to search on from: each for its own group, instead of as many random ones.
-        checkpoint: file that keeps the search after every step; an interrupted one goes on from it.
-        on_step: called after every step with its number and the best shift so far.
+        groups: groups of recorded drives, each attacked together. By default, for a method with gradients and drives
+            pushed to both sides, the paper's two sides, of which the stronger is kept; otherwise one group of all
+            drives, to whichever side they give way.
+        seed: seed of everything random, 0 by default.
+        device: torch device on which the search computes.
+        random_patterns: number of random patterns per group for the self-check on recordings; 0 leaves that check out.
+        starts: candidates of an earlier search to start from, each in its own group, in place of as many random starts.
+        checkpoint: file that keeps the search after every step, so that an interrupted one goes on; None for none.
+        on_step: called after every step with its number and the best value so far, in the objective's unit.
 
     Raises:
-        ControllerError: the controller takes other frames, or answers NaN.
+        ControllerError: the controller takes frames of another size, or answers NaN.
         RecordingError: a group names drives that the set lacks.
-        PatternError: the method does not know these patterns, or the limits on paint leave none on this road.
-        RoadproofError: the method needs gradients, and a simulator has none; or as `rollout` in a simulator does.
+        PatternError: the method cannot search these patterns, or the limits on paint leave none on this road.
+        RoadproofError: the method needs gradients, which a simulator does not give; or `rollout` fails there.
     """
     objective, method = objective or SteeringShift(), method or GradOpt()
     method.check_space(space)
@@ -137,7 +138,7 @@ def _checks(
     random_patterns: int,
     seed: int,
 ) -> tuple[Check, ...]:
-    """What may be distrusted of a search, by what it was made on."""
+    """The self-checks that suit what a search ran on: recordings, a recorded world or a simulator."""
     if not isinstance(measure, RecordedMeasure):
         return (check_bounds(space, search),)
     checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
@@ -160,23 +161,23 @@ def kept_attack(
     starts: Sequence[Candidate] = (),
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
-    """A search that is done once: what it found is read from its folder where it is there already.
+    """Search once: if the folder already holds the result of this search, read it instead.
 
     Args:
-        folder: folder of the result; it keeps the running search too.
-        recordings: as in `attack`, like all that follow.
-        controller: on `device`.
-        space: the patterns allowed.
-        objective: what is made large.
-        method: how it is searched.
-        groups: drives attacked together.
+        folder: folder of the result; it also keeps the checkpoint of the running search.
+        recordings: calibrated recordings of the drives, as in `attack`.
+        controller: the controller that is attacked; it computes on `device`.
+        space: the search space: the patterns that are allowed.
+        objective: what the search makes large, as in `attack`.
+        method: the search method, as in `attack`.
+        groups: groups of recorded drives, each attacked together; the method's own by default.
         seed: seed of everything random.
-        device: where to search.
-        starts: candidates to search on from.
-        on_step: called after every step.
+        device: torch device on which the search computes.
+        starts: candidates of an earlier search to start from, each in its own group.
+        on_step: called after every step with its number and the best value so far.
 
     Raises:
-        RoadproofError: the result is damaged or of another search, or the search refuses.
+        RoadproofError: the stored result is damaged or belongs to another search, or the search itself fails.
         OutputError: the folder cannot be written.
     """
     frames = hashlib.sha256()
@@ -214,7 +215,7 @@ def kept_attack(
 
 
 def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:
-    """Those of a group, as points; a simulator's drives belong to none and take all."""
+    """The start candidates of a group as points of the space; a group without pushes, in a simulator, takes all."""
     points = [space.point(start.pattern) for start in starts if not group.pushes or start.group == str(group)]
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 

@@ -39,13 +39,13 @@ Value: TypeAlias = Callable[[Float[Tensor, "b k n"]], Float[Tensor, " b"]]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BlackBox(Method):
-    """A search that knows patterns by their values alone; one of its kinds is meant.
+    """A search that knows patterns by their values alone; the base class of all methods without gradients.
 
     Args:
-        calls: patterns tried.
+        calls: number of patterns tried, 1 or more.
 
     Raises:
-        RoadproofError: a number is below 1.
+        RoadproofError: a field is below 1.
     """
 
     by_gradient: ClassVar[bool] = False
@@ -57,20 +57,20 @@ class BlackBox(Method):
         at_least_one(self, "calls")
 
     def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """What names the next points of a space; `given` of the points tried first are another search's."""
+        """The function that proposes the next points of a space; the first `given` trials come from another search."""
         raise NotImplementedError
 
     def steps(self, objective: Objective) -> int:
-        """One for each pattern."""
+        """The number of patterns tried, since `on_step` is called once for each."""
         del objective
         return self.calls
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """All drives, to whichever side they give way."""
+        """One group of all drives, to whichever side each gives way."""
         return parse_groups("all", recordings)
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
-        """Try patterns, on recordings some at once; each counts by its best group."""
+        """Try patterns, on recordings several at once; the value of each is that of its best group."""
         del objective
         groups = len(measure.groups)
 
@@ -101,7 +101,7 @@ class RandomSearch(BlackBox):
     word: ClassVar[str] = "random"
 
     def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """Independent draws."""
+        """Independent random points."""
         del given
         return proposals.random(space, seed)
 
@@ -113,7 +113,7 @@ class TPE(BlackBox):
     word: ClassVar[str] = "tpe"
 
     def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """Points of the unit cube."""
+        """Optuna's TPE sampler on the unit cube."""
         del given
         return proposals.optuna("tpe", space.figures * len(space.names), seed)
 
@@ -125,7 +125,7 @@ class GaussianProcess(BlackBox):
     word: ClassVar[str] = "gp"
 
     def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """Points of the unit cube."""
+        """Optuna's Gaussian process sampler on the unit cube."""
         del given
         return proposals.optuna("gp", space.figures * len(space.names), seed)
 
@@ -137,7 +137,7 @@ class CMAES(BlackBox):
     word: ClassVar[str] = "cma-es"
 
     def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """From the cube's middle, or from the best of the points given."""
+        """CMA-ES, begun at the middle of the unit cube, or at the best of the points given."""
         return proposals.cma_es(space.figures * len(space.names), seed, given)
 
 
@@ -146,7 +146,7 @@ class BayesianOptimisation(BlackBox):
     """Bayesian optimisation as the paper's baseline had it.
 
     Args:
-        random_calls: how many of the calls are random, before the model guides.
+        random_calls: number of the calls that are drawn at random before the model guides the rest.
     """
 
     word: ClassVar[str] = "published-bo"
@@ -158,7 +158,7 @@ class BayesianOptimisation(BlackBox):
         at_least_one(self, "calls", "random_calls")
 
     def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """Points in natural units, as published."""
+        """The paper's Bayesian optimisation, on parameters in natural units (px, degrees, colour levels)."""
         del given
         return proposals.published_bo(proposals.natural_ranges(space), self.random_calls, seed)
 
@@ -168,9 +168,9 @@ class Trials:
     """What a search has tried, in order.
 
     Args:
-        unit: the points.
-        value: of each.
-        seconds: since the search began, when each was known; time in which it was not running does not count.
+        unit: the points tried, in the unit cube, (T, K, N) for T trials, K figures and N parameters each.
+        value: value of each point, (T,).
+        seconds: time at which each value was known, in seconds since the search began, (T,); pauses do not count.
     """
 
     unit: Float[Tensor, "t k n"]
@@ -178,12 +178,12 @@ class Trials:
     seconds: Float[Tensor, " t"]
 
     def __len__(self) -> int:
-        """How many."""
+        """How many points have been tried."""
         return len(self.value)
 
     @property
     def best(self) -> int:
-        """Index of the best one."""
+        """Index of the trial with the largest value."""
         return int(self.value.argmax())
 
     @property
@@ -207,18 +207,18 @@ def blackbox_search(
     """Find the point of a search space with the largest value, without gradients.
 
     Args:
-        value: gives the values.
-        space: where to look; the authors' Bayesian optimisation had the "published-bo" family.
-        method: proposes the points.
-        seed: of everything random.
-        at_once: how many points are proposed before their values are asked for.
-        first: points to begin with, as those of another search; the method goes on from what they are worth.
-        world: tells what gives the values from what gives others.
-        checkpoint: a file that keeps the trials after every call for values; a search that finds its own goes on.
-        on_step: told how many points have been tried, and the best value.
+        value: function from points (P, K, N) of the unit cube to their values (P,), larger being better.
+        space: the search space; the authors' Bayesian optimisation had the "published-bo" family.
+        method: the black-box method that proposes the points.
+        seed: seed of everything random, 0 by default.
+        at_once: number of points proposed before their values are asked for, 1 or more.
+        first: points (F, K, N) to try first, such as those of another search; the method goes on from their values.
+        world: text that identifies what computes the values, so that a checkpoint of other values is not resumed.
+        checkpoint: file that keeps the trials after every call of `value`, so that an interrupted search goes on.
+        on_step: called after every batch with the number of points tried and the best value so far.
 
     Raises:
-        RoadproofError: an argument makes no sense, or a value is not finite.
+        RoadproofError: `at_once` is out of range for the method, or a value is not finite.
     """
     if at_once < 1:
         raise RoadproofError(f"at_once is {at_once}, expected 1 or more")
@@ -265,10 +265,10 @@ def _resumed(checkpoint: Path | None, space: SearchSpace, identity: str) -> Tria
 
 
 def at_least_one(method: object, *names: str) -> None:
-    """See that fields of a method are whole numbers from 1, or None.
+    """Check that fields of a method are whole numbers from 1, or None.
 
     Raises:
-        RoadproofError: one is not; the message names it.
+        RoadproofError: a field is something else; the message names it.
     """
     for name in names:
         number = getattr(method, name)

@@ -41,12 +41,12 @@ _RUNGS = (Rung(1, 8, 0.03),)
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One pattern on the way to the cheapest.
+    """A pattern found on the way to the cheapest: its area and its effect.
 
     Args:
-        area_m2: the sum of its figures' areas.
-        figures: how many it has.
-        predicted_m: its deviation in the recorded world, the least over small errors of steering.
+        area_m2: sum of the figures' areas, m².
+        figures: number of figures.
+        predicted_m: paper's deviation in the recorded world, metres: the least over small errors of steering.
     """
 
     area_m2: float
@@ -59,12 +59,12 @@ class Cheapest:
     """The cheapest pattern that was found for a deviation.
 
     Args:
-        pattern: the pattern.
-        group: the drives that it was found for.
-        wanted_m: the deviation that it was to reach.
-        predicted_m: the deviation that it is predicted to cause, the least over small errors of steering.
-        conspicuousness: how conspicuous it is.
-        levels: every pattern that still reached it, the strongest first.
+        pattern: the cheapest pattern.
+        group: name of the group of drives that it was found for, such as "clean+right".
+        wanted_m: deviation that it had to reach, metres.
+        predicted_m: deviation that it is predicted to cause, metres: the least over small errors of steering.
+        conspicuousness: how conspicuous the pattern is on this road.
+        levels: every pattern that still reached the deviation, the strongest first.
     """
 
     pattern: Pattern
@@ -76,7 +76,7 @@ class Cheapest:
 
     @property
     def candidate(self) -> Candidate:
-        """For driving over it."""
+        """The pattern as a candidate, so that it can be driven over."""
         return Candidate(self.pattern, self.group, 0.0, self.predicted_m)
 
     def save(self, folder: Path, made_of: object = None) -> None:
@@ -90,7 +90,7 @@ class Cheapest:
 
     @staticmethod
     def load(folder: Path) -> Cheapest:
-        """Read what `save` wrote.
+        """Read the pattern that `save` wrote.
 
         Raises:
             RoadproofError: a file is missing or damaged.
@@ -122,22 +122,22 @@ def cheapest(
     """The fewest square metres of paint that still take a controller so far aside.
 
     Args:
-        recordings: as the search had them, with canvas and tracks.
-        controller: on `device`.
-        found: what the search found; its limits on paint hold here too.
-        wanted_m: the paper's deviation, metres, above 0.
-        groups: of the search.
-        objective: of the search where it drove in the recorded world; `PathDeviation()` by default.
-        device: where to search.
-        on_level: told after every limit of the area how many there were, and the least area so far.
+        recordings: the calibrated recordings that were searched, with canvas and tracks.
+        controller: the controller that was attacked; it computes on `device`.
+        found: result of the search before; its limits on paint hold here too.
+        wanted_m: the paper's deviation that must be reached, metres, above 0 and at most 100.
+        groups: the groups of drives of the search before.
+        objective: objective of the search before if it drove in the recorded world; `PathDeviation()` by default.
+        device: torch device on which the search computes.
+        on_level: called after every limit of the area with the number of limits tried and the least area so far, m².
 
     Returns:
         The cheapest pattern; None where the strongest one is not predicted to reach the deviation under all small
         errors of steering.
 
     Raises:
-        RoadproofError: the deviation is out of its range.
-        RecordingError: the recordings cannot be driven in.
+        RoadproofError: `wanted_m` is out of its range.
+        RecordingError: the recordings lack a canvas or tracks, or the vehicle cannot be identified from them.
         PatternError: the recordings do not say how large the canvas is.
     """
     check_wanted(wanted_m)
@@ -180,7 +180,7 @@ def cheapest(
 
 
 def in_words(found: Cheapest | None, wanted_m: float) -> str:
-    """What came of the search for less paint, as a sentence."""
+    """The outcome of the search for less paint, as one sentence."""
     if found is None:
         return (
             f"The strongest pattern is not predicted to deviate by {wanted_m:g} m under all small errors of steering, "
@@ -193,10 +193,10 @@ def in_words(found: Cheapest | None, wanted_m: float) -> str:
 
 
 def check_wanted(wanted_m: float) -> None:
-    """See that a deviation may be asked for.
+    """Check that a wanted deviation is in its allowed range.
 
     Raises:
-        RoadproofError: it may not.
+        RoadproofError: the deviation is out of range.
     """
     if not 0.0 < wanted_m <= 100.0:
         raise RoadproofError(f"cheapest is {wanted_m} m, expected metres of deviation above 0, and 100 at most")
@@ -214,12 +214,12 @@ class _Run:
 
     @property
     def pattern(self) -> Pattern:
-        """The pattern here."""
+        """The pattern at the current point of the search."""
         here = self.space.pattern(self.unit[0, 0].detach())
         return Pattern(here.shapes, here.boxes.cpu(), here.colours.cpu())
 
     def level(self) -> Level:
-        """What it comes to."""
+        """Area, number of figures and predicted deviation of the current pattern."""
         site = self.space.site
         assert site is not None
         assert site.size_m is not None
@@ -227,7 +227,7 @@ class _Run:
         return Level(float(area_m2(self.pattern, site.size_m)), self.space.figures, float(least[0]))
 
     def without_a_figure(self) -> _Run | None:
-        """The same without the figure that is missed least; None where all are needed."""
+        """The search without the figure whose loss costs least deviation; None if every figure is needed."""
         count = self.space.figures
         if count == 1:
             return None
@@ -238,12 +238,12 @@ class _Run:
         return replace(self, space=space, unit=unit[:, [best]]) if float(least[best]) >= self.wanted_m else None
 
     def lowered(self, most_m2: float) -> _Run:
-        """What the search comes to with a lower limit of the area."""
+        """The search after going on under a lower limit of the area, in m²."""
         assert self.space.limits is not None
         space = replace(self.space, limits=replace(self.space.limits, max_area_m2=most_m2))
         search = gradopt(self.measure, space, _RUNGS, seed=self.seed, starts=[self.unit[0].cpu()])
         return replace(self, space=space, unit=search.best_unit)
 
     def _least_m(self, space: SearchSpace, unit: Float[Tensor, "1 s k n"]) -> Float[Tensor, " s"]:
-        """The least deviation that each is predicted to cause."""
+        """The least deviation that each pattern is predicted to cause, metres, over small errors of steering."""
         return self.measure.readings(space, unit)[1].amin(-1)[0]

@@ -14,7 +14,7 @@ from roadproof.io.identity import digest
 
 
 def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None:
-    """Write the tensors of a search, marked with what search they belong to.
+    """Write the tensors of a search, marked with the identity of that search.
 
     Raises:
         OutputError: the file cannot be written.
@@ -24,7 +24,7 @@ def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor]) -> None
 
 
 def load_checkpoint(path: Path, identity: str, device: torch.device) -> dict[str, Tensor] | None:
-    """The tensors of a search, or None where there are none, or they belong to another search or are damaged."""
+    """The tensors of a search; None if there is no file, it is damaged, or it belongs to another search."""
     if not path.exists():
         return None
     try:

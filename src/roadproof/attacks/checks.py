@@ -23,13 +23,13 @@ ASIDE_M, TURNED_RAD = 1.0, 0.3
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing looked at.
+    """The outcome of one self-check of a search.
 
     Args:
-        name: what.
-        passed: whether all is well.
-        finding: what was seen, in a sentence.
-        advice: what to do about it; empty where all is well.
+        name: short name of the check.
+        passed: whether the check found nothing wrong.
+        finding: what was measured, in a sentence.
+        advice: what to do about it; empty if the check passed.
     """
 
     name: str
@@ -44,11 +44,11 @@ def check_search(
     """Look for the usual reasons why a search disappoints.
 
     Args:
-        measure: what was searched on.
-        space: where.
-        search: what came of it.
-        random_patterns: patterns of the random search it is compared with, a group; 0 leaves that check out.
-        seed: of those.
+        measure: the measure on the recordings that the search made large.
+        space: the search space.
+        search: the outcome of the search.
+        random_patterns: number of random patterns per group to compare with; 0 leaves that check out.
+        seed: seed of the random patterns.
     """
     checks = [_check_determinism(measure, space, search), check_bounds(space, search)]
     if random_patterns:
@@ -57,11 +57,11 @@ def check_search(
 
 
 def check_world(measure: DeviationMeasure, pattern: Pattern) -> tuple[Check, ...]:
-    """Look whether recorded worlds may be believed: on the bare road, and over the pattern found.
+    """Check whether the recorded world can be trusted, on the bare road and over the pattern found.
 
     Args:
-        measure: what was searched on.
-        pattern: one pattern.
+        measure: the measure in the recorded world that the search made large.
+        pattern: the pattern found; one pattern, not a batch.
     """
     on_device = Pattern(
         pattern.shapes, pattern.boxes[None].to(measure.device), pattern.colours[None].to(measure.device)
@@ -104,7 +104,7 @@ def _check_determinism(measure: Measure, space: SearchSpace, search: Search) -> 
 
 
 def check_gradients(measure: RecordedMeasure, space: SearchSpace, search: Search) -> Check:
-    """Look whether gradients come through the controller, at what was found and at random patterns."""
+    """Check whether gradients reach the frames through the controller, at what was found and at random patterns."""
     _, gradient = measure.values_and_gradients(space, search.best_unit)
     _, at_start = measure.values_and_gradients(
         space, space.random((len(measure.groups), 2), torch.Generator().manual_seed(0)).to(measure.device)
@@ -127,7 +127,7 @@ def _zero_share(gradient: Float[Tensor, "*n"]) -> Float[Tensor, ""]:
 
 
 def check_bounds(space: SearchSpace, search: Search) -> Check:
-    """Look whether the bounds hold the strongest pattern back."""
+    """Check whether the strongest pattern lies on the bounds of the search space."""
     group, restart = divmod(int(search.best.argmax()), search.best.shape[1])
     shape_parameters = search.best_unit[group, restart, :, : len(space.shape_ranges)]
     stuck = float(((shape_parameters == 0) | (shape_parameters == 1)).float().mean())

@@ -36,17 +36,17 @@ class DeviationMeasure:
     """Predicted offset of patterns in a recorded world, for every group at once.
 
     Args:
-        recordings: with canvas and tracks; the drives of each weather are a world of their own.
-        controller: on `device`.
-        groups: give the sides; all drives of the set are driven in, whatever group they belong to.
-        starts: of the drives over each pattern.
-        every: steps from one picture to the next.
-        saturation_m: s.
-        device: where to drive.
-        variation: looks over which the mean is taken; None for paint and camera as recorded.
+        recordings: recordings with canvas and tracks; the drives of each weather are a world of their own.
+        controller: the controller that drives; it computes on `device`.
+        groups: groups that state the sides; whatever group they belong to, all drives of the set are driven in.
+        starts: offsets from the clean drive at which the drives over each pattern begin.
+        every: number of steps from one picture to the next, 1 or more.
+        saturation_m: the s of the formula above, metres.
+        device: torch device on which the cars drive.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
-        RecordingError: poses are not known, or the vehicle cannot be identified.
+        RecordingError: the poses of a drive are not known, or the vehicle cannot be identified.
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
     """
 
@@ -75,22 +75,22 @@ class DeviationMeasure:
         self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
 
     def thinned(self, every: int) -> DeviationMeasure:
-        """The same world with a picture every n steps: it chooses among many starts for less."""
+        """The same measure with a picture only every n steps: cheaper, for choosing among many starts."""
         thin = copy.copy(self)
         thin.every, thin.frames_evaluated = every, 0
         return thin
 
     def redraw(self, seed: int) -> None:
-        """Take the mean over other looks from now on; nothing without a variation."""
+        """Take the mean over the looks of another seed from now on; does nothing without a variation."""
         if self.variation is not None:
             self._looks = self.variation.draw(seed, self.device)
 
     def open_loop(self) -> Surrogate:
-        """The steering shift on the recorded frames."""
+        """The surrogate: the steering shift on the recorded frames."""
         return self._open_loop
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """Metres to each group's side at points of a search space, without gradients."""
+        """Mean offset to each group's side, metres, at R points per group of a search space, without gradients."""
         with torch.no_grad():
             return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
 
@@ -99,8 +99,8 @@ class DeviationMeasure:
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
         """Metres to each group's side and their gradient at R points a group of a search space.
 
-        The gradient of each point is scaled to unit length: closed loops amplify, and how much says nothing about how
-        far a step should go.
+        The gradient of each point is scaled to unit length: a closed loop amplifies, and by how much says nothing about
+        how far a step should go.
         """
         values: list[Tensor] = []
         gradients: list[Tensor] = []
@@ -130,7 +130,7 @@ class DeviationMeasure:
         return self._open_loop.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
 
     def fingerprint(self) -> str:
-        """Tells this measure from another: drives, calibration, controller, starts."""
+        """A digest of drives, calibration, controller and starts, which tells this measure from others."""
         # The variation is in the fingerprint of the steering shift.
         more = repr((self._starts, self.every, self._saturation_m, [each.vehicle for each in self.worlds]))
         return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
@@ -154,7 +154,7 @@ class DeviationMeasure:
         return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
 
     def _pictures(self, world: RecordedWorld) -> int:
-        """How many all drives over one pattern take."""
+        """Number of pictures that all drives over one pattern take."""
         return len(self._starts) * self._times * -(-world.course.count // self.every)
 
     @property

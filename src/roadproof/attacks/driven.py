@@ -41,11 +41,11 @@ SHARE = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """What a pattern did in one drive.
+    """What a pattern did in one drive in a simulator.
 
     Args:
-        steering: absolute sum of the steering's shift, steer units.
-        deviation: between the paths, metres.
+        steering: absolute value of the summed steering shift, in steer units.
+        deviation: the paper's deviation between the clean and the painted path, metres.
     """
 
     steering: float
@@ -54,15 +54,15 @@ class Effect:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InSimulator:
-    """A stretch of road in a simulator, driven in the same conditions every time, without others on the road.
+    """A stretch of road in a simulator, always driven in the same conditions and without traffic.
 
     Args:
         simulator: an open simulator.
-        scenario: the stretch of road.
-        weather: of all drives.
-        seed: of all drives.
-        keep: file that keeps the effect of every drive; a pattern it knows is not driven again. It belongs to one
-            scenario, controller, weather and seed.
+        scenario: scenario with the stretch of road to drive.
+        weather: weather of all drives, clear noon by default.
+        seed: seed of all drives, 0 by default.
+        keep: file that keeps the effect of every drive, so that a known pattern is not driven again; it belongs to one
+            scenario, controller, weather and seed. None keeps nothing.
     """
 
     simulator: Simulator
@@ -76,13 +76,12 @@ class DrivenMeasure:
     """The effect of patterns in a simulator, one drive each, to whichever side the car gives way.
 
     Args:
-        place: where and how is driven; the clean drive is made at once.
+        place: simulator, scenario and conditions; the clean drive is made at once.
         driver: a controller, or a function that is given the simulator after each reset.
-        objective: `SteeringShift()` or `PathDeviation()`; what else they say is of recordings.
+        objective: `SteeringShift()` or `PathDeviation()`; their fields concern recordings and are not used here.
 
     Raises:
-        RoadproofError: the objective is another one, or the file of drives is damaged; or as `rollout` does, for the
-            clean drive.
+        RoadproofError: another objective is asked for, the file of drives is damaged, or the clean `rollout` fails.
     """
 
     groups = (Group((), Direction.EITHER),)
@@ -109,13 +108,13 @@ class DrivenMeasure:
         self.clean = drive(None, None)
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """The value of R points; one drive each, unless the pattern has been driven over."""
+        """Values of R points of a search space; each takes one drive, unless its pattern was driven over before."""
         effects = [self.effect(space.pattern(point)) for point in unit[0]]
         found = [each.deviation if self._deviates else each.steering for each in effects]
         return torch.tensor([found], dtype=torch.float64)
 
     def effect(self, pattern: Pattern) -> Effect:
-        """What a pattern does."""
+        """The effect of a pattern, from one drive over it or from the file of drives."""
         paint = raster(pattern)
         key = hashlib.sha256(paint.tobytes()).hexdigest()[:24]
         if key not in self._known:
@@ -125,12 +124,12 @@ class DrivenMeasure:
         return self._known[key]
 
     def fingerprint(self) -> str:
-        """Tells these drives from others: the clean one, and what is taken of each."""
+        """A digest of the clean drive and the objective, which tells this measure from others."""
         told = hashlib.sha256(path_of(self.clean).tobytes() + self.clean.steer.tobytes())
         return f"{told.hexdigest()} {self._deviates}"
 
     def _enough(self) -> Callable[[Observation], bool]:
-        """Ends a drive behind the last frame that either effect looks at: a car off the road need not wait there."""
+        """A condition that ends a drive after the last frame that either effect needs, for a car off the road."""
         canvas = self._place.scenario.canvas
         last = max(_counted_frames(self.clean), passage(path_of(self.clean), canvas).stop)
         seen = 0
@@ -144,7 +143,7 @@ class DrivenMeasure:
 
 
 def effect_of(clean: Episode, painted: Episode, canvas: CanvasPlacement) -> Effect:
-    """What the paint changed between two drives that differ in it alone."""
+    """The effect of the paint, from two drives that differ in the paint alone."""
     frames = min(_counted_frames(clean), painted.steer.size)
     shift = painted.steer[:frames] - clean.steer[:frames]
     return Effect(steering=abs(float(shift.sum())), deviation=passage_deviation_m(clean, painted, canvas))
@@ -156,7 +155,7 @@ def _counted_frames(clean: Episode) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """Effects by digest of the paint; a list of three values each in their file."""
+    """The file of effects: the key of each is a digest of its paint."""
 
     drives: dict[str, Effect]
 

@@ -29,17 +29,17 @@ from roadproof.search_space import SearchSpace, derived_seed
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """Steps of one size, on the same frames.
+    """A part of a search: steps of one size on the same frames, from a number of starts.
 
     Args:
-        starts: of every group: the best of the rung before, and random ones where those are fewer.
-        iterations: steps of each.
-        learning_rate: of Adam, in units of each parameter's range.
-        every: the share of the frames used: every n-th of each drive; in the recorded world, of the steps.
-        open_loop: climb the steering shift on recorded frames, whatever the search makes large.
+        starts: number of starts of every group: the best of the rung before, and random points if those are fewer.
+        iterations: number of steps of each start.
+        learning_rate: Adam's learning rate, as a share of each parameter's range.
+        every: use every n-th frame of each drive; in the recorded world, a picture every n-th step. 1 uses all.
+        open_loop: whether to climb the steering shift on recorded frames, whatever the objective of the search.
 
     Raises:
-        RoadproofError: a number is not positive.
+        RoadproofError: `starts`, `iterations`, `learning_rate` or `every` is not positive.
     """
 
     starts: int
@@ -53,12 +53,12 @@ class Rung:
             raise RoadproofError(f"{self} has a number that is too small; expected 1 or more, and a rate above 0")
 
     def view(self, measure: RecordedMeasure) -> RecordedMeasure:
-        """What it climbs of a measure; the measure itself where it looks at all of it."""
+        """The measure that this rung climbs: thinned or open loop, or the measure itself if it uses all frames."""
         climbed = measure.open_loop() if self.open_loop else measure
         return climbed if self.every == 1 else climbed.thinned(self.every)
 
     def goes_on(self, before: Rung) -> bool:
-        """Whether it takes smaller steps with the same starts on the same frames as another rung."""
+        """Whether this rung takes smaller steps than another with the same starts on the same frames."""
         return (self.starts, self.every, self.open_loop) == (before.starts, before.every, before.open_loop)
 
 
@@ -68,7 +68,7 @@ Ladder = tuple[Rung, ...]
 def dropping(
     starts: int, iterations: int, learning_rate: float, *, after: tuple[float, float], factor: float
 ) -> Ladder:
-    """Steps that become smaller by a factor twice, after shares of them."""
+    """Rungs whose learning rate falls by a factor twice, after the given shares of the iterations."""
     first, second = (max(1, int(iterations * share + 1e-9)) for share in after)
     parts = (first, second - first, iterations - second)
     rates = (learning_rate * factor**k for k in range(3))
@@ -77,13 +77,13 @@ def dropping(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """Where a search came to.
+    """The outcome of a search.
 
     Args:
-        best_unit: the best point of every group and start.
-        best: its value.
-        history: values at every iteration of the last rungs, those that have all frames and the last number of starts;
-            without gradients the best so far, (calls, 1, 1).
+        best_unit: best point of every group and start, in the unit cube, (G, R, K, N).
+        best: value at each best point, (G, R).
+        history: value at every iteration of the last rungs, those with all frames and the final number of starts, (i,
+            g, c); without gradients the best value so far, (calls, 1, 1).
     """
 
     best_unit: Float[Tensor, "g r k n"]
@@ -95,10 +95,9 @@ class Running(TypedDict, total=False):
     """How a search is run, whatever its method.
 
     Args:
-        seed: of everything random; required.
-        starts: points to begin at, for each group in turn; random ones make up what they lack.
-        checkpoint: a file that keeps the search after every step; where it is there already and belongs to the same
-            search, that search goes on, to the same result.
+        seed: seed of everything random; required.
+        starts: points to begin at, one tensor (S, K, N) per group; random points fill the remaining starts.
+        checkpoint: file that keeps the search after every step and from which the same search goes on; None for none.
         on_step: called after every step with its number and the best value so far.
     """
 
@@ -114,11 +113,11 @@ def gradopt(
     """Make a measure large over a search space.
 
     Args:
-        measure: what is made large, for all groups.
-        space: where to look.
-        rungs: steps and rates.
+        measure: the measure that is made large, for all groups.
+        space: the search space.
+        rungs: the rungs of the search in order, each with its starts, iterations and learning rate.
         momentum: Adam's β₁; 0.9 is Adam's own, the released code has 0.
-        **running: see `Running`.
+        **running: seed, starts, checkpoint and callback; see `Running`.
 
     Raises:
         RoadproofError: the controller answers NaN to a composited frame.
@@ -168,7 +167,7 @@ def _starts(
     seed: int,
     given: Sequence[Float[Tensor, "s k n"]],
 ) -> Float[Tensor, "g r k n"]:
-    """Random points, the first of them replaced by those given."""
+    """Random points of every group, of which the first are replaced by the points given."""
     unit = space.random((len(measure.groups), count), torch.Generator().manual_seed(seed))
     for group, points in enumerate(given):
         unit[group, : len(points)] = points[:count]
@@ -182,7 +181,7 @@ def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:
 
 
 def _next_rung(state: dict[str, Tensor], space: SearchSpace, before: Rung, rung: Rung, seed: int) -> dict[str, Tensor]:
-    """Where the best of every group are; random points make up what they lack."""
+    """State of the next rung, begun at the best points of every group; random points fill the remaining starts."""
     if rung.goes_on(before):
         kept = ("best_unit", "best", "history")
         return {name: state[name] for name in kept} | {"unit": state["best_unit"], "done": torch.tensor(0)}

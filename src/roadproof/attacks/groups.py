@@ -30,10 +30,10 @@ class Direction(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Drives attacked together, and where to.
+    """Drives that are attacked together, and the side the attack pushes to.
 
     Args:
-        pushes: which drives belong to it.
+        pushes: kinds of drives that belong to the group; empty for drives in a simulator.
         direction: "right" or "left" for the paper's Group, "either" for Group-All, Random and a single drive.
     """
 
@@ -90,9 +90,9 @@ def divergence(shift: Float[Tensor, "*b f"], lengths: Sequence[int], direction: 
     """δ, per frame: how far steering moved where the attack wants it.
 
     Args:
-        shift: steer on composited minus steer on clean frames, the group's drives one after another.
-        lengths: frames of each drive.
-        direction: "right" counts right as positive, "left" left; "either" takes each drive's absolute sum.
+        shift: steer on composited minus steer on clean frames, one drive of the group after another, (*b, F).
+        lengths: number of frames of each drive; they sum to F.
+        direction: "right" counts right as positive, "left" counts left; "either" takes the absolute sum of each drive.
 
     Returns:
         The sum over frames divided by their number, so that groups of different length compare; the paper's loss is

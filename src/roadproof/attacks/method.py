@@ -16,20 +16,20 @@ from roadproof.search_space import SearchSpace
 
 
 class Method:
-    """A way to search the pattern of largest value; by gradient, where a kind does not say otherwise."""
+    """A way to search for the pattern of largest value; it uses gradients unless a subclass says otherwise."""
 
     __slots__ = ()
     word: ClassVar[str]
     by_gradient: ClassVar[bool] = True
 
     def steps(self, objective: Objective) -> int:
-        """How often `on_step` is called in a search for an objective."""
+        """How often `on_step` is called during a search for an objective."""
         raise NotImplementedError
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """Drives attacked together, where nothing else is said.
+        """The groups of drives attacked together by default.
 
-        By gradient the paper's two sides, each apart, where drives were pushed to both; else all drives.
+        With gradients the paper's two sides, each apart, if drives were pushed to both; otherwise all drives.
         """
         return (RIGHT_GROUP, LEFT_GROUP) if recordings.has_both_sides else parse_groups("all", recordings)
 
@@ -42,18 +42,18 @@ class Method:
         *,
         device: torch.device | str,
     ) -> RecordedMeasure:
-        """What it makes large of an objective: the objective's own measure.
+        """The measure that this method makes large for an objective; by default the objective's own.
 
         Raises:
-            RoadproofError: it does not know that objective.
+            RoadproofError: the method cannot search for that objective.
         """
         return objective.measure(recordings, controller, groups, device=device)
 
     def check_space(self, space: SearchSpace) -> None:
-        """See that it can search these patterns; called before any work begins.
+        """Check that the method can search these patterns; called before any work begins.
 
         Raises:
-            RoadproofError: it cannot; the message says what to change.
+            RoadproofError: the method cannot search these patterns; the message says what to change.
         """
         del space
 

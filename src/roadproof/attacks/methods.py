@@ -32,12 +32,12 @@ class GradOpt(Method):
     """Exact gradients, and starts that compete (successive halving) before the best of them are searched to the end.
 
     Args:
-        iterations: steps of the search proper; 100 for a steering shift and 32 for a path deviation by default.
-        restarts: starts of every group that are searched to the end.
-        halving: whether many starts compete for those places; else they are random.
+        iterations: number of steps of the full search; by default 100 for a steering shift and 32 for a path deviation.
+        restarts: number of starts per group that are searched to the end.
+        halving: whether many starts compete for these places (successive halving); otherwise the starts are random.
 
     Raises:
-        RoadproofError: a number is below 1.
+        RoadproofError: `iterations` or `restarts` is below 1.
     """
 
     word: ClassVar[str] = "gradopt"
@@ -54,7 +54,7 @@ class GradOpt(Method):
             )
 
     def ladder(self, objective: Objective) -> Ladder:
-        """Its rungs for an objective.
+        """The rungs of the search for an objective.
 
         A search in the recorded world takes smaller steps, since a loop amplifies. It begins where the steering shift
         is large: a controller that holds its lane well brings the car back from what a random pattern does, and the
@@ -67,11 +67,11 @@ class GradOpt(Method):
         return (*first, *proper) if self.halving else proper
 
     def steps(self, objective: Objective) -> int:
-        """Iterations of all rungs."""
+        """Number of iterations of all rungs together."""
         return sum(rung.iterations for rung in self.ladder(objective))
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
-        """Climb its ladder."""
+        """Climb all rungs of the search by gradient."""
         return gradopt(cast("RecordedMeasure", measure), space, self.ladder(objective), **running)
 
 
@@ -87,7 +87,7 @@ class _OnGrid(Rung):
     grid: float = 1.0
 
     def view(self, measure: RecordedMeasure) -> RecordedMeasure:
-        """The published measure on that grid."""
+        """The published measure, linearised on this rung's grid."""
         return cast("PublishedMeasure", measure).on_grid(self.grid)
 
 
@@ -100,11 +100,11 @@ class Published(Method):
     or degrees at the first rate and of 1 after it, as the released code was run.
 
     Args:
-        masks: "binary", those of the released code; "antialiased", those of the paper's text.
-        restarts: of every group; the paper's text has four, its code one.
+        masks: "binary", the masks of the released code, or "antialiased", those of the paper's text.
+        restarts: number of starts per group; the paper's text has four, its code one.
 
     Raises:
-        RoadproofError: a value makes no sense.
+        RoadproofError: `masks` is another word, or `restarts` is below 1.
 
     References:
         "Attack Optimization" of the paper; run.sh of the released code. There TensorFlow's Adam corrects its bias
@@ -121,13 +121,13 @@ class Published(Method):
             raise RoadproofError(f"masks is {self.masks!r}, expected {' or '.join(MASKS)}")
 
     def steps(self, objective: Objective) -> int:
-        """250."""
+        """The number of iterations, 250."""
         del objective
         return sum(rung.iterations for rung in self.ladder)
 
     @property
     def ladder(self) -> Ladder:
-        """Its three rates."""
+        """The rungs of the three published learning rates."""
         stages = ((100, 0.1, 10.0), (100, 0.01, 1.0), (50, 0.001, 1.0))
         return tuple(_OnGrid(self.restarts, count, rate, grid=grid) for count, rate, grid in stages)
 
@@ -140,20 +140,20 @@ class Published(Method):
         *,
         device: torch.device | str,
     ) -> PublishedMeasure:
-        """The published divergence.
+        """The published divergence, a sum over frames, as the measure.
 
         Raises:
-            RoadproofError: another objective is asked for.
+            RoadproofError: the objective is not a steering shift without variation.
         """
         if not isinstance(objective, SteeringShift) or objective.variation is not None:
             raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
         return PublishedMeasure(recordings, controller, groups, masks=self.masks, device=device)
 
     def check_space(self, space: SearchSpace) -> None:
-        """See that all of it was published.
+        """Check that the patterns are those of the publication: rectangles of a published family, without limits.
 
         Raises:
-            PatternError: it has limits, or another family.
+            PatternError: the space has limits on paint, or a family that was not published.
         """
         if not space.family.startswith("published") or space.max_painted_share is not None or space.limits is not None:
             raise PatternError(
@@ -162,7 +162,7 @@ class Published(Method):
             )
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
-        """Climb as published."""
+        """Search by gradient as published."""
         del objective
         return gradopt(cast("RecordedMeasure", measure), space, self.ladder, momentum=0.0, **running)
 
@@ -174,10 +174,10 @@ METHODS: dict[str, type[Any]] = {
 
 
 def method_of(word: str, **given: object) -> Method:
-    """A method from its word and values of its fields.
+    """The method of a word such as "gradopt", with values for its fields.
 
     Raises:
-        RoadproofError: there is none of that word, it has no such field, or a value makes no sense.
+        RoadproofError: no method has that word, it has no such field, or a value is out of range.
     """
     if word not in METHODS:
         raise RoadproofError(f"method is {word!r}, expected one of {', '.join(METHODS)}")
@@ -190,5 +190,5 @@ def method_of(word: str, **given: object) -> Method:
 
 
 def stored(method: Method) -> dict[str, Any]:
-    """A method as its word and fields, for files."""
+    """A method as its word and its fields, as files store it."""
     return {"method": method.word, **asdict(cast("Any", method))}

@@ -32,66 +32,66 @@ each of some drives that differ by as little as a prediction may be wrong."""
 
 @runtime_checkable
 class Measure(Protocol):
-    """Values patterns for every group at once; all that a search without gradients asks for."""
+    """Gives patterns their values, for every group at once; all that a search without gradients needs."""
 
     groups: tuple[Group, ...]
     frames_evaluated: int
 
     @property
     def device(self) -> torch.device:
-        """Where patterns are valued."""
+        """The torch device on which patterns are valued."""
         ...
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """Values of R points a group, without gradients."""
+        """Values (G, R) of R points per group of a search space, without gradients."""
         ...
 
     def fingerprint(self) -> str:
-        """Tells this measure from every other, so that an interrupted search goes on with its own."""
+        """A text that tells this measure from every other, so that an interrupted search goes on only with its own."""
         ...
 
 
 @runtime_checkable
 class RecordedMeasure(Measure, Protocol):
-    """A measure on recordings: it has gradients, which `gradopt` climbs, and tells more of what was found."""
+    """A measure on recordings: it also has gradients, for `gradopt` to climb, and predictions for what was found."""
 
     def thinned(self, every: int) -> RecordedMeasure:
         """A cheaper measure, on every n-th frame or step, whose order of starts is much the same."""
         ...
 
     def open_loop(self) -> RecordedMeasure:
-        """The steering shift on the same recorded frames: where a search may begin."""
+        """The steering shift on the same recorded frames, from which a search may begin."""
         ...
 
     def values_and_gradients(
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
-        """Values of R points a group, and the directions in which they rise."""
+        """Values (G, R) of R points per group, and their gradients or the directions in which they rise."""
         ...
 
     def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Readings:
-        """What is told of R points a group in the end."""
+        """Steering shift and predicted deviation of R points per group, for the result of a search."""
         ...
 
 
 @runtime_checkable
 class Varied(Protocol):
-    """A measure that may take the mean over other looks at every step."""
+    """A measure that can take its mean over new looks at every step."""
 
     variation: Variation | None
 
     def redraw(self, seed: int) -> None:
-        """Take the mean over the looks of a seed from now on."""
+        """Take the mean over the looks drawn from a seed from now on."""
         ...
 
 
 @runtime_checkable
 class Objective(Protocol):
-    """What a search makes large."""
+    """What a search makes large, such as a steering shift or a path deviation."""
 
     @property
     def name(self) -> str:
-        """In words, for results and reports."""
+        """The name of the objective in words, for results and reports."""
         ...
 
     def measure(
@@ -100,7 +100,7 @@ class Objective(Protocol):
         """The measure of patterns on a set of recordings.
 
         Raises:
-            RoadproofError: recordings or controller do not allow it.
+            RoadproofError: the recordings or the controller do not allow this objective.
         """
         ...
 
@@ -110,7 +110,7 @@ class SteeringShift:
     """How far steering moves on recorded frames, open loop, as published; its value is steer units a frame.
 
     Args:
-        variation: looks over which its mean is taken; None for paint and camera as recorded.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
     """
 
     # Runs know their objective by its repr, which is older than variations; those are told beside it.
@@ -118,13 +118,13 @@ class SteeringShift:
 
     @property
     def name(self) -> str:
-        """In words, for results and reports."""
+        """The name of the objective in words, for results and reports."""
         return "steering shift" + _over(self.variation)
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
     ) -> Surrogate:
-        """The surrogate on the groups' frames."""
+        """The surrogate, which measures the steering shift on the groups' recorded frames."""
         return Surrogate(recordings, controller, groups, device=device, variation=self.variation)
 
 
@@ -133,13 +133,13 @@ class PathDeviation:
     """How far aside the car goes in the recorded world, closed loop; its value is metres.
 
     Args:
-        starts: of the drives over each pattern; several make what is found less particular to one way.
-        every: steps from one picture to the next while searching; a prediction looks at every step.
-        saturation_m: an offset of so many metres counts hardly less than a larger one.
-        variation: looks over which its mean is taken; None for paint and camera as recorded.
+        starts: offsets from the clean drive at which drives begin, one or more; several make the result more general.
+        every: number of steps from one picture to the next during the search; a prediction has a picture at every step.
+        saturation_m: offset in metres, above 0, beyond which a larger one hardly counts more.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
-        RoadproofError: there is no start, or a number is not positive.
+        RoadproofError: `starts` is empty, or `every` or `saturation_m` is not positive.
     """
 
     starts: tuple[Start, ...] = (Start(),)
@@ -156,13 +156,13 @@ class PathDeviation:
 
     @property
     def name(self) -> str:
-        """In words, for results and reports."""
+        """The name of the objective in words, for results and reports."""
         return "path deviation" + _over(self.variation)
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
     ) -> DeviationMeasure:
-        """The recorded world of the whole set."""
+        """The measure in the recorded world of the whole set, closed loop."""
         return DeviationMeasure(
             recordings,
             controller,
@@ -180,10 +180,10 @@ def _over(variation: Variation | None) -> str:
 
 
 def varied(objective: Objective, variation: Variation | None) -> Objective:
-    """An objective in expectation over a variation; itself where there is none.
+    """The objective in expectation over a variation; unchanged if the variation is None.
 
     Raises:
-        RoadproofError: it is one of the user's own, which has to take the mean itself.
+        RoadproofError: the objective is the user's own, which has to take the mean itself.
     """
     if variation is None:
         return objective
@@ -193,7 +193,7 @@ def varied(objective: Objective, variation: Variation | None) -> Objective:
 
 
 def variation_of(objective: Objective) -> Variation | None:
-    """The variation of an objective; None where it has none, or is the user's own."""
+    """The variation of an objective; None if it has none, or is the user's own."""
     return objective.variation if isinstance(objective, SteeringShift | PathDeviation) else None
 
 

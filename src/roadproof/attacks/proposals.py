@@ -61,9 +61,9 @@ def published_bo(ranges: Float[np.ndarray, " d"], random_calls: int, seed: int) 
     points, theirs began at others.
 
     Args:
-        ranges: of each parameter in natural units, beginning at 0.
-        random_calls: points drawn uniformly before the first guided one.
-        seed: theirs was 42.
+        ranges: range of each parameter in natural units, all beginning at 0, (D,).
+        random_calls: number of points drawn uniformly before the first guided one.
+        seed: seed of everything random; the authors' was 42.
     """
     try:
         from bayes_opt import TargetSpace, acquisition
@@ -137,10 +137,10 @@ def cma_es(dimensions: int, seed: int, given: int = 0) -> Propose:
     """Covariance matrix adaptation, begun at the centre of the cube with a sixth of its side.
 
     Args:
-        dimensions: of the cube.
-        seed: of what it draws.
-        given: how many of the trials come first and are another search's; it then begins at the best of them with a
-            thirtieth of the side.
+        dimensions: number of dimensions of the unit cube.
+        seed: seed of the points it draws.
+        given: number of first trials that come from another search; if above 0, CMA-ES begins at the best of them with
+            a thirtieth of the side.
     """
     try:
         from cmaes import CMA

@@ -28,14 +28,14 @@ class PublishedMeasure:
     renderings at both, all other parameters as they are.
 
     Args:
-        recordings: the drives.
-        controller: on `device`.
-        groups: drives attacked together; each has patterns of its own.
+        recordings: calibrated recordings of the drives.
+        controller: the controller that is attacked; it computes on `device`.
+        groups: groups of drives, each attacked together with patterns of its own.
         masks: "binary" as the released code has them, "antialiased" as the paper's text says.
-        device: where frames are composited.
+        device: torch device on which frames are composited.
 
     Raises:
-        ControllerError, RecordingError: as `Surrogate`.
+        ControllerError, RecordingError: for the reasons that `Surrogate` names.
 
     References:
         "Computing Adversarial Perturbations" of the paper, eqs. sgrad and cgrad.
@@ -59,21 +59,21 @@ class PublishedMeasure:
         self._views: dict[bool, list[MaskedView]] = {}
 
     def on_grid(self, grid: float) -> PublishedMeasure:
-        """The same, linearised between values so many px or degrees apart."""
+        """The published measure, linearised between parameter values `grid` px or degrees apart."""
         other = copy.copy(self)
         other.grid, other.frames_evaluated = grid, 0
         return other
 
     def thinned(self, every: int) -> Surrogate:
-        """The shift on every n-th frame."""
+        """The surrogate on every n-th frame of each drive."""
         return self._exact.thinned(every)
 
     def open_loop(self) -> Surrogate:
-        """The shift itself, with exact gradients."""
+        """The surrogate, which has exact gradients of the steering shift."""
         return self._exact
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """δ at points of the published search space."""
+        """δ at R points per group of the published search space, (G, R)."""
         with torch.no_grad():
             rows = [[self._shown(space, group, point)[0] for point in points] for group, points in enumerate(unit)]
         return torch.stack([torch.stack(row) for row in rows])
@@ -89,12 +89,12 @@ class PublishedMeasure:
         return values, gradients
 
     def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> tuple[Float[Tensor, "g r"], None]:
-        """The mean shift a frame; where the car goes is not known."""
+        """The mean steering shift per frame; None for the deviation, which this measure does not know."""
         lengths = unit.new_tensor([sum(lengths) for lengths in self._exact.lengths])
         return self.values(space, unit) / lengths[:, None], None
 
     def fingerprint(self) -> str:
-        """Tells this measure from every other."""
+        """A digest that tells this measure from every other."""
         return f"published {self._masks} {self._exact.fingerprint()}"
 
     def _shown(
@@ -112,7 +112,7 @@ class PublishedMeasure:
         return value, view, masks, colours, pixels
 
     def _climbed(self, space: SearchSpace, group: int, point: Float[Tensor, "k n"]) -> tuple[Tensor, Tensor]:
-        """δ of one point and its gradient."""
+        """δ of one point, and the paper's approximation of its gradient."""
         value, view, masks, colours, pixels = self._shown(space, group, point)
         on_pixels, on_colours = torch.autograd.grad(value, (pixels, colours))
         with torch.no_grad():

@@ -25,12 +25,12 @@ from roadproof.search_space import SearchSpace
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Cost:
-    """What an attack took.
+    """The cost of an attack.
 
     Args:
-        controller_frames: frames the controller was shown, forward or forward and backward.
-        seconds: wall time of the search, without loading and checks.
-        simulator_calls: drives in a simulator, the clean one among them; 0 on recordings.
+        controller_frames: number of frames the controller was shown, forward or forward and backward.
+        seconds: wall time of the search in seconds, without loading and checks.
+        simulator_calls: number of drives in a simulator, the clean one included; 0 on recordings.
     """
 
     controller_frames: int
@@ -40,17 +40,17 @@ class Cost:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """Where one start of the search came to.
+    """The best pattern of one start of a search.
 
     Args:
-        pattern: its best.
-        group: the drives it was found on.
-        surrogate_shift: its mean steering shift a frame towards that group's side, on recorded frames; None where there
-            were none.
-        predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
-            steering; None where nothing was driven there.
-        predicted_range_m: least and most of it over those.
-        driven: what it did in the drive that chose it; None where nothing was driven in a simulator.
+        pattern: the best pattern of this start.
+        group: name of the group of drives that it was found on, such as "clean+right".
+        surrogate_shift: mean steering shift per frame towards that group's side on recorded frames, in steer units;
+            None without recorded frames.
+        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors
+            of steering; None if the search did not drive there.
+        predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
+        driven: effect in the drive that chose the pattern; None if nothing was driven in a simulator.
     """
 
     pattern: Pattern
@@ -73,24 +73,25 @@ class AttackResult:
         pattern: the strongest pattern.
         group: the group it was found for, e.g. "clean+right".
         objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
-        surrogate_shift: its mean steering shift a frame towards that group's side, in steer units; None where there
-            were no recorded frames.
-        predicted_m: the paper's deviation in the recorded world, mean over recorded weathers and small errors of
-            steering; None where the search did not drive there.
-        predicted_range_m: least and most of it over those.
-        driven: what the strongest pattern did in the drive that chose it; None where nothing was driven in a simulator.
-        by_group: the best value of every group, in the objective's unit: steer a frame, or metres; the published
-            method's is a sum over frames.
-        candidates: every start's best, the strongest first: by the least predicted deviation where there is one. The
-            steering shift ranks only coarsely, so that driving over its first few finds a stronger one than the first.
+        surrogate_shift: mean steering shift of the pattern per frame towards that group's side, in steer units; None
+            without recorded frames.
+        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors
+            of steering; None if the search did not drive there.
+        predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
+        driven: effect of the strongest pattern in the drive that chose it; None if nothing was driven in a simulator.
+        by_group: best value of every group, in the objective's unit: steer units per frame, or metres; for the
+            published method a sum over frames.
+        candidates: best pattern of every start, the strongest first, by the least predicted deviation if there is one.
+            The steering shift ranks only coarsely, so that driving over the first few finds a stronger one than the
+            first.
         history: value at every iteration after the first rungs, (iterations, groups, restarts); without gradients the
-            best so far, (calls, 1, 1).
-        cost: what it took.
-        checks: what the attack found when it distrusted itself.
-        space: where it looked.
-        method: how it searched.
-        seed: of everything random.
-        conspicuousness: of the strongest pattern, on this road; None in results older than the word.
+            best value so far, (calls, 1, 1).
+        cost: controller frames, seconds and simulator calls that the attack took.
+        checks: outcomes of the attack's self-checks.
+        space: the search space.
+        method: the search method.
+        seed: seed of everything random.
+        conspicuousness: how conspicuous the strongest pattern is on this road; None in results of versions without it.
     """
 
     pattern: Pattern
@@ -129,7 +130,7 @@ class AttackResult:
 
         Args:
             folder: folder of the result.
-            made_of: what tells the search from another (`kept_attack`).
+            made_of: what identifies the search, by name (see `kept_attack`); None outside of it.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -169,7 +170,7 @@ class AttackResult:
 
 
 class _Ranked(msgspec.Struct, array_like=True, frozen=True):
-    """A candidate but for its pattern, as a list; older results lack the last ones."""
+    """A candidate without its pattern, as a list; results of earlier versions lack the last fields."""
 
     group: str
     surrogate_shift: float | None
@@ -180,7 +181,7 @@ class _Ranked(msgspec.Struct, array_like=True, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """The candidates of result.json."""
+    """The candidates as result.json lists them."""
 
     candidates: tuple[_Ranked, ...]
 
@@ -194,7 +195,7 @@ def _method(stated: dict[str, Any]) -> Method:
 
 
 def _of_first_format(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The method, which was a schedule and a number of restarts."""
+    """The method of a result in the first format, from the schedule and the number of restarts that stood there."""
     schedule: dict[str, Any] = content["schedule"] if isinstance(content.get("schedule"), dict) else {}
     halving = bool(schedule.get("heats"))
     stated = {"iterations": schedule.get("iterations"), "restarts": content.get("restarts"), "halving": halving}

@@ -21,11 +21,11 @@ class ShownDrive:
     """One recorded drive without and with a pattern composited in.
 
     Args:
-        name: of the drive.
-        clean: its frames.
-        painted: the same with the pattern.
-        clean_steer: the controller's answers to the clean frames.
-        painted_steer: its answers to the composited ones.
+        name: name of the drive.
+        clean: frames of the drive without paint, RGB, (F, H, W, 3).
+        painted: the same frames with the pattern composited in, (F, H, W, 3).
+        clean_steer: the controller's answers to the clean frames, in steer units, positive to the right, (F,).
+        painted_steer: the controller's answers to the composited frames, in steer units, (F,).
     """
 
     name: str
@@ -36,7 +36,7 @@ class ShownDrive:
 
     @property
     def mean_shift(self) -> float:
-        """How far steering moved, a frame; positive = right."""
+        """Mean shift of steering per frame, in steer units, positive to the right."""
         return float((self.painted_steer - self.clean_steer).mean())
 
 
@@ -48,14 +48,14 @@ def show_pattern(
     *,
     device: torch.device | str = "cpu",
 ) -> tuple[ShownDrive, ...]:
-    """Composite a pattern into the drives of a group and ask the controller.
+    """Composite a pattern into the drives of a group and ask the controller about the frames.
 
     Args:
-        pattern: one pattern.
-        recordings: the drives.
-        controller: on `device`.
-        group: which drives.
-        device: where to composite.
+        pattern: the pattern to composite; one pattern, not a batch.
+        recordings: calibrated recordings of the drives.
+        controller: the controller that is asked; it computes on `device`.
+        group: the group whose drives are shown.
+        device: torch device on which frames are composited.
     """
     surrogate = Surrogate(recordings, controller, [group], device=device)
     view = surrogate.views[0]

@@ -37,11 +37,11 @@ class Surrogate:
     """Divergence of patterns on a set of recordings, for every group at once, with gradients.
 
     Args:
-        recordings: the drives.
-        controller: on `device`; it is given float32 frames, whatever it computes in.
-        groups: drives attacked together; each has patterns of its own.
-        device: where frames are composited.
-        variation: looks over which the shift's mean is taken; None for paint and camera as recorded.
+        recordings: calibrated recordings of the drives.
+        controller: the controller that is attacked, on `device`; it is given float32 frames, whatever it computes in.
+        groups: groups of drives, each attacked together with patterns of its own.
+        device: torch device on which frames are composited.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
@@ -87,16 +87,16 @@ class Surrogate:
 
     @property
     def device(self) -> torch.device:
-        """Where frames are composited."""
+        """The torch device on which frames are composited."""
         return self.views[0].frames.device
 
     def thinned(self, every: int) -> Surrogate:
-        """The same on every n-th frame of each drive."""
+        """The surrogate on every n-th frame of each drive."""
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
         return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
 
     def redraw(self, seed: int) -> None:
-        """Take the mean over other looks from now on; nothing without a variation."""
+        """Take the mean over the looks of another seed from now on; does nothing without a variation."""
         if self.variation is None:
             return
         self._looks = looks = self.variation.draw(seed, self.device)
@@ -111,14 +111,14 @@ class Surrogate:
             ]
 
     def open_loop(self) -> Surrogate:
-        """Itself."""
+        """The surrogate itself, since it is open loop already."""
         return self
 
     def divergences(self, patterns: Sequence[Pattern]) -> Float[Tensor, "g r"]:
         """δ per frame of R patterns for each group, differentiable in the patterns.
 
         Args:
-            patterns: one batch of R patterns a group.
+            patterns: one batch of R patterns per group.
         """
         shifts = self.shifts(patterns)
         return torch.stack(
@@ -169,11 +169,11 @@ class Surrogate:
         return torch.cat(values, 1), torch.cat(gradients, 1)
 
     def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> tuple[Float[Tensor, "g r"], None]:
-        """The shift itself; where the car goes is not known."""
+        """The mean steering shift per frame; None for the deviation, which the surrogate does not know."""
         return self.values(space, unit), None
 
     def fingerprint(self) -> str:
-        """Tells this surrogate from another: drives, calibration, controller (by its clean answers)."""
+        """A digest of drives, calibration and the controller's clean answers that tells this surrogate from others."""
         told = (self.groups, self.lengths) if self.variation is None else (self.groups, self.lengths, self.variation)
         digest = hashlib.sha256(repr(told).encode())
         for view, steer in zip(self.views, self.clean_steer, strict=True):

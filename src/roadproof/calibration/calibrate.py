@@ -48,7 +48,7 @@ METHODS = tuple(Method)
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What came of a calibration, and its place in the folder of a run.
+    """A finished calibration, and its place in the folder of a run.
 
     RUN/calibration/report.json   how good it is
     RUN/recordings/               the recordings; there when the calibration is finished
@@ -60,26 +60,25 @@ class Calibrated:
     """The method and a digest of every drive, which tell it from another calibration."""
 
     def save(self, run: Path) -> None:
-        """Write both, the recordings last, since they say that it is finished.
+        """Write report and recordings, the recordings last, since their presence says that the calibration is finished.
 
         Raises:
-            OutputError: they cannot be written.
+            OutputError: the files cannot be written.
         """
         CalibrationReport.FILE.write(run / "calibration" / "report.json", self.report, made_of=self.made_of)
         save_recordings(self.recordings, run / "recordings")
 
     @staticmethod
     def kept(run: Path, drives: Drives, method: Method) -> Calibrated | None:
-        """Read what `save` wrote; None where the run has not been calibrated.
+        """Read what `save` wrote; None if the run has not been calibrated.
 
         Args:
-            run: folder of the run.
-            drives: the drives that it is to be a calibration of.
-            method: how they are to be calibrated.
+            run: path of the run folder.
+            drives: drives of which it must be a calibration.
+            method: calibration method with which it must have been made.
 
         Raises:
-            CalibrationError, RecordingError: a file is missing or damaged, or it is a calibration of other drives, or
-                by another method.
+            CalibrationError, RecordingError: a file is missing or damaged, or drives or method are not the stored ones.
         """
         if not (run / "recordings").exists():
             return None
@@ -99,7 +98,7 @@ class Calibrated:
 
 
 def _same_frames(recording: Recording, drives: Drives) -> bool:
-    """Whether what was calibrated is frames of the drive of that name; a calibration may leave some out."""
+    """Whether the frames of a calibrated recording are those of the drive of its name; it may lack some."""
     drive = next((drive for drive in drives.drives if drive.name == recording.name), None)
     if drive is None:
         return False
@@ -121,7 +120,7 @@ class _Geometry:
 
 
 def replays_needed(drives: Drives, method: Method) -> int:
-    """Calls of the simulator on top of the recorded drives."""
+    """Number of replays in the simulator that a calibration takes on top of the recorded drives."""
     count = len(drives.drives)
     return RUNS * count + len(PAINTS) if method is Method.PUBLISHED else 2 * count
 
@@ -139,12 +138,12 @@ def calibrate(
     Args:
         simulator: an open simulator, the one the drives were recorded in.
         drives: what `drives.record` made.
-        method: how.
-        folder: keeps every replay; those it holds already are not driven again.
-        on_call: called with the number of replays so far.
+        method: calibration method, two-paint by default.
+        folder: folder that keeps every replay; those it holds already are not driven again. None keeps nothing.
+        on_call: called with the number of replays so far, at first 0.
 
     Raises:
-        CalibrationError: a replay goes astray, or the calibration of a drive is bad; the message says why.
+        CalibrationError: a replay goes astray, or the calibration of a drive cannot be trusted; the message says why.
         SimulatorError, ScenarioError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
@@ -209,7 +208,7 @@ def _from_paints(paints: Paints) -> _Geometry:
 
 
 def _check(drive: Drive, geometry: _Geometry) -> None:
-    """Refuse what an attack should not be built on."""
+    """Refuse a drive's calibration on which an attack should not be built."""
     count, left = len(drive.frames), len(geometry.found)
     if left < LEAST_SHARE * count:
         first = next(iter(geometry.dropped.values()))

@@ -50,10 +50,10 @@ class PoseDoubt:
     """How far a pose may be off: standard deviations along the camera's axes (right, down, forward).
 
     Args:
-        common_rad: rotation common to a drive, about each axis.
-        common_m: translation common to a drive.
-        own_rad: rotation of each frame by itself.
-        own_m: translation of each frame by itself.
+        common_rad: rotation about each axis that is common to a drive, radians.
+        common_m: translation along each axis that is common to a drive, metres.
+        own_rad: rotation about each axis of each frame by itself, radians.
+        own_m: translation along each axis of each frame by itself, metres.
     """
 
     common_rad: tuple[float, float, float] = (0.01, 0.01, 0.01)
@@ -63,7 +63,7 @@ class PoseDoubt:
 
     @property
     def precisions(self) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6 6"]]:
-        """Of the common and the own corrections."""
+        """The inverse covariances of the common and of each frame's own correction."""
         common, own = (*self.common_rad, *self.common_m), (*self.own_rad, *self.own_m)
         return np.diag(1 / np.square(common)), np.diag(1 / np.square(own))
 
@@ -73,9 +73,8 @@ class OutlineFit:
     """Homographies fitted to the edges of canvas and squares.
 
     Args:
-        image_from_canvas: one a frame.
-        outline_px: mean distance of the predicted from the measured edges, camera px, a frame; NaN where none is in
-            view.
+        image_from_canvas: one fitted homography per frame, canvas px to camera px, (F, 3, 3).
+        outline_px: mean distance of predicted from measured edges per frame, camera px, (F,); NaN if none is in view.
     """
 
     image_from_canvas: Float[np.ndarray, "f 3 3"]
@@ -93,11 +92,11 @@ def fit_outline(
     """Move homographies until canvas and squares lie where they are seen.
 
     Args:
-        prior: homographies from the pose.
-        contrast: D, light less dark frames at the controller's input, mean over channels, 1 being white less black.
-        camera: the pinhole.
-        view: how the input is made from its picture.
-        doubt: how far the pose may be off.
+        prior: homographies from the pose, canvas px to camera px, (F, 3, 3).
+        contrast: D: light minus dark frames, mean over channels, 1 for white minus black, (F, H, W).
+        camera: pinhole camera of the frames.
+        view: crop and resize that make the controller's input from the camera picture.
+        doubt: standard deviations of the pose; `PoseDoubt()` by default.
     """
     common, own = (PoseDoubt() if doubt is None else doubt).precisions
     moves = np.zeros((len(prior), 6))
@@ -115,7 +114,7 @@ def outline_errors_px(
     camera: CameraModel,
     view: CropResize,
 ) -> Float[np.ndarray, " f"]:
-    """Mean distance of predicted from measured edges, camera px, a frame; NaN where none is in view."""
+    """Mean distance of predicted from measured edges per frame, camera px; NaN if no edge is in view."""
     unmoved = np.zeros((len(contrast), 6))
     return _Outline(image_from_canvas, contrast, camera, view, 0, unmoved).outline_px(unmoved)
 
@@ -123,7 +122,7 @@ def outline_errors_px(
 def predicted_contrast(
     image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
 ) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, "f h w"]]:
-    """Share of the canvas in every pixel's footprint, and that less what the squares take: p."""
+    """Share of the canvas in every pixel's footprint, and the predicted contrast p, which the squares reduce."""
     canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
     row, column = np.divmod(np.arange(view.height_px * view.width_px), view.width_px)
     pixel = np.stack([column, row, np.ones_like(row)], -1).astype(np.float64)
@@ -143,9 +142,9 @@ def moved(
     """Homographies of a camera turned by ω and shifted by τ in its own axes.
 
     Args:
-        image_from_canvas: with a third coordinate that is the depth in metres, as a pose gives them.
-        moves: ω and τ of each frame.
-        camera: the pinhole.
+        image_from_canvas: homographies whose third coordinate is the depth in metres, as a pose gives them, (F, 3, 3).
+        moves: rotation ω in radians and translation τ in metres for each frame, (F, 6).
+        camera: pinhole camera of the frames.
     """
     K = camera.intrinsics
     turned = _rotation(moves[:, :3]) @ (np.linalg.inv(K) @ image_from_canvas)
@@ -154,7 +153,7 @@ def moved(
 
 
 def _rotation(vector: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
-    """Rodrigues' formula."""
+    """Rotation matrices from rotation vectors, by Rodrigues' formula."""
     angle = np.linalg.norm(vector, axis=-1)[:, None, None]
     x, y, z = vector.T
     zero = np.zeros_like(x)
@@ -199,7 +198,7 @@ class _Outline:
         return _arrow_step(moves, normal, slope, common, own)
 
     def outline_px(self, moves: Float[np.ndarray, "f 6"]) -> Float[np.ndarray, " f"]:
-        """Sum of wrong shares, over the length of the outline: its mean distance, in camera px."""
+        """Mean distance of predicted from measured edges per frame, camera px: wrong shares over the edges' length."""
         frames = len(moves)
         wrong = np.bincount(self._frame, np.abs(self._predicted(moves) - self._measured), frames)
         canvas_from_input = np.linalg.inv(self._view.input_from_camera @ moved(self._prior, moves, self._camera))
@@ -225,7 +224,7 @@ class _Outline:
 def _canvas_shares(
     canvas_from_input: Float[np.ndarray, "p 3 3"], pixel: Float[np.ndarray, "p 3"], variance: float
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Share of each footprint on the canvas, and p.
+    """Share of each footprint on the canvas, and the predicted contrast p.
 
     Along either axis a checkerboard is a square wave, and it is their product: squares are where it is positive.
     """
@@ -282,7 +281,7 @@ def _blurred(
 
 
 def _near_edge(contrast: Float[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
-    """Pixels within reach of a place where the contrast changes."""
+    """The pixels within reach of a place where the contrast changes."""
     shown = torch.tensor(contrast)[:, None]
     size = 2 * _REACH_PX + 1
     most, least = max_pool2d(shown, size, 1, _REACH_PX), -max_pool2d(-shown, size, 1, _REACH_PX)

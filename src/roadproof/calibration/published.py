@@ -49,7 +49,7 @@ _SEED = 1
 
 
 def calibration_points() -> Float[np.ndarray, "60 2"]:
-    """Points on the canvas, at least 44 px apart, always the same."""
+    """The 60 calibration points on the canvas, px, at least 44 px apart, always the same."""
     rng = np.random.default_rng(_SEED)
     while True:
         points = np.empty((0, 2))
@@ -61,7 +61,7 @@ def calibration_points() -> Float[np.ndarray, "60 2"]:
 
 
 def points_target(points: Float[np.ndarray, "5 2"]) -> PatternImage:
-    """A black canvas with a disc of each colour."""
+    """A black canvas with a disc of each of the five colours at its point."""
     target = uniform(0, 0, 0)
     rows, columns = np.mgrid[0:CANVAS_SIZE_PX, 0:CANVAS_SIZE_PX]
     for (x, y), colour in zip(points, COLOURS, strict=True):
@@ -70,7 +70,7 @@ def points_target(points: Float[np.ndarray, "5 2"]) -> PatternImage:
 
 
 def detect_points(picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "5 2"]:
-    """Where each colour is seen, in whole pixels: the brightest pixel of that colour; NaN where there is none."""
+    """The pixel at which each colour is seen brightest, (5, 2), in whole px; NaN for a colour that is not seen."""
     levels = picture.astype(np.float32)
     found = np.full((len(COLOURS), 2), np.nan)
     for k, colour in enumerate(COLOURS):
@@ -150,7 +150,7 @@ def colours_from_paints(
 
 
 def _inner(homography: Homography, view: CropResize) -> np.ndarray:
-    """Pixels of the controller's input well inside the canvas."""
+    """The pixels of the controller's input that lie well inside the canvas."""
     columns, rows = np.meshgrid(np.arange(view.width_px, dtype=np.float64), np.arange(view.height_px))
     inverse = np.linalg.inv(view.input_from_camera @ homography)
     pixels = np.stack([columns, rows], -1).reshape(-1, 2)

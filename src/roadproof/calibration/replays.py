@@ -28,9 +28,9 @@ class Replays:
 
     Args:
         simulator: an open simulator, the one the drives were recorded in.
-        drives: what is driven again.
-        folder: keeps what each replay saw; what it holds is not driven again.
-        on_call: called with the number of replays so far.
+        drives: recorded drives that are replayed.
+        folder: folder that keeps what each replay saw, so that it is not driven again; None keeps nothing.
+        on_call: called after each replay, made or read, with the number of replays so far.
     """
 
     def __init__(
@@ -53,9 +53,9 @@ class Replays:
         """The kept frames of a drive as they look with paint on the canvas.
 
         Args:
-            drive: one of the drives.
-            name: of what is painted.
-            paint: on the canvas.
+            drive: the drive to replay, one of the drives.
+            name: name of the paint, for the file that keeps the frames.
+            paint: picture of the paint on the canvas.
 
         Raises:
             CalibrationError: the replay goes another way than the drive.
@@ -74,11 +74,11 @@ class Replays:
         """What `see` makes of each kept frame of a drive with paint on the canvas, stacked.
 
         Args:
-            drive: one of the drives.
-            name: of what is painted and seen.
-            paint: on the canvas.
-            see: called with each of them.
-            full_pictures: whether it needs full camera pictures.
+            drive: the drive to replay, one of the drives.
+            name: name of what is painted and seen, for the file that keeps the result.
+            paint: picture of the paint on the canvas.
+            see: function that is called with the observation of each kept frame.
+            full_pictures: whether `see` needs full camera pictures.
 
         Raises:
             CalibrationError: the replay goes another way than the drive.
@@ -132,7 +132,7 @@ class Replays:
 
 
 def uniform(red: int, green: int, blue: int) -> PatternImage:
-    """A canvas painted all over."""
+    """A canvas painted all over with one colour, each channel in 0…255."""
     return np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), (red, green, blue, 255), np.uint8)
 
 
@@ -147,7 +147,7 @@ def _check_same_way(name: str, step: int, state: VehicleState, wanted: VehicleSt
 
 
 def drive_digest(drive: Drive, before: bytes = b"", after: bytes = b"") -> str:
-    """Tells a drive from others by its controls and the steps of its kept frames; and what stands before and after."""
+    """A digest that tells a drive from others by its controls, its kept frames' steps, and the given extra bytes."""
     episode, digest = drive.episode, hashlib.sha256(before)
     for values in (episode.steer, episode.throttle, episode.brake, drive.frame_number):
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -156,13 +156,13 @@ def drive_digest(drive: Drive, before: bytes = b"", after: bytes = b"") -> str:
 
 
 def _digest(drives: Drives, drive: Drive, paint: PatternImage) -> str:
-    """Tells replays apart: where, the controls, the frames wanted, and the paint."""
+    """A digest that tells replays apart by scenario, controls, kept frames and paint."""
     where = repr((drives.settings, drive.name)).encode()
     return drive_digest(drive, where, np.ascontiguousarray(paint).tobytes())
 
 
 def _read(path: Path, digest: str) -> dict[str, Any] | None:
-    """What a replay saw; None where there is none that can be used."""
+    """The stored result of a replay; None if there is none that can be used."""
     names = ("seen", "stated", "seconds")
     try:
         of, arrays = read_record(path, names, CalibrationError, "drive it again")

@@ -16,29 +16,28 @@ _GRID = 9
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Errors in px of the camera picture."""
+    """Mean and 95th percentile of errors, in px of the camera picture."""
 
     mean: float
     p95: float
 
     @staticmethod
     def of(errors: Float[np.ndarray, " n"]) -> Spread | None:
-        """Mean and 95th percentile; None of nothing."""
+        """Mean and 95th percentile of some errors; None if there are none."""
         return Spread(float(errors.mean()), float(np.percentile(errors, 95))) if errors.size else None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DriveReport:
-    """What became of one drive.
+    """How the calibration of one drive went.
 
     Args:
-        name: of the drive.
-        frames: how many are left.
-        dropped: frame number and reason of each that was not.
-        residual_px: how far the homographies miss what they were fitted to: the detected points, or the outline of the
-            canvas; mean and 95th percentile, camera px.
-        stated_px: how far they miss the homographies that the simulator itself states, over a grid of canvas points in
-            view; camera px. None where no replay asked.
+        name: name of the drive.
+        frames: number of frames that are kept.
+        dropped: frame number of each frame that was dropped, and why.
+        residual_px: mean and 95th percentile by which homographies miss their points or outline, camera px.
+        stated_px: distance between points mapped by the homographies and by those that the simulator states, over a
+            grid on the visible canvas, camera px; None if no replay stated any.
     """
 
     name: str
@@ -53,12 +52,12 @@ class CalibrationReport(Saved):
     """How good a calibration is, and what it cost.
 
     Args:
-        method: how it was made.
-        drives: what became of each.
-        colour_residual: mean error of the fitted colours, 8-bit levels; None where they leave none (two paints and two
-            unknowns a pixel).
-        calls: drives the simulator made, recording included.
-        seconds: wall time of the replays and the fits, without recording.
+        method: calibration method.
+        drives: report on each drive.
+        colour_residual: mean error of the fitted colours, 8-bit levels; None for two-paint methods, which fit two
+            unknowns to two paints.
+        calls: number of drives the simulator made, recording included.
+        seconds: wall time in seconds of replays and fits, without recording.
     """
 
     method: str

@@ -24,10 +24,10 @@ class Paints:
     """What two paints show of one drive.
 
     Args:
-        maps: gain, offset and visibility.
-        image_from_canvas: one homography a frame.
-        outline_px: how far each misses the edges seen, camera px; NaN where none is in view.
-        dropped: which frames show too little of the canvas, and why.
+        maps: gain, offset and visibility of every pixel of the drive's frames.
+        image_from_canvas: one homography per frame, canvas px to camera px, (F, 3, 3).
+        outline_px: distance by which each homography misses the seen edges, camera px, (F,); NaN if none is in view.
+        dropped: index of each frame that shows too little of the canvas, and why.
     """
 
     maps: PixelMaps
@@ -37,7 +37,7 @@ class Paints:
 
 
 def dark_target() -> PatternImage:
-    """Black, with grey squares like the black ones of a chessboard."""
+    """The dark target: a black canvas with grey squares like the squares of one colour on a chessboard."""
     target = uniform(0, 0, 0)
     rows, columns = np.indices((CANVAS_SIZE_PX, CANVAS_SIZE_PX)) * SQUARES // CANVAS_SIZE_PX
     target[(rows + columns) % 2 == 0, :3] = round(255 * GREY)
@@ -56,15 +56,15 @@ def look_at_paints(
     """Replay a drive over a light and a dark canvas.
 
     Args:
-        replays: of the recorded drives.
-        drive: one of them.
-        prior: homographies from its poses.
-        camera: on the car.
-        view: how the controller's input is made from its picture.
-        refine: whether homographies are corrected by what is seen.
+        replays: replays of the recorded drives.
+        drive: the drive to replay, one of the drives.
+        prior: homographies from the drive's poses, canvas px to camera px, (F, 3, 3).
+        camera: camera on the car.
+        view: crop and resize that make the controller's input from the camera picture.
+        refine: whether the homographies are corrected by what the frames show.
 
     Raises:
-        CalibrationError: the two look alike, saturate, or a replay goes astray.
+        CalibrationError: the two paints look alike or saturate, or a replay goes astray.
     """
     light = replays.frames(drive, "light", uniform(255, 255, 255))
     dark = replays.frames(drive, "dark", dark_target())
@@ -93,5 +93,5 @@ def look_at_paints(
 
 
 def at_frames(maps: PixelMaps, kept: list[int]) -> PixelMaps:
-    """The maps of some frames."""
+    """The maps of the frames with the given indices."""
     return PixelMaps(maps.gain[kept], maps.offset[kept], maps.visible[kept], maps.response)

@@ -31,11 +31,11 @@ def composite(pattern: Pattern, view: CanvasView) -> Float[Tensor, "*b f 3 h w"]
     Differentiable in the pattern's boxes and colours, exactly.
 
     Args:
-        pattern: on the device and in the precision of the view.
-        view: frames and their view of the canvas.
+        pattern: one pattern or a batch of them, on the device and in the precision of the view.
+        view: F frames and the pixels through which the canvas shows.
 
     Returns:
-        Frames in [0, 1]; the bare road is copied bit for bit.
+        Frames in [0, 1], (*b, F, 3, H, W); pixels of the bare road are copied bit for bit.
     """
     batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
     flat = Pattern(pattern.shapes, pattern.boxes.reshape(-1, figures, 5), pattern.colours.reshape(-1, figures, 3))
@@ -50,8 +50,8 @@ class Compositor:
     last one returned: use a result, backward pass included, before asking for the next.
 
     Args:
-        views: the sets of frames, all of one size.
-        copies: how many patterns are painted into each of them.
+        views: sets of frames with their view of the canvas, all frames of one size.
+        copies: number of patterns painted into each view.
     """
 
     def __init__(self, views: Sequence[CanvasView], copies: int) -> None:
@@ -60,11 +60,11 @@ class Compositor:
         self._frames = torch.cat([view.frames.repeat(copies, 1, 1, 1) for view in views])
 
     def __call__(self, patterns: Sequence[Pattern], looks: Looks | None = None) -> Float[Tensor, "n 3 h w"]:
-        """The frames, view after view, pattern after pattern.
+        """The composited frames in [0, 1], view after view and, in each view, pattern after pattern.
 
         Args:
-            patterns: for each view a batch of `copies` patterns.
-            looks: how worn they are, in turn; None for fresh paint.
+            patterns: one batch of `copies` patterns for each view.
+            looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
         """
         colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
         if looks is not None:
@@ -87,7 +87,7 @@ class Compositor:
         return self._frames.permute(0, 3, 1, 2)
 
     def pick(self, frames: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
-        """The canvas' pixels of a batch of frames: the transpose of `paste`."""
+        """The canvas' pixels of a batch of frames, one (copies, P, 3) per view: the transpose of `paste`."""
         slots = self.slots(frames.permute(0, 2, 3, 1))
         return [slot.index_select(1, view.index) for slot, view in zip(slots, self._views, strict=True)]
 
@@ -109,10 +109,10 @@ def composite_own(
     """B pictures with a pattern of its own painted into each, differentiable in the patterns.
 
     Args:
-        pattern: a batch of B patterns.
-        frames: the bare pictures, in [0, 1].
-        views: their view of the canvas.
-        looks: how worn they are, in turn; None for fresh paint.
+        pattern: batch of B patterns, one for each picture.
+        frames: bare pictures in [0, 1], (B, 3, H, W).
+        views: the pixels of each picture through which the canvas shows.
+        looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
     """
     colours = canvas_colours(pattern, views)
     if looks is not None:
@@ -123,7 +123,7 @@ def composite_own(
 
 
 def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
-    """Colours of the canvas' pixels where the bare road shows through."""
+    """Colours of the canvas' pixels with worn paint, through which the bare road shows."""
     return torch.lerp(clean.expand_as(colours), colours, left[..., None].to(colours))
 
 

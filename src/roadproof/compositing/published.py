@@ -43,7 +43,7 @@ class MaskedView(Protocol):
         ...
 
     def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
-        """How much of each pixel a rectangle covers."""
+        """The share of each pixel that a rectangle covers, in [0, 1]."""
         ...
 
     def pixels(
@@ -58,10 +58,10 @@ class BinaryView:
     """Frames as the released code paints them.
 
     Args:
-        frames: clean frames, (F, H, W, 3), in [0, 1].
-        index: where in the flattened frames the canvas' pixels are, (P,).
-        lookup: the canvas pixel that each of them is painted with, row-major, (P,).
-        colour: painted to seen; its flat response alone is used. None draws paint in its own colour.
+        frames: clean frames in [0, 1], (F, H, W, 3).
+        index: index of the canvas' pixels in the flattened frames, (P,).
+        lookup: canvas pixel that paints each of the canvas' picture pixels, as a row-major index, (P,).
+        colour: transform from painted to seen, of which only the response is used; None draws paint unchanged.
     """
 
     frames: Float[Tensor, "f h w 3"]
@@ -70,7 +70,7 @@ class BinaryView:
     colour: ColourTransform | None
 
     def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
-        """0 or 1 for each pixel."""
+        """1 for each pixel whose canvas pixel the rectangle covers, 0 for the others."""
         return canvas_mask(boxes).to(self.frames.dtype).flatten(-2)[..., self.lookup]
 
     def pixels(
@@ -89,7 +89,7 @@ class AntialiasedView:
     """Frames painted with the fractional masks of the paper's text.
 
     Args:
-        view: frames and their view of the canvas.
+        view: clean frames and the pixels through which the canvas shows.
     """
 
     view: CanvasView
@@ -105,7 +105,7 @@ class AntialiasedView:
         return self.view.index
 
     def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
-        """The share of each pixel."""
+        """The share of each pixel that a rectangle covers, antialiased."""
         return coverage(Shape.RECTANGLE, boxes[..., None, :], self.view.footprints)[..., 0, :]
 
     def pixels(
@@ -153,13 +153,13 @@ def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: C
 
 
 def composite_published(pattern: Pattern, view: MaskedView) -> Float[Tensor, "f h w 3"]:
-    """Whole frames with one pattern of rectangles."""
+    """Whole frames with one pattern of rectangles painted on the canvas."""
     pixels = view.pixels(visibilities(view.masks(pattern.boxes)), pattern.colours)
     return pasted(view, pixels)
 
 
 def pasted(view: MaskedView, pixels: Float[Tensor, "p 3"]) -> Float[Tensor, "f h w 3"]:
-    """Whole frames with other colours of the canvas' pixels."""
+    """Whole frames with the given colours in the canvas' pixels."""
     return view.frames.reshape(-1, 3).index_copy(0, view.index, pixels).view_as(view.frames)
 
 

@@ -21,15 +21,15 @@ SAMPLES_ACROSS, SAMPLES_DOWN = 4, 16
 def composite_raster(
     paint: UInt8[np.ndarray, "400 400 4"], frames: Float[Tensor, "b 3 h w"], views: OwnViews
 ) -> Float[Tensor, "b 3 h w"]:
-    """B pictures with the same paint on the canvas of each.
+    """B pictures with the same picture of paint on the canvas of each.
 
     A pixel at the canvas' border sees the paint of that border beyond it too, since the share of the pixel that lies
     on the canvas is part of the views already.
 
     Args:
-        paint: RGBA with straight alpha, y = 0 the far edge.
-        frames: the bare pictures, in [0, 1].
-        views: their view of the canvas.
+        paint: RGBA picture of the canvas with straight alpha; row 0 is the far edge.
+        frames: bare pictures in [0, 1], (B, 3, H, W).
+        views: the pixels of each picture through which the canvas shows.
 
     Returns:
         Pictures in [0, 1]; pixels outside the canvas are those of `frames` bit for bit.
@@ -40,7 +40,7 @@ def composite_raster(
 
 
 def _seen(paint: UInt8[np.ndarray, "400 400 4"], views: OwnViews) -> Float[Tensor, "n 4"]:
-    """What each canvas pixel is seen as before gain and bias: colour times alpha, and alpha; row after row."""
+    """Seen colour of each canvas pixel before gain and bias, times its alpha, and the alpha; row after row."""
     straight = torch.tensor(paint, device=views.clean.device, dtype=views.clean.dtype).flatten(0, 1) / 255
     alpha = straight[:, 3:]
     return torch.cat([views.response(straight[:, :3]) * alpha, alpha], 1)

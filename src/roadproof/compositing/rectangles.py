@@ -39,7 +39,7 @@ class PaintedRectangles(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, boxes: Tensor, seen: Tensor, whole: Runs) -> Tensor:  # noqa: ANN401
-        """Paint, piece by piece."""
+        """Colours of the canvas' pixels, painted piece by piece."""
         rows = _edge_rows(boxes)
         painted = torch.empty(len(boxes), len(whole) * RUN, 3, device=boxes.device, dtype=boxes.dtype)
         within = torch.empty(len(boxes), 3, len(whole) * RUN, device=boxes.device, dtype=torch.bool)

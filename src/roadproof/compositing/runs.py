@@ -26,12 +26,12 @@ class Runs:
     """P pixels as N runs of `RUN`; the last is filled up with copies of the last pixel, which nothing is painted on.
 
     Args:
-        features: of the footprints, see `Footprints`.
-        centre: middle x, middle y and 1 of each run's box on the canvas, which holds its footprints, px.
-        reach: half the width and height of the box, px.
-        clean: see `CanvasView`; p = N · RUN.
-        gain: see `CanvasView`.
-        bias: see `CanvasView`.
+        features: features of the footprints, see `Footprints`, (v, 6, N, RUN).
+        centre: box of each run's footprints on the canvas: middle x and y in canvas px, then 1, (v, 3, N).
+        reach: half the width and height of that box, canvas px, (v, 2, N).
+        clean: clean colours of the pixels, see `CanvasView`; p = N · RUN.
+        gain: A of the pixels, see `CanvasView`.
+        bias: B of the pixels, see `CanvasView`.
     """
 
     features: Float[Tensor, "v 6 n run"]
@@ -48,7 +48,7 @@ class Runs:
         gain: Float[Tensor, "v p 3"],
         bias: Float[Tensor, "v p 3"],
     ) -> Runs:
-        """Runs of pixels in their order."""
+        """Pixels cut into runs in the order in which they stand."""
         missing = -features.shape[2] % RUN
         last = features[..., -1:].expand(-1, -1, missing)
         whole = torch.cat([features, last], 2).view(len(features), 6, -1, RUN)
@@ -72,7 +72,7 @@ class Runs:
         """Which runs lie wholly inside each figure, and which may be crossed by its edges.
 
         Args:
-            rows: that give the distances to the four edges, first those across and along the figure to one side.
+            rows: rows as `_edge_rows` gives them: the first four yield the distances to the four edges.
         """
         distance = self._lined(rows[..., :4, :3], self.centre)
         depth = torch.minimum(distance[..., :2, :], distance[..., 2:, :])

@@ -32,17 +32,17 @@ _LEAST_WEAR = 1e-4
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Variation:
-    """The ranges that a search takes the mean over; 0 leaves one out.
+    """The ranges of looks over which a search takes its mean; 0 leaves a range out.
 
     Args:
         noise: standard deviation of the noise of every pixel, as a share of full scale, 0 to 0.2.
-        exposure_stops: exposure, up to so many stops more or less, 0 to 2.
-        white_balance: red gains up to this share while blue loses it, or the other way round, 0 to 0.3.
-        blur_px: standard deviation of the blur, up to so many pixels of the controller's input, 0 to 0.7.
-        shift_m: the paint lies up to so far beside its place, across and along the road each, 0 to 1.
-        turn_deg: it is turned by up to so much either way, 0 to 20.
-        wear: up to this share of the paint is gone, 0 to 0.9.
-        draws: looks that every pattern is shown in at every step, 1 to 64.
+        exposure_stops: largest change of exposure either way, in stops, 0 to 2.
+        white_balance: largest share by which red gains while blue loses, or the other way round, 0 to 0.3.
+        blur_px: largest standard deviation of the blur, in pixels of the controller's input, 0 to 0.7.
+        shift_m: largest shift of the paint from its place, across and along the road each, metres, 0 to 1.
+        turn_deg: largest turn of the paint either way, degrees, 0 to 20.
+        wear: largest share of the paint that is gone, 0 to 0.9.
+        draws: number of looks in which every pattern is shown at every step, 1 to 64.
 
     Raises:
         RoadproofError: a value is out of its range.
@@ -63,12 +63,12 @@ class Variation:
                 raise RoadproofError(f"variation: {field.name} is {value}, expected {least:g} to {most:g}")
 
     def draw(self, seed: int, device: torch.device | str = "cpu", count: int | None = None) -> Looks:
-        """Looks of a seed, the same on every device.
+        """Looks drawn from a seed, the same on every device.
 
         Args:
-            seed: what they are drawn from.
-            device: where they are used.
-            count: how many; `draws` by default.
+            seed: seed of the draw.
+            device: torch device of the looks' tensors.
+            count: number of looks; `draws` by default.
         """
         count = count or self.draws
         generator = torch.Generator().manual_seed(seed)
@@ -98,18 +98,18 @@ _RANGES = ((0, 0.2), (0, 2), (0, 0.3), (0, 0.7), (0, 1), (0, 20), (0, 0.9), (1, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Looks:
-    """D looks; rows of a batch have them in turn.
+    """D looks of paint and camera; the rows of a batch have them in turn.
 
     Args:
-        gain: g.
-        blur: β.
-        shift_m: of the paint, right and towards the car.
-        turn_deg: of the paint, clockwise on the picture.
-        wear: share of it that is gone.
-        wave: of the wear, radians a canvas px.
-        phase: of those waves.
-        noise: standard deviation.
-        seed: of the noise.
+        gain: gain g of red, green and blue, (D, 3).
+        blur: share β of the blurred picture, (D,).
+        shift_m: shift of the paint to the right and towards the car, metres, (D, 2).
+        turn_deg: turn of the paint about the canvas' middle, degrees, clockwise on the picture, (D,).
+        wear: share of the paint that is gone, (D,).
+        wave: wave vectors of the pattern of wear, radians per canvas px, (D, W, 2).
+        phase: phases of the waves of wear, radians, (D, W).
+        noise: standard deviation of the noise of every pixel, as a share of full scale.
+        seed: seed of the noise.
     """
 
     gain: Float[Tensor, "d 3"]
@@ -123,15 +123,15 @@ class Looks:
     seed: int
 
     def __len__(self) -> int:
-        """How many."""
+        """How many looks there are."""
         return len(self.gain)
 
     def rows(self, count: int) -> Int[Tensor, " r"]:
-        """The look of each row."""
+        """Index of the look that each of `count` rows has, in turn."""
         return torch.arange(count, device=self.gain.device) % len(self)
 
     def placed(self, pattern: Pattern, canvas: CanvasPlacement | None) -> Pattern:
-        """A batch of R patterns, each where its look has it; the paper's canvas stands for one that is not known."""
+        """R patterns, each shifted and turned as its look says; if no canvas is known, on one of the paper's size."""
         canvas = canvas or CanvasPlacement(x_m=0.0, y_m=0.0)
         which = self.rows(len(pattern.boxes))
         scale = pattern.boxes.new_tensor([canvas.width_m, canvas.length_m]) / CANVAS_SIZE_PX
@@ -146,7 +146,7 @@ class Looks:
         return Pattern(pattern.shapes, boxes, pattern.colours)
 
     def left(self, centre: Float[Tensor, "#r p 2"], count: int) -> Float[Tensor, "r p"]:
-        """The share of the paint that is left at footprints of R rows."""
+        """The share of the paint that wear leaves at the footprints of R rows."""
         which = self.rows(count)
         field = torch.zeros(count, centre.shape[-2], device=centre.device)
         for k in range(self.wave.shape[1]):
@@ -157,12 +157,12 @@ class Looks:
         return torch.where((self.wear > 0)[which, None], 1 - worn, 1.0)
 
     def seen(self, frames: Float[Tensor, "n 3 h w"], rows: int, step: int = 0) -> Float[Tensor, "n 3 h w"]:
-        """Pictures as the camera of each look takes them.
+        """The pictures as the camera of each look takes them: gain, blur and noise.
 
         Args:
-            frames: N / R pictures of each of R rows, row after row.
-            rows: R.
-            step: of the drive: every step has noise of its own.
+            frames: pictures in [0, 1]: R rows of N / R pictures, row after row.
+            rows: number R of rows.
+            step: number of the step in the drive, which seeds its noise, so that every step has noise of its own.
         """
         which = self.rows(rows).repeat_interleave(len(frames) // rows)
         shown = frames * self.gain.to(frames)[which][:, :, None, None]

@@ -22,14 +22,14 @@ class CanvasView:
     """Recorded frames and the P pixels of theirs through which the canvas shows.
 
     Args:
-        frames: clean frames, (F, H, W, 3), in [0, 1].
-        index: where in the flattened frames those pixels are, (P,).
-        footprints: of those pixels on the canvas.
-        clean: their clean colours, (P, 3).
+        frames: clean frames in [0, 1], (F, H, W, 3).
+        index: index of the P picture pixels that show the canvas in the flattened frames, (P,).
+        footprints: footprints on the canvas of these P picture pixels.
+        clean: clean colours of these pixels, (P, 3).
         gain: A = s·gain, (P, 3), with s the share of the pixel that lies on the canvas.
         bias: B = s·(offset − clean), (P, 3).
-        response: painted → seen, before gain and bias.
-        runs: the same pixels in runs, as rectangles are painted.
+        response: response from painted to seen colour, before gain and bias.
+        runs: the same pixels cut into runs, for painting rectangles.
     """
 
     frames: Float[Tensor, "f h w 3"]
@@ -43,7 +43,7 @@ class CanvasView:
 
     @property
     def clean_frames(self) -> Float[Tensor, "f 3 h w"]:
-        """The frames as a controller takes them."""
+        """The clean frames with channels first, as a controller takes them."""
         return self.frames.permute(0, 3, 1, 2)
 
 
@@ -53,14 +53,14 @@ class OwnViews(NamedTuple):
     Rows with fewer pixels are filled up with copies of their last one, which `valid` leaves out.
 
     Args:
-        pixel: where in its flattened picture each pixel is, (B, P).
-        valid: which of them are no copies.
-        footprints: of those pixels on the canvas, (B, 1, P, ...).
-        clean: their clean colours.
-        gain: see `CanvasView`.
-        bias: see `CanvasView`.
-        response: painted → seen, before gain and bias.
-        runs: the same pixels in runs, as rectangles are painted.
+        pixel: index of each pixel in its flattened picture, (B, P).
+        valid: which pixels are not copies that fill up a row, (B, P).
+        footprints: footprints of the pixels on the canvas, (B, 1, P, ...).
+        clean: clean colours of the pixels, (B, P, 3).
+        gain: A of the pixels, see `CanvasView`, (B, P, 3).
+        bias: B of the pixels, see `CanvasView`, (B, P, 3).
+        response: response from painted to seen colour, before gain and bias.
+        runs: the same pixels cut into runs, for painting rectangles.
     """
 
     pixel: Int[Tensor, "b p"]
@@ -82,7 +82,7 @@ class OwnViews(NamedTuple):
         bias: Float[Tensor, "b p 3"],
         response: Response,
     ) -> OwnViews:
-        """The views with their runs."""
+        """Views from the data of their pixels, which are cut into runs here."""
         runs = Runs.of(footprints.features[:, 0], clean, gain, bias)
         return OwnViews(pixel, valid, footprints, clean, gain, bias, response, runs)
 
@@ -102,17 +102,17 @@ def view_canvas(
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> CanvasView:
-    """Prepare frames for compositing.
+    """Prepare frames for compositing, by finding the pixels through which the canvas shows.
 
     Args:
-        frames: clean frames at the controller's input.
-        image_from_canvas: one homography a frame, canvas px to camera px.
-        view: how the input was made from the camera picture.
-        colour: painted → seen.
-        maps: gain, offset and visibility of the canvas for every pixel of the frames, to the response of `colour`, in
-            place of its smooth shading.
-        device: where to composite.
-        dtype: precision of compositing; float64 for gradient checks.
+        frames: clean frames at the controller's input, RGB, (F, H, W, 3).
+        image_from_canvas: one homography per frame, canvas px to camera px.
+        view: crop and resize that made the input from the camera picture.
+        colour: colour transform from painted to seen.
+        maps: gain, offset and visibility of the canvas in every pixel, for the response of `colour`; they replace its
+            smooth shading. None for that shading.
+        device: torch device on which frames will be composited.
+        dtype: precision of compositing, float32 by default; float64 for gradient checks.
 
     Raises:
         GeometryError: no frame shows the canvas.
@@ -140,11 +140,11 @@ def canvas_pixels(
     """Pixels of the controller's input whose footprint touches the canvas, in front of the camera.
 
     Args:
-        image_from_canvas: one homography a frame, canvas px to camera px.
-        view: how the input is made from the camera picture.
+        image_from_canvas: one homography per frame, canvas px to camera px.
+        view: crop and resize that make the input from the camera picture.
 
     Returns:
-        Index into the flattened (F, H, W) pixels, canvas coordinates of their centres, and ∂canvas/∂pixel.
+        Index into the flattened (F, H, W) pixels (P,), canvas px of their centres (P, 2), and ∂canvas/∂pixel (P, 2, 2).
 
     Raises:
         GeometryError: no frame shows the canvas.

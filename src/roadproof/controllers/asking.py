@@ -24,11 +24,11 @@ NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy
 def steer_of(
     controller: Controller, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
 ) -> Float[Tensor, " b"]:
-    """What `Controller.steer` answers.
+    """What `Controller.steer` answers, checked: steering of each frame, in steer units, (B,).
 
     Raises:
-        ControllerError: it raises, or answers with anything but one finite number a frame, differentiable in the
-            frames where they carry gradients; the message names what came.
+        ControllerError: the controller raises, or does not answer with one finite number per frame that is
+            differentiable in frames that carry gradients; the message names what came.
     """
     answer = answer_of(controller, "steer", frames, speed_mps, command)
     require_finite(answer, "steer")
@@ -42,10 +42,10 @@ def controls_of(
     speed_mps: Float[Tensor, " b"],
     command: Int[Tensor, " b"],
 ) -> Float[Tensor, "b 3"]:
-    """What `PedalController.controls` answers.
+    """What `PedalController.controls` answers, checked: steer, throttle and brake of each frame, (B, 3).
 
     Raises:
-        ControllerError: as `steer_of`, of three numbers a frame.
+        ControllerError: the controller raises, or answers wrongly, as in `steer_of` but with three numbers per frame.
     """
     answer = answer_of(controller, "controls", frames, speed_mps, command)
     require_finite(answer, "controls")
@@ -54,10 +54,10 @@ def controls_of(
 
 
 def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
-    """What `Controller.act` answers, in plain numbers.
+    """What `Controller.act` answers for one frame, as plain numbers.
 
     Raises:
-        ControllerError: it raises, or answers with something that is no `Control` of numbers.
+        ControllerError: the controller raises, or answers with something that is no `Control` of numbers.
     """
     control = call("the controller's act", controller.act, frame, speed_mps, command)
     if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # controllers are the user's
@@ -78,7 +78,7 @@ def frame_size_of(controller: Controller) -> tuple[int, int] | None:
     """`Controller.input_size`: (height, width) of the frames it takes, or None when it takes any size.
 
     Raises:
-        ControllerError: it raises, or is something else.
+        ControllerError: asking for it raises, or gives something else.
     """
     size: object = call("the controller's input_size", getattr, controller, "input_size")
     if size is None:
@@ -99,10 +99,10 @@ def answer_of(
     speed_mps: Float[Tensor, " b"],
     command: Int[Tensor, " b"],
 ) -> Float[Tensor, "b ..."]:
-    """What `steer` or `controls` answers, whatever its values.
+    """What `steer` or `controls` answers, checked for shape, dtype and device, but not for its values.
 
     Raises:
-        ControllerError: it raises, or answers with something that has not the promised shape, dtype and device.
+        ControllerError: the controller raises, or its answer has not the promised shape, dtype or device.
     """
     what = f"the controller's {member}"
     answer: object = call(what, getattr(controller, member), frames, speed_mps, command)
@@ -119,10 +119,10 @@ def answer_of(
 
 
 def require_finite(answer: Float[Tensor, "b ..."], member: str) -> None:
-    """Refuse NaN and infinity.
+    """Refuse an answer with NaN or infinity in it.
 
     Raises:
-        ControllerError: some are there; the message says for how many frames.
+        ControllerError: the answer has such values; the message says for how many frames.
     """
     finite = answer.detach().isfinite()
     if not bool(finite.all()):
@@ -134,17 +134,17 @@ def require_finite(answer: Float[Tensor, "b ..."], member: str) -> None:
 
 
 def require_gradient(answer: Float[Tensor, "b ..."], frames: Float[Tensor, "b 3 h w"], member: str) -> None:
-    """Refuse an answer without gradients to frames that carry them.
+    """Refuse an answer without gradients if the frames carry them.
 
     Raises:
-        ControllerError: it has none.
+        ControllerError: the answer has no gradient.
     """
     if torch.is_grad_enabled() and frames.requires_grad and not answer.requires_grad:
         raise ControllerError(f"the controller's {member} answered without a gradient to the frames; {NO_GRADIENT}")
 
 
 def _in_words(value: object) -> str:
-    """The type of what came instead, and its shape or value, shortly."""
+    """The type of an unexpected answer with its shape or value, in a few words."""
     if isinstance(value, np.ndarray | Tensor):
         kind = "a numpy array" if isinstance(value, np.ndarray) else "a tensor"
         return f"{kind} of shape {tuple(cast('tuple[int, ...]', value.shape))}, {value.dtype}"

@@ -35,11 +35,11 @@ class ControllerCard:
 
     Args:
         architecture: "cil", "pilotnet" or "conditional-pilotnet", or None for an exported network.
-        width: CIL's factor on channels and units.
-        activation: PilotNet's, "elu" or "relu".
-        target_speed_mps: speed held when a network that only steers drives.
-        preparation: how frames become the network's input, or None for the architecture's own.
-        origin: what the weights were made from, in words, or None where that is not said.
+        width: factor on CIL's channels and units, 1 by default.
+        activation: activation of PilotNet, "elu" or "relu".
+        target_speed_mps: speed in m/s that is held when a network that only steers drives, 6 by default.
+        preparation: how frames become the network's input; None for the architecture's own.
+        origin: what the weights were made from, in words; None if it is not said.
     """
 
     architecture: str | None = None
@@ -56,14 +56,14 @@ class ControllerCard:
 
 
 def read_card(text: str, source: str) -> ControllerCard:
-    """The card written in `text`.
+    """Read the card from its JSON text.
 
     Args:
-        text: JSON.
-        source: where it stands, for messages.
+        text: the card as JSON text.
+        source: file or place of the card, for messages.
 
     Raises:
-        ControllerError: it is not a card, of another version, or holds an unknown key or a value of the wrong kind.
+        ControllerError: the text is not a card, is of another version, or has an unknown key or a wrong kind of value.
     """
     try:
         card: object = json.loads(text)

@@ -31,10 +31,10 @@ class ControllerCheck:
     """One promise and whether it is kept.
 
     Args:
-        name: short and stable.
-        passed: whether it is.
-        found: what was measured.
-        advice: what to do when it is not.
+        name: short name of the check, the same in all versions.
+        passed: whether the promise is kept.
+        found: what was measured, in words.
+        advice: what to do if the check fails.
     """
 
     name: str
@@ -45,7 +45,7 @@ class ControllerCheck:
 
 @dataclass(frozen=True, slots=True)
 class ControllerReport:
-    """All checks, in the order they were made; those that an earlier one leaves nothing to measure for are not."""
+    """All checks in the order in which they were made, without those that an earlier failure makes impossible."""
 
     checks: tuple[ControllerCheck, ...]
 
@@ -60,10 +60,10 @@ class ControllerReport:
         return tuple(check for check in self.checks if not check.passed)
 
     def require(self) -> None:
-        """Refuse a controller that fails.
+        """Refuse a controller that fails a check.
 
         Raises:
-            ControllerError: names what failed, what was found and what to do, in one line.
+            ControllerError: a check failed; one line names each failure, what was found and what to do.
         """
         if self.failures:
             raise ControllerError(
@@ -90,17 +90,17 @@ def check_controller(
     """Try a controller on eight made-up frames, two for each command.
 
     Args:
-        controller: what is to be checked.
+        controller: the object to check.
         size: (height, width) of the frames; by default the controller's `input_size`.
-        device: where the controller computes.
+        device: torch device on which the controller computes.
         tolerance: largest difference between answers that should be equal, in steering; about 0.02 for bfloat16.
-        seed: of the frames.
+        seed: seed of the made-up frames.
 
     Returns:
-        The report; it never raises for what the controller does.
+        The report of all checks; what the controller does wrong stands in it and is never raised.
 
     Raises:
-        ControllerError: the controller takes any size and none was given.
+        ControllerError: the controller takes frames of any size and `size` is not given.
     """
     try:
         missing = call("the controller's interface", missing_members, controller)
@@ -122,14 +122,14 @@ def require_usable(
     """Refuse a controller with which nothing can begin: the part of `check_controller` that takes no time.
 
     Args:
-        controller: is asked about two made-up frames, and for their gradient.
+        controller: the controller; it is asked about two made-up frames, and for their gradient.
         size: (height, width) of the frames that it will be given.
-        device: where the controller computes.
-        drives: whether it will also be asked to act.
-        gradients: whether they are needed.
+        device: torch device on which the controller computes.
+        drives: whether the controller will also be asked to act.
+        gradients: whether gradients are needed.
 
     Raises:
-        ControllerError: it takes frames of another size, raises, answers wrongly, or gives no finite gradient.
+        ControllerError: the controller takes another frame size, raises, answers wrongly, or has no finite gradient.
     """
     if (own := frame_size_of(controller)) not in (None, size):
         raise ControllerError(
@@ -190,7 +190,7 @@ def _repeated(
     tolerance: float,
     advice: str,
 ) -> ControllerCheck:
-    """Whether the same frames, a part at a time, are answered as they were at first."""
+    """Whether frames asked about again, a part at a time, are answered as they were at first."""
     try:
         with torch.no_grad():
             again = torch.cat([answer_of(controller, "steer", *part) for part in parts])
@@ -217,10 +217,10 @@ def _gradient_checks(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"])
 
 
 def _gradient_of(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"] | None:
-    """The gradient of the summed steering to its frames; None where none reaches them.
+    """The gradient of the summed steering in the frames; None if no gradient reaches them.
 
     Raises:
-        ControllerError: computing it raises.
+        ControllerError: the backward pass raises.
     """
     if not steer.requires_grad:
         return None
@@ -256,7 +256,7 @@ def _failed(name: str, error: ControllerError, advice: str) -> ControllerCheck:
 
 
 def _picture(drive: _Drive) -> UInt8[np.ndarray, "h w 3"]:
-    """The first frame as a camera gives it."""
+    """The first frame of a drive as a camera gives it, 8-bit RGB."""
     levels = (drive.frames[0].permute(1, 2, 0) * 255).round().to(torch.uint8)
     return np.ascontiguousarray(levels.cpu().numpy())
 

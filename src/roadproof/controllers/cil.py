@@ -59,14 +59,14 @@ class CentredBatchNorm2d(nn.Module):
 
 
 class CIL(ConditionalNetwork):
-    """The network and the agent around it; a `Controller`.
+    """The CIL network and the agent around it; a `Controller`.
 
     Args:
         width: factor on the number of channels and units of every hidden layer; 1 is the published network.
-        seed: of the initial weights (Xavier, biases 0.1), drawn without touching the global random state.
+        seed: seed of the initial weights (Xavier, biases 0.1), drawn without touching the global random state.
 
     Raises:
-        ControllerError: a width that leaves a layer without units.
+        ControllerError: the width leaves a layer without units.
 
     Convention:
         The last feature map is flattened in H, W, C order, as TensorFlow does, so that published weights can be
@@ -108,7 +108,7 @@ class CIL(ConditionalNetwork):
 
     @property
     def configuration(self) -> dict[str, float]:
-        """What a file needs to say to build the same network again."""
+        """The arguments that a file needs to build the same network again."""
         return {"width": self.width}
 
     @property
@@ -136,10 +136,10 @@ class CIL(ConditionalNetwork):
         return copied
 
     def image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
-        """Convolutions and dense layers.
+        """The image feature, from convolutions and dense layers.
 
         Raises:
-            ControllerError: frames that are not 88×200.
+            ControllerError: the frames are not 88×200.
         """
         require_frame_size(frames, self.input_size)
         maps = self.convolutions(frames.to(next(self.parameters()).dtype))

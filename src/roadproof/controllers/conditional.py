@@ -28,11 +28,11 @@ _FOLLOW, _LEFT, _RIGHT = int(Command.FOLLOW), int(Command.LEFT), int(Command.RIG
 
 
 class ConditionalOutput(NamedTuple):
-    """What a network answers while it learns.
+    """The output of a conditional network in training.
 
     Args:
         controls: steer, gas and brake of the commanded head; linear, so slightly outside their ranges at times.
-        speed: the speed it believes to see, divided by `SPEED_SCALE_MPS`.
+        speed: speed that the network estimates from the frames, divided by `SPEED_SCALE_MPS`.
     """
 
     controls: Float[Tensor, "b 3"]
@@ -50,11 +50,11 @@ class ConditionalNetwork(nn.Module):
     speed_branch: nn.Module
 
     def image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
-        """What is seen, in the network's own dtype."""
+        """The feature of what the frames show, in the network's own dtype."""
         raise NotImplementedError
 
     def joined(self, image: Float[Tensor, "b image"], speed: Float[Tensor, "b 1"]) -> Float[Tensor, "b joined"]:
-        """What the heads are given, of the image feature and the scaled speed."""
+        """The input of the heads, from the image feature and the scaled speed."""
         raise NotImplementedError
 
     def forward(
@@ -63,9 +63,9 @@ class ConditionalNetwork(nn.Module):
         """Controls and predicted speed, in the network's own dtype; what training needs.
 
         Args:
-            frames: RGB in [0, 1].
-            speed_mps: measured speed.
-            command: CARLA's codes.
+            frames: RGB in [0, 1], (B, 3, H, W).
+            speed_mps: measured speed of the car at each frame, m/s, (B,).
+            command: what the route asks at each frame, in CARLA's codes (`datatypes.Command`), (B,).
         """
         image = self.image_feature(frames)
         return ConditionalOutput(self._controls(image, speed_mps, command), self.speed_branch(image)[:, 0])
@@ -76,7 +76,7 @@ class ConditionalNetwork(nn.Module):
         """Steering, positive to the right, linear and not clipped; see `Controller.steer`.
 
         Raises:
-            ControllerError: frames of the wrong size.
+            ControllerError: the frames have the wrong size.
         """
         return self._controls(self.image_feature(frames), speed_mps, command)[:, 0].to(frames.dtype)
 
@@ -88,7 +88,7 @@ class ConditionalNetwork(nn.Module):
         It does not brake below 0.1, gives gas or brakes but not both, and gives no gas above 10 m/s.
 
         Raises:
-            ControllerError: frames of the wrong size.
+            ControllerError: the frames have the wrong size.
         """
         steer, gas, brake = self._controls(self.image_feature(frames), speed_mps, command).to(frames.dtype).unbind(1)
         brake = torch.where((brake < 0.1) | (gas > brake), 0.0, brake)
@@ -96,7 +96,7 @@ class ConditionalNetwork(nn.Module):
         return torch.stack([steer.clamp(-1.0, 1.0), gas.clamp(0.0, 1.0), brake.clamp(0.0, 1.0)], 1)
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
-        """What `controls` says of one frame."""
+        """The control that `controls` gives for one frame."""
         with torch.no_grad():
             steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
         return Control(steer=steer, throttle=gas, brake=brake)

@@ -27,11 +27,11 @@ _FLAT, _IMAGE = 1152, 100
 
 
 class ConditionalPilotNet(ConditionalNetwork):
-    """The network and the agent around it; a `Controller`.
+    """PilotNet with a head per command, and the agent around it; a `Controller`.
 
     Args:
-        preparation: how its 66×200 input is made from the frames.
-        seed: of the initial weights (Xavier, biases 0), drawn without touching the global random state.
+        preparation: how the network's 66×200 input is made from the frames.
+        seed: seed of the initial weights (Xavier, biases 0), drawn without touching the global random state.
 
     Convention:
         Heads, in order: follow, straight, left, right.
@@ -54,10 +54,10 @@ class ConditionalPilotNet(ConditionalNetwork):
         return self.preparation.frame_size
 
     def image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
-        """Convolutions and one dense layer.
+        """The image feature, from convolutions and one dense layer.
 
         Raises:
-            ControllerError: frames of the wrong size.
+            ControllerError: the frames have the wrong size.
         """
         x = self.preparation(frames).to(self.image.weight.dtype)
         for layer in self.conv:
@@ -65,7 +65,7 @@ class ConditionalPilotNet(ConditionalNetwork):
         return self.bend(self.image(x.flatten(1)))
 
     def joined(self, image: Float[Tensor, "b image"], speed: Float[Tensor, "b 1"]) -> Float[Tensor, "b joined"]:
-        """Both side by side."""
+        """The image feature and the scaled speed side by side."""
         return torch.cat([image, speed], dim=1)
 
 

@@ -41,13 +41,13 @@ def exported_controller(
 
     Args:
         path: a `.pt2` or `.onnx` file.
-        card: how frames are prepared for it.
-        device: where it shall compute.
-        dtype: in which precision; a `.pt2` file has its own.
+        card: card that says how frames are prepared for the network.
+        device: torch device on which the network computes.
+        dtype: precision in which the network computes; a `.pt2` file has its own.
 
     Raises:
         ControllerError: the file cannot be read, its inputs cannot be told apart, or its batch is fixed.
-        DeviceError: a `.pt2` file of another precision.
+        DeviceError: the precision of a `.pt2` file is another.
     """
     network = TorchProgram(path, device) if path.suffix == ".pt2" else OnnxGraph(path)
     if isinstance(network, TorchProgram):
@@ -64,10 +64,10 @@ class TorchProgram(nn.Module):
 
     Args:
         path: a `.pt2` file.
-        device: where it shall compute.
+        device: torch device on which the program computes.
 
     Raises:
-        ControllerError: it cannot be read, or was exported for one batch size only.
+        ControllerError: the file cannot be read, or was exported for one batch size only.
     """
 
     def __init__(self, path: Path, device: torch.device) -> None:
@@ -99,10 +99,10 @@ class TorchProgram(nn.Module):
                 )
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """The program's output for its inputs, in order.
+        """The program's output for its inputs, which come in the program's order.
 
         Raises:
-            ControllerError: it cannot be computed, most often for inputs of other shapes than it was exported for.
+            ControllerError: the output cannot be computed, most often for inputs of other shapes than exported.
         """
         try:
             answer: Any = self.program(*inputs)
@@ -117,12 +117,12 @@ class TorchProgram(nn.Module):
         return answer
 
     def train(self, mode: bool = True) -> TorchProgram:  # noqa: ARG002
-        """Nothing: an exported program stays as it was exported."""
+        """Do nothing: an exported program stays in the mode in which it was exported."""
         return self
 
 
 def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple[str, ...], FramePreparation]:
-    """What each input is, and how its frames are prepared."""
+    """The kind of each input of a network, and how its frames are prepared."""
     known = {"frames", "frames_yuv", "speed_mps", "command"}
     names = list(shapes)
     if len(names) == 1 and names[0] not in known:
@@ -147,14 +147,14 @@ def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple
 
 
 def _first_sentence(error: Exception) -> str:
-    """What torch says first; what follows points to logs and stack traces."""
+    """The first sentence of an error of torch; the rest points to logs and stack traces."""
     lines = str(error).strip().splitlines()
     return lines[0].split(". ")[0] if lines else type(error).__name__
 
 
 @contextmanager
 def _quiet() -> Generator[None, None, None]:
-    """Keep torch from telling on the side, at length, what its exceptions say."""
+    """Suppress torch's log output about an error; the exception says the same."""
     log = logging.getLogger("torch.export")
     before = log.disabled
     log.disabled = True

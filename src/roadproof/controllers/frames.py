@@ -23,15 +23,15 @@ class FramePreparation:
     In this order: keep some rows, resize by area, change the colour space, subtract the mean, divide by the deviation.
 
     Args:
-        frame_size: (height, width) of the frames, or None for any.
-        rows: first row kept and one past the last, or None for all.
-        network_size: (height, width) of the network's input, or None for that of the kept rows.
+        frame_size: (height, width) of the frames; None for any size.
+        rows: first row kept and one past the last; None for all rows.
+        network_size: (height, width) of the network's input; None for the size of the kept rows.
         colour: "rgb", or "yuv" as OpenCV's COLOR_RGB2YUV gives it on 8-bit pictures, divided by 255.
-        mean: subtracted from each channel in [0, 1].
-        std: then divided by; (0.5, 0.5, 0.5) with a mean of 0.5 is the usual x / 127.5 − 1.
+        mean: mean that is subtracted from each channel in [0, 1].
+        std: deviation by which each channel is then divided; 0.5 with a mean of 0.5 is the usual x / 127.5 − 1.
 
     Raises:
-        ControllerError: sizes that are not positive, rows outside the frame, a deviation of 0.
+        ControllerError: a size is not positive, rows lie outside the frame, or a deviation is 0.
     """
 
     frame_size: tuple[int, int] | None = None
@@ -56,10 +56,10 @@ class FramePreparation:
             raise ControllerError(f"std is {self.std}, expected three numbers other than 0")
 
     def __call__(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 hn wn"]:
-        """The network's input.
+        """The network's input made from the frames.
 
         Raises:
-            ControllerError: frames of another size than `frame_size`, or with fewer rows than are to be kept.
+            ControllerError: the frames have another size than `frame_size`, or fewer rows than are to be kept.
         """
         require_frame_size(frames, self.frame_size)
         if self.rows is not None:
@@ -78,10 +78,10 @@ class FramePreparation:
 
 
 def require_frame_size(frames: Float[Tensor, "b 3 h w"], expected: tuple[int, int] | None) -> None:
-    """Refuse frames that a controller was not made for.
+    """Refuse frames of a size that a controller was not made for.
 
     Raises:
-        ControllerError: frames of another size than `expected`, (height, width); None accepts any.
+        ControllerError: the frames have another size than `expected`, (height, width); None accepts any.
     """
     height, width = frames.shape[-2:]
     if expected is not None and (height, width) != expected:
@@ -123,8 +123,8 @@ def resize_by_area(frames: Float[Tensor, "b 3 h w"], size: tuple[int, int]) -> F
     """Average each output pixel over exactly its footprint, as OpenCV's INTER_AREA does when it makes pictures smaller.
 
     Args:
-        frames: any values.
-        size: (height, width) of the result.
+        frames: pictures with any values, (B, 3, H, W).
+        size: (height, width) of the result, px.
     """
     height, width = frames.shape[-2:]
     if size[0] != height:

@@ -19,11 +19,11 @@ def answers_of(controller: Controller, size: tuple[int, int]) -> Answers:
     """Steer, throttle and brake for four made-up pictures, to four digits: the same for the same controller.
 
     Args:
-        controller: is asked to act at 6 m/s, following the lane.
-        size: (height, width) of the pictures, where the controller does not say its own.
+        controller: the controller; it is asked to act at 6 m/s, following the lane.
+        size: (height, width) of the pictures in px, if the controller does not name its own.
 
     Raises:
-        ControllerError: it raises, or answers with something that is no control.
+        ControllerError: the controller raises, or answers with something that is no control.
     """
     rng = np.random.default_rng(0)
     height, width = frame_size_of(controller) or size
@@ -41,10 +41,10 @@ def identity_of(driver: object, size: tuple[int, int]) -> str:
 
     Args:
         driver: a controller, or a function that drives, such as `training.expert.expert`.
-        size: (height, width) in pixels of the pictures it is shown, where it does not say its own.
+        size: (height, width) in px of the pictures it is shown, if the controller does not name its own.
 
     Raises:
-        ControllerError: as `answers_of`.
+        ControllerError: the controller raises, or answers with something that is no control.
     """
     if not isinstance(driver, Controller):
         return ""

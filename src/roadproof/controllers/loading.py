@@ -41,13 +41,13 @@ _METADATA_KEY = "roadproof"
 
 
 def runs_code(spec: str) -> bool:
-    """Whether loading a controller of this spec runs what its author wrote: an exported network, or Python."""
+    """Whether loading a controller from this spec runs its author's code: an exported network, or Python."""
     head, _, tail = spec.partition(":")
     return spec.endswith(".pt2") or (bool(tail) and head not in ARCHITECTURES)
 
 
 def load_network(path: Path) -> CIL | ConditionalPilotNet:
-    """A network as it was trained, to train on: nothing merged, gradients on, in float32.
+    """A network ready for training: batch normalisation not merged, gradients on, in float32.
 
     Raises:
         ControllerError: the file is missing, damaged, or holds weights that cannot be trained on here.
@@ -73,11 +73,11 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
             importable;
             `module:factory@FILE.safetensors`: the same, a `torch.nn.Module`, with weights that `harden` tuned.
         device: "cpu", "cuda" or "cuda:N".
-        dtype: "float32", "bfloat16" or "float64"; what the network computes in. Frames may stay in float32.
+        dtype: precision in which the network computes: "float32", "bfloat16" or "float64". Frames may stay in float32.
 
     Raises:
-        ControllerError: no such spec or file, weights that do not fit, or something that is no controller.
-        DeviceError: the device or dtype is not there.
+        ControllerError: the spec or file does not exist, the weights do not fit, or the object is no controller.
+        DeviceError: the device or dtype is not available.
 
     Note:
         A `.pt2` file and `module:factory` run what their authors wrote: load only what you trust. Weights files hold
@@ -90,14 +90,14 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
 
 
 def load_trainable(spec: str) -> nn.Module:
-    """A controller as it can be trained on: nothing merged, in float32, on the CPU, in eval mode, with gradients.
+    """A controller ready for training: nothing merged, in float32, on the CPU, in eval mode, with gradients.
 
     Args:
-        spec: as `load_controller` takes it; of a Python factory's module, the parameters that want gradients are those
-            its author left so, or all where none does.
+        spec: spec as `load_controller` takes it. In the module of a Python factory, those parameters are trained that
+            its author left with gradients, or all if there are none.
 
     Raises:
-        ControllerError: as `load_controller`; or it is no `torch.nn.Module` with parameters, or an exported network.
+        ControllerError: as `load_controller`; or the controller is an exported network, or no module with parameters.
     """
     if spec.endswith((".pt2", ".onnx")):
         raise ControllerError(
@@ -115,7 +115,7 @@ def load_trainable(spec: str) -> nn.Module:
 
 
 def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | nn.Module:
-    """The controller of a spec as it was made."""
+    """The controller of a spec as its maker returns it, before it is set up for use."""
     head, _, tail = text.partition(":")
     factory, at, weights = tail.partition("@")
     if head in ARCHITECTURES and tail:
@@ -152,14 +152,14 @@ def save_controller(
     """Write a CIL or PilotNet controller as safetensors, its card in the header.
 
     Args:
-        controller: as it was trained.
-        path: the file.
-        dtype: what its numbers are kept in, "float16" or "float32"; half the bytes cost steering of about 0.001.
-        origin: what the weights were made from, for the card.
+        controller: the network as it was trained, not folded.
+        path: path of the file to write.
+        dtype: format of the stored numbers, "float16" or "float32"; half the bytes cost about 0.001 of steering.
+        origin: what the weights were made from, in words, for the card.
 
     Raises:
-        ControllerError: another network, or a folded one: save it as it was trained.
-        OutputError: the file cannot be written. An older file of that name is then still whole.
+        ControllerError: the controller is another network, or a folded one; save it as it was trained.
+        OutputError: the file cannot be written; an older file of that name stays whole.
     """
     network: nn.Module = controller
     if isinstance(controller, ConditionalPilotNet):
@@ -206,7 +206,7 @@ def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
 
 
 def _read_weights(path: Path) -> tuple[dict[str, Shaped[Tensor, "..."]], str | None]:
-    """The tensors of a safetensors file, and the card in its header."""
+    """The tensors of a safetensors file, and the text of the card in its header; None without a card."""
     try:
         with cast("Any", safe_open)(path, framework="pt") as file:
             state: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -240,10 +240,10 @@ def imported(spec: str, expected: str) -> Callable[..., object]:
 
     Args:
         spec: the function's module and name, with a colon between.
-        expected: what it should be, in words.
+        expected: description of what the function should be, for messages.
 
     Raises:
-        ControllerError: its module cannot be imported, lacks it, or holds something else there.
+        ControllerError: the module cannot be imported, lacks the function, or has something else of that name.
     """
     module_name, _, name = spec.partition(":")
     with _current_directory_importable():

@@ -36,8 +36,8 @@ class OnnxGraph(nn.Module):
         path: an `.onnx` file; external data must lie in its folder.
 
     Raises:
-        ControllerError: the extra is not installed, the file is not ONNX, older than operator set 13, has several
-            outputs, or uses an operator that is not there; the message names it.
+        ControllerError: the extra is not installed, or the file is not ONNX, is older than operator set 13, has several
+            outputs, or uses an operator that is not supported; the message names it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -95,7 +95,7 @@ class OnnxGraph(nn.Module):
         self.register_buffer(buffer, constant)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """The output for the inputs, in the file's order.
+        """The output of the graph for its inputs, which come in the file's order.
 
         Raises:
             ControllerError: a node cannot be computed; the message names it and the shapes it met.

@@ -35,7 +35,7 @@ def _get(x: Inputs, index: int) -> Tensor | None:
 
 
 def _axes(a: Attributes, x: Inputs) -> list[int] | None:
-    """Axes are an attribute in older operator sets and an input in newer ones."""
+    """The axes of an operator: an attribute in older operator sets, an input in newer ones."""
     return a.get("axes") or _integers(_get(x, 1))
 
 

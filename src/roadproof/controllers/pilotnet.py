@@ -37,11 +37,11 @@ class PilotNet(nn.Module):
     """The network alone: prepared frames in, steering out.
 
     Args:
-        activation: "elu" or "relu", after every layer but the last.
-        seed: of the initial weights (Xavier, biases 0), drawn without touching the global random state.
+        activation: activation after every layer but the last, "elu" or "relu".
+        seed: seed of the initial weights (Xavier, biases 0), drawn without touching the global random state.
 
     Raises:
-        ControllerError: an unknown activation.
+        ControllerError: the activation is unknown.
 
     Convention:
         The last feature map is flattened in C, H, W order.
@@ -69,7 +69,7 @@ class PilotNet(nn.Module):
 
 
 def pilotnet_convolutions() -> nn.ModuleList:
-    """The five convolutions, without what bends between them: 66×200 prepared frames to 64×1×18 maps."""
+    """The five convolutions without their activations: 66×200 prepared frames in, 64×1×18 feature maps out."""
     inputs = (3, *(channels for channels, _, _ in _CHANNELS_KERNEL_STRIDE))
     return nn.ModuleList(
         nn.Conv2d(c_in, c_out, k, s) for (c_out, k, s), c_in in zip(_CHANNELS_KERNEL_STRIDE, inputs, strict=False)
@@ -86,13 +86,13 @@ def pilotnet_controller(
     """PilotNet as a controller, with fresh weights.
 
     Args:
-        activation: "elu" or "relu".
-        preparation: how its 66×200 input is made from the frames; by default from those of CARLA's agent.
-        cruise: how the speed is held when driving.
-        seed: of the weights.
+        activation: activation after every layer but the last, "elu" or "relu".
+        preparation: how the network's 66×200 input is made from the frames; by default from those of CARLA's agent.
+        cruise: cruise control that holds the speed when driving; None for the usual one.
+        seed: seed of the initial weights.
 
     Raises:
-        ControllerError: an unknown activation, or a preparation that does not end at 66×200.
+        ControllerError: the activation is unknown, or the preparation does not end at 66×200.
     """
     if preparation.network_size != PILOTNET_SIZE:
         raise ControllerError(f"PilotNet's network_size is {preparation.network_size}, expected {PILOTNET_SIZE}")

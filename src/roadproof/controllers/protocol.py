@@ -33,9 +33,9 @@ class Controller(Protocol):
         """Steering of each frame by itself, differentiable in the frames.
 
         Args:
-            frames: RGB in [0, 1].
-            speed_mps: speed of the car at each frame.
-            command: what the route asks at each frame.
+            frames: RGB in [0, 1], (B, 3, H, W).
+            speed_mps: speed of the car at each frame, m/s, (B,).
+            command: what the route asks at each frame, in CARLA's codes (`datatypes.Command`), (B,).
 
         Returns:
             Steering in about [−1, 1], not clipped, in the frames' dtype.
@@ -61,13 +61,13 @@ class PedalController(Controller, Protocol):
         """Steer, throttle and brake of each frame by itself, inside their ranges, differentiable in the frames.
 
         Args:
-            frames: RGB in [0, 1].
-            speed_mps: speed of the car at each frame.
-            command: what the route asks at each frame.
+            frames: RGB in [0, 1], (B, 3, H, W).
+            speed_mps: speed of the car at each frame, m/s, (B,).
+            command: what the route asks at each frame, in CARLA's codes (`datatypes.Command`), (B,).
         """
         ...
 
 
 def missing_members(candidate: object) -> tuple[str, ...]:
-    """What an object lacks to be a `Controller`; properties are asked, and may raise."""
+    """The members that an object lacks to be a `Controller`; its properties are read, which may raise."""
     return tuple(name for name in ("input_size", "steer", "act") if not hasattr(candidate, name))

@@ -39,8 +39,8 @@ def convert_cil(checkpoint: Path, out: Path, *, overwrite: bool = False) -> None
     Args:
         checkpoint: an `.npz` file with one array a TensorFlow variable, under the variable's name; or, where
             TensorFlow is installed, the checkpoint itself by its name without `.index`, such as `model.ckpt-450000`.
-        out: the weights file, which ends in `.safetensors`. The card in its header names the checkpoint.
-        overwrite: whether a file that is already there may be replaced.
+        out: path of the weights file, which ends in `.safetensors`; the card in its header names the checkpoint.
+        overwrite: whether an existing file may be replaced.
 
     Raises:
         ControllerError: the checkpoint is missing or damaged, TensorFlow is needed and absent, or a variable is
@@ -68,7 +68,7 @@ def convert_cil(checkpoint: Path, out: Path, *, overwrite: bool = False) -> None
 
 
 def _variable_names() -> dict[str, str]:
-    """TensorFlow's name of every tensor of `CIL`.
+    """The name in TensorFlow of every tensor of `CIL`.
 
     Convolutions, normalisations and dense layers are each numbered from 1 in the order in which the graph was built.
     A bias is the nameless variable of the scope that it was made in.
@@ -152,7 +152,7 @@ def _require_all(names: Collection[str], held: Collection[str], path: Path) -> N
 
 
 def _tensor(variable: np.ndarray, shape: tuple[int, ...], path: Path, name: str) -> Float[Tensor, "..."]:
-    """A variable with its axes in torch's order, in which it has this shape."""
+    """A TensorFlow variable as a torch tensor of the given shape, with its axes in torch's order."""
     what = f"{path}: variable {name}"
     order = {4: (3, 2, 0, 1), 2: (1, 0), 1: (0,)}[len(shape)]
     expected = tuple(shape[order.index(axis)] for axis in range(len(shape)))

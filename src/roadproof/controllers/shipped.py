@@ -18,13 +18,13 @@ class ModelCard:
     """What there is to know about a shipped controller.
 
     Args:
-        name: what it is loaded by.
-        summary: one line.
-        network: architecture and size.
-        data: what it was shown.
-        training: how it learnt: samples, rounds, seeds, time.
-        can: what it does, with the scores that say so.
-        cannot: what it does not do, or not well.
+        name: name by which the controller is loaded.
+        summary: what the controller is, in one line.
+        network: architecture and size of the network.
+        data: what the network was trained on.
+        training: how the network was trained: samples, rounds, seeds, time.
+        can: what the controller does, with the scores that show it.
+        cannot: what the controller does not do, or not well.
     """
 
     name: str
@@ -45,7 +45,7 @@ def shipped_weights(name: str) -> Path:
     """The weights file of a shipped controller.
 
     Raises:
-        ControllerError: there is none of this name; the message names the nearest.
+        ControllerError: no shipped controller has this name; the message names the nearest.
     """
     names = shipped_names()
     if name not in names:
@@ -59,7 +59,7 @@ def model_card(name: str) -> ModelCard:
     """The card of a shipped controller.
 
     Raises:
-        ControllerError: there is none of this name.
+        ControllerError: no shipped controller has this name.
     """
     path = shipped_weights(name).with_suffix(".toml")
     content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -21,12 +21,12 @@ class CruiseControl:
     """Holds a speed: throttle, or brake, in proportion to how much is missing.
 
     Args:
-        target_mps: the speed to hold; CARLA's agent takes its turns at 5.5 to 7.
-        gain_per_mps: throttle for each m/s missing.
-        hold: throttle at the target speed, against drag.
+        target_mps: speed to hold, m/s, above 0; CARLA's agent takes its turns at 5.5 to 7.
+        gain_per_mps: throttle for each m/s by which the speed is too low.
+        hold: throttle at the target speed, which makes up for drag.
 
     Raises:
-        ControllerError: a target that is not positive.
+        ControllerError: the target is not positive.
     """
 
     target_mps: float = 6.0
@@ -38,12 +38,12 @@ class CruiseControl:
             raise ControllerError(f"target speed is {self.target_mps} m/s, expected a value above 0")
 
     def control(self, steer: float, speed_mps: float) -> Control:
-        """The control that steers so and approaches the target speed."""
+        """The control with this steering that approaches the target speed."""
         effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
         return Control(steer=steer, throttle=max(effort, 0.0), brake=max(-effort, 0.0)).clipped()
 
     def controls(self, steer: Float[Tensor, " b"], speed_mps: Float[Tensor, " b"]) -> Float[Tensor, "b 3"]:
-        """The same for many cars: steer, throttle and brake inside their ranges, differentiable."""
+        """Controls of many cars: steer, throttle and brake inside their ranges, differentiable."""
         effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
         return torch.stack([steer.clamp(-1.0, 1.0), effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0)], 1)
 
@@ -52,10 +52,10 @@ class SteeringController(nn.Module):
     """A `Controller` around a network that answers with one steering value a frame.
 
     Args:
-        network: takes the `inputs`, in order, and answers with shape (b,) or (b, 1).
+        network: network that takes the `inputs`, in order, and answers with shape (B,) or (B, 1).
         preparation: how the network's frames are made from those of a recording.
         inputs: what the network takes: "frames", and "speed_mps" and "command" if it wants them.
-        cruise: how the speed is held when driving.
+        cruise: cruise control that holds the speed when driving.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SteeringController(nn.Module):
         """Steering, positive to the right and not clipped; see `Controller.steer`.
 
         Raises:
-            ControllerError: frames of the wrong size, or an answer that is not one value a frame.
+            ControllerError: the frames have the wrong size, or the answer is not one value per frame.
         """
         tensors = chain(self.network.parameters(), self.network.buffers())
         dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), frames.dtype)
@@ -110,7 +110,7 @@ class SteeringController(nn.Module):
         """Steer by the network, throttle and brake by `cruise`; see `controllers.PedalController`.
 
         Raises:
-            ControllerError: as `steer` does.
+            ControllerError: the frames have the wrong size, or the answer is not one value per frame.
         """
         return self.cruise.controls(self.steer(frames, speed_mps, command), speed_mps)
 

@@ -11,14 +11,14 @@ from torch import nn
 
 @contextmanager
 def seeded(seed: int) -> Generator[None, None, None]:
-    """Draw from the seed inside the block; the global random state is as before afterwards."""
+    """Draw random numbers from the seed inside the block; afterwards the global random state is as it was."""
     with torch.random.fork_rng(devices=[]):  # pyright: ignore[reportUnknownMemberType]
         torch.manual_seed(seed)  # pyright: ignore[reportUnknownMemberType]
         yield
 
 
 def initialise_xavier(network: nn.Module, *, bias: float) -> None:
-    """Xavier weights and constant biases for every convolution and dense layer."""
+    """Give every convolution and dense layer Xavier weights and constant biases."""
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(module.weight)

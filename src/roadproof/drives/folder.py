@@ -33,15 +33,15 @@ class Drive:
     """One recorded drive and its frames that show the canvas.
 
     Args:
-        name: name of its folder.
-        push: how it was perturbed.
-        episode: the whole drive; its steering is what was done.
+        name: name of the drive and of its folder.
+        push: how the drive was perturbed.
+        episode: episode of the whole drive; its steering is what was applied.
         frame_number: steps of the episode whose frames are kept, (F,).
-        frames: the controller's input at those steps, RGB, (F, H, W, 3).
-        steer: what the driver answered to each of these frames, in [−1, 1], positive to the right, (F,).
-        right_m: offset from the clean drive at each of them in metres, positive to the right, (F,).
-        calls: drives of the simulator that it took, those given up included.
-        note: what the user should know; empty where there is nothing.
+        frames: the controller's input at the kept steps, RGB, (F, H, W, 3).
+        steer: what the driver answered to each kept frame, in [−1, 1], positive to the right, (F,).
+        right_m: offset from the clean drive at each kept frame, metres, positive to the right, (F,).
+        calls: number of simulator drives that it took, those given up included.
+        note: what the user should know about the drive; empty if there is nothing.
 
     Raises:
         RecordingError: there is no frame, lengths differ, or a step is not one of the episode.
@@ -70,12 +70,12 @@ class Drive:
 
     @property
     def states(self) -> tuple[VehicleState, ...]:
-        """Where the car was at each kept frame."""
+        """Pose and speed of the car at each kept frame."""
         return tuple(self.episode.state(step) for step in self.frame_number.tolist())
 
     @property
     def track(self) -> Track:
-        """Poses and controls of all its steps; what was given last is held at the last one."""
+        """Poses and controls of all steps of the drive; the last step holds the controls of the one before."""
         episode = self.episode
 
         def held(values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
@@ -96,20 +96,19 @@ class Drive:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Settings:
-    """What was asked of a recording; two with the same settings are the same recording.
+    """The settings of a recording; two recordings with the same settings are the same recording.
 
     Args:
-        scenario: that was driven.
-        weather: of all drives.
-        trajectories: which drives.
-        window: which frames are kept.
-        seed: of the perturbations.
-        driver: who drove, in words.
-        answers: which controller that is (`controllers.identity`); empty for a function, and in recordings older than
-            the word.
-        camera: on the car.
-        view: how the controller's input is made from its picture.
-        dt_s: seconds a step.
+        scenario: scenario that was driven.
+        weather: weather of all drives.
+        trajectories: number of drives and their perturbations.
+        window: which frames of each drive are kept.
+        seed: seed of the perturbations.
+        driver: name of the driver, in words.
+        answers: identity of the controller (`controllers.identity`); empty for a function, and in older recordings.
+        camera: camera on the car.
+        view: crop and resize that make the controller's input from the camera picture.
+        dt_s: seconds per step.
     """
 
     scenario: Scenario
@@ -129,8 +128,8 @@ class Drives:
     """The recorded drives of one scenario, not calibrated yet.
 
     Args:
-        settings: what was asked for.
-        drives: the clean one first.
+        settings: settings of the recording.
+        drives: the recorded drives, the clean one first.
 
     Raises:
         RecordingError: there is no drive, or the first is not the clean one.
@@ -145,16 +144,16 @@ class Drives:
 
     @property
     def calls(self) -> int:
-        """Drives the simulator made."""
+        """Number of drives the simulator made, those given up included."""
         return sum(drive.calls for drive in self.drives)
 
 
 def write_settings(settings: Settings, folder: Path) -> None:
-    """Begin the folder of a recording.
+    """Write the settings of a recording, which begins its folder.
 
     Raises:
-        RecordingError: it holds a recording with other settings; the message names the first.
-        OutputError: it cannot be written.
+        RecordingError: the folder holds a recording with other settings; the message names the first difference.
+        OutputError: the folder cannot be written.
     """
     path = folder / "record.json"
     if path.exists():
@@ -169,7 +168,7 @@ def write_drive(drive: Drive, folder: Path) -> None:
     """Write one finished drive to `folder`/its name, all or nothing.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the drive cannot be written.
     """
 
     def write(part: Path) -> None:
@@ -180,11 +179,11 @@ def write_drive(drive: Drive, folder: Path) -> None:
 
 
 def read_drive(name: str, folder: Path) -> Drive | None:
-    """A finished drive of a recording, or None where it is not finished.
+    """A finished drive of a recording; None if it is not finished.
 
     Raises:
-        RecordingError: it is damaged.
-        EpisodeError: its episode is.
+        RecordingError: the drive is damaged.
+        EpisodeError: the episode of the drive is damaged.
     """
     path = folder / name / "drive.npz"
     if not path.parent.is_dir():
@@ -212,7 +211,7 @@ def load_drives(folder: AnyPath) -> Drives:
 
 
 class _Trajectories(TypedDict):
-    """Trajectories in record.json: flat, with the keys of one kind of perturbation."""
+    """Trajectories as record.json stores them: flat, with the keys of one kind of perturbation."""
 
     count: int
     scheme: Scheme

@@ -43,10 +43,10 @@ class CleanPath:
     """A clean drive as a line on the ground.
 
     Args:
-        arclength_m: of each of its points, rising.
-        x_m: of each point, as y_m and heading_rad.
-        steer: that was given there.
-        curvature_per_steer: g.
+        arclength_m: arclength of each point of the path, metres, rising, (n,).
+        x_m: world x of each point, metres, (n,); y_m likewise, and heading_rad in radians, left positive.
+        steer: steer that was given at each point, (n,).
+        curvature_per_steer: curvature g of a unit of steer, 1/m.
     """
 
     arclength_m: Float[np.ndarray, " n"]
@@ -58,7 +58,7 @@ class CleanPath:
 
     @staticmethod
     def of(episode: Episode) -> CleanPath:
-        """The path of an episode.
+        """The path of a clean episode.
 
         Raises:
             RecordingError: the car did not move.
@@ -74,11 +74,11 @@ class CleanPath:
         return CleanPath(arclength, episode.x_m[on], episode.y_m[on], heading[on], steer, max(float(gain), 0.05))
 
     def locate(self, state: VehicleState, near_m: float | None) -> tuple[float, float]:
-        """Arclength s and offset d of a car.
+        """Arclength s along the path and offset d from it of a car, metres.
 
         Args:
-            state: the car.
-            near_m: s a moment ago, so that a path that crosses itself is not mistaken; None searches all of it.
+            state: state of the car.
+            near_m: s a moment ago, so that a path that crosses itself is not mistaken; None searches all of the path.
         """
         distance = np.hypot(self.x_m - state.x_m, self.y_m - state.y_m)
         if near_m is not None:
@@ -89,7 +89,7 @@ class CleanPath:
         return float(self.arclength_m[k] + c * dx + s * dy), s * dx - c * dy
 
     def at(self, values: Float[np.ndarray, " n"], s: float) -> float:
-        """What has one value a point of the path, in between."""
+        """Values given at the points of the path, interpolated at arclength s."""
         return float(np.interp(s, self.arclength_m, values))
 
 
@@ -104,12 +104,12 @@ class Offsets:
 
     @staticmethod
     def of(arclength_m: Float[np.ndarray, " n"], offset_m: Float[np.ndarray, " n"]) -> Offsets:
-        """From offsets at evenly spaced arclengths."""
+        """Offsets, with slope and bend, from values at evenly spaced arclengths."""
         slope = np.gradient(offset_m, arclength_m)
         return Offsets(arclength_m, offset_m, slope, np.gradient(slope, arclength_m))
 
     def at(self, s: float) -> tuple[float, float, float]:
-        """d*, d*' and d*''."""
+        """Offset d*, slope d*' and bend d*'' at arclength s."""
         offset, slope, bend = (
             float(np.interp(s, self.arclength_m, values)) for values in (self.offset_m, self.slope, self.bend)
         )
@@ -129,13 +129,13 @@ def offsets(
     """An offset that grows from 0 while the canvas is in view, to one side or, at random, to both.
 
     Args:
-        push: RIGHT, LEFT or RANDOM.
-        size_m: the largest offset.
-        from_m: arclength at which the canvas comes into view.
-        to_m: arclength at which it is out of view.
-        length_m: of the path.
-        rng: draws where it rises.
-        weaves: from side to side, beginning to the right or the left.
+        push: side of the offset: RIGHT, LEFT or RANDOM.
+        size_m: largest offset, metres.
+        from_m: arclength at which the canvas comes into view, metres.
+        to_m: arclength at which the canvas is out of view, metres.
+        length_m: length of the path, metres.
+        rng: random generator that draws where the offset rises and, for RANDOM, its sizes.
+        weaves: whether the offset weaves from side to side, to the pushed side first.
     """
     s = np.arange(0.0, length_m + _FINE_M, _FINE_M)
     side = 1.0 if push is Push.RIGHT else -1.0
@@ -156,18 +156,18 @@ def offsets(
 
 
 def _smooth(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """From 0 to 1 with slope and bend 0 at both ends."""
+    """A step that rises smoothly from 0 to 1, with slope and bend 0 at both ends."""
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
 
 
 def swerving(policy: Policy, path: CleanPath, wanted: Offsets, answered: Callable[[float], object]) -> Policy:
-    """Drives along a path with an offset, at the speed of another policy.
+    """A policy that drives along a path with an offset, at the speed of another policy.
 
     Args:
-        policy: asked at every step; only its pedals are used.
-        path: the clean drive.
-        wanted: offsets from it.
-        answered: told what the policy would have steered.
+        policy: policy that is asked at every step; only its pedals are used.
+        path: path of the clean drive.
+        wanted: wanted offsets from the path.
+        answered: called at every step with the steer that the policy gave.
     """
     at_m: float | None = None
 
@@ -191,8 +191,8 @@ def steering_test(side: float, dt_s: float) -> list[float]:
     """Steer for a second: full to a side, full to the other, straight; it shows how far and how fast the wheels turn.
 
     Args:
-        side: 1 begins to the right, −1 to the left.
-        dt_s: seconds a step.
+        side: 1 to begin to the right, −1 to the left.
+        dt_s: seconds per step.
     """
     held = max(round(_TEST_S / dt_s), 1)
     return [*([side] * held), *([-side] * held), *([0.0] * (held // 2))]
@@ -201,13 +201,13 @@ def steering_test(side: float, dt_s: float) -> list[float]:
 def noisy(
     policy: Policy, clean: Episode, noise_deg: Float[np.ndarray, " n"], answered: Callable[[float], object]
 ) -> Policy:
-    """Gives a clean drive's controls again with noise on the steering, while another policy is asked.
+    """A policy that repeats a clean drive's controls with noise on the steering, while another policy is asked.
 
     Args:
-        policy: asked at every step; nothing of it is carried out.
-        clean: whose controls are given.
-        noise_deg: added at every step, positive to the right; n° are n·π/180 of steer.
-        answered: told what the policy would have steered.
+        policy: policy that is asked at every step; nothing it answers is carried out.
+        clean: episode of the clean drive whose controls are repeated.
+        noise_deg: noise added at each step, degrees, positive to the right, (n,); n° are n·π/180 of steer.
+        answered: called at every step with the steer that the policy gave.
     """
     step = 0
 
@@ -224,14 +224,14 @@ def noisy(
 def steering_noise(
     push: Push, noise: SteeringNoise, clean: Episode, last_step: int, rng: np.random.Generator
 ) -> Float[np.ndarray, " n"]:
-    """One draw of whole degrees a step, positive to the right, 0 outside its time.
+    """Steering noise: one draw of whole degrees per step, positive to the right, 0 outside the noise's time.
 
     Args:
-        push: RIGHT, LEFT or RANDOM.
-        noise: how much.
-        clean: the drive it is added to.
-        last_step: at which the canvas is last in view.
-        rng: draws.
+        push: side of the noise: RIGHT, LEFT or RANDOM.
+        noise: range of the noise.
+        clean: episode of the clean drive to which the noise is added.
+        last_step: number of the step at which the canvas is last in view.
+        rng: random generator of the draws.
     """
     count = clean.steer.size
     draws = rng.integers(noise.low_deg, noise.high_deg + 1, count).astype(np.float64)

@@ -55,14 +55,14 @@ def record(
     Args:
         simulator: an open simulator.
         driver: a controller, or a function that is given the simulator after each reset.
-        scenario: where.
-        weather: of all drives.
-        trajectories: which drives; one clean and one pushed 1.5 m to each side by default.
-        window: which frames are kept.
-        seed: of the perturbations.
-        driver_name: who drives, in words, for the record.
-        folder: keeps every finished drive; those it holds already are not driven again.
-        on_drive: called with the number of finished drives.
+        scenario: scenario that is driven.
+        weather: weather of all drives, clear noon by default.
+        trajectories: number of drives and their perturbations; by default one clean and one pushed 1.5 m to each side.
+        window: which frames of each drive are kept; `Window()` by default.
+        seed: seed of the perturbations.
+        driver_name: name of the driver in words, for the record; empty by default.
+        folder: folder that keeps every finished drive; those it holds already are not driven again. None keeps nothing.
+        on_drive: called with the number of finished drives, at first 0.
 
     Raises:
         RecordingError: the canvas never comes into view, no drive passes it unharmed, or the folder holds a recording
@@ -112,16 +112,16 @@ def record_along(
 ) -> Drive:
     """Record the bare road along a drive made before: its controls given again, open loop, with no paint.
 
-    What the paint did to it is in the way it goes, and it alone; where it came to harm, the drive is cut. It counts as
-    pushed to the side on which it was furthest from the clean drive.
+    The paint's effect on the drive is in the path alone; a drive that came to harm is cut there. It counts as pushed to
+    the side on which it was furthest from the clean drive.
 
     Args:
         simulator: an open simulator, the one the drives were recorded in.
-        controller: asked for its answers to the frames, which are not carried out.
-        drives: a recording of the same scenario; gives scenario, weather, window and clean drive.
-        episode: what is driven again.
-        name: of the drive.
-        folder: keeps it; a drive it holds already is not driven again.
+        controller: controller that is asked for its answers to the frames, which are not carried out.
+        drives: a recording of the same scenario; it gives scenario, weather, window and clean drive.
+        episode: episode whose controls are given again.
+        name: name of the new drive.
+        folder: folder that keeps the drive; a drive it holds already is not driven again. None keeps nothing.
 
     Raises:
         RecordingError: the canvas never comes into view, or the drive in the folder is damaged.
@@ -161,7 +161,7 @@ Frame: TypeAlias = UInt8[np.ndarray, "h w 3"]
 
 @dataclass(slots=True)
 class _Film:
-    """Keeps the frames of a drive near the canvas, to choose from."""
+    """Collects the frames of a drive near the canvas, from which those to keep are chosen."""
 
     scenario: Scenario
     window: Window
@@ -222,7 +222,7 @@ def _astray(
     share: float,
     film: _Film,
 ) -> tuple[Episode, Float[np.ndarray, " n"], float]:
-    """One perturbed drive to behind the canvas, what the driver answered on the way, and when it was behind.
+    """One perturbed drive past the canvas, the driver's answers on it, and the time at which the canvas was passed.
 
     A swerve ends with a steering test there, from which a vehicle can be identified (`recorded.vehicle`); it stops
     where it comes to harm.
@@ -267,7 +267,7 @@ Chosen: TypeAlias = tuple[Int[np.ndarray, " f"], UInt8[np.ndarray, "f h w 3"], I
 
 
 def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
-    """Steps and frames to keep, and which of the filmed ones they are.
+    """The steps and frames to keep, and their indices among the collected frames.
 
     Raises:
         RecordingError: the canvas is not in view.
@@ -284,14 +284,14 @@ def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, " f"]:
-    """Indices of at most so many of a number of frames, evenly spread, the first and the last among them."""
+    """Indices of at most `most` of `count` frames, evenly spread, the first and the last included."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def in_view(
     states: list[VehicleState], canvas: CanvasPlacement, camera: CameraModel, view: CropResize, least_px: int
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the canvas fills so many pixels of the controller's input, going by the pose; occluders do not count."""
+    """Whether the canvas fills `least_px` pixels of the controller's input, by the pose; occlusion does not count."""
     if not states:
         return np.zeros(0, bool)
     image_from_canvas = np.stack([homography_from_pose(camera, state, canvas) for state in states])

@@ -28,12 +28,12 @@ class Swerve:
     this size more than on how many drives there are.
 
     Args:
-        deviations_m: sizes; the pairs of a Group (or the drives of Random) take them in turn.
-        weaves_m: sizes of further ones that weave from side to side instead, beginning to their own: they show what a
-            car sees that has turned, as an attacked one does.
+        deviations_m: sizes of the swerves, metres; the pairs of a Group (or the drives of Random) take them in turn.
+        weaves_m: sizes of further drives, metres, that weave from side to side, so that frames show what a car sees
+            that has turned, as an attacked one has.
 
     Raises:
-        RecordingError: there is none, or one is outside 0.1…5 m.
+        RecordingError: there is no size, or a size is outside 0.1…5 m.
     """
 
     deviations_m: tuple[float, ...] = (1.5,)
@@ -53,11 +53,11 @@ class SteeringNoise:
     the canvas is out of view. Nothing steers back; how far the car goes astray depends on its speed.
 
     Args:
-        low_deg: least noise to a side.
-        high_deg: most.
+        low_deg: least noise to a side, whole degrees.
+        high_deg: largest noise to a side, whole degrees.
 
     Raises:
-        RecordingError: not 0 ≤ low ≤ high ≤ 57, or only zero.
+        RecordingError: the range is not 0 ≤ low ≤ high ≤ 57, or it is only zero.
 
     References:
         getNoiseTrajs.sh of the released code.
@@ -75,14 +75,14 @@ class SteeringNoise:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """One drive to be recorded.
+    """The plan of one drive to be recorded.
 
     Args:
-        name: of its folder.
-        push: to which side.
+        name: name of the drive and of its folder.
+        push: side to which the drive is pushed.
         offset_m: largest offset of a swerve in metres; 0 for a clean drive and for steering noise.
-        stream: numbers its random draws.
-        weaves: whether it weaves from side to side.
+        stream: number that tells its random draws from those of other drives.
+        weaves: whether the drive weaves from side to side.
     """
 
     name: str
@@ -94,12 +94,12 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Trajectories:
-    """How many drives, and how they are perturbed.
+    """How many drives are recorded, and how they are perturbed.
 
     Args:
-        count: T of the paper: the clean drive and T − 1 perturbed ones.
-        scheme: "group": pairs of which one is pushed right, one left; "random": each to both sides at random.
-        perturbation: by metres, or by degrees as published.
+        count: the paper's T, 1, 3, 5 or 7: the clean drive and T − 1 perturbed ones.
+        scheme: "group" for pairs, of which one is pushed right and one left; "random" for both sides at random.
+        perturbation: swerve by metres, or steering noise by degrees as published.
 
     Raises:
         RecordingError: T is not 1, 3, 5 or 7.
@@ -114,7 +114,7 @@ class Trajectories:
             raise RecordingError(f"T is {self.count} trajectories, expected one of {', '.join(map(str, COUNTS))}")
 
     def plans(self) -> tuple[Plan, ...]:
-        """The drives, the clean one first."""
+        """The plans of all drives, the clean one first."""
         pushes = (Push.RANDOM,) if self.scheme is Scheme.RANDOM else (Push.RIGHT, Push.LEFT)
         how, sizes = self.perturbation, [(0.0, False)]
         if isinstance(how, Swerve):
@@ -132,12 +132,12 @@ class Window:
     """Which frames of a drive are kept.
 
     Args:
-        horizon_m: at most so far before the canvas' near edge.
-        least_px: pixels of the controller's input that show the canvas, at least.
-        frames: at most so many a drive, evenly spread.
+        horizon_m: largest distance before the canvas' near edge, metres.
+        least_px: least number of pixels of the controller's input that show the canvas.
+        frames: largest number of frames per drive, evenly spread.
 
     Raises:
-        RecordingError: one of them is not positive.
+        RecordingError: a field is not positive.
     """
 
     horizon_m: float = 25.0

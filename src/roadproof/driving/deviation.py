@@ -31,9 +31,9 @@ def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZO
     Distances are driven ones, measured from where the drive comes closest to the canvas' middle, so bends do no harm.
 
     Args:
-        clean: path of the drive without paint.
-        canvas: where the canvas lies.
-        horizon_m: from how far before its near edge the canvas counts as seen.
+        clean: path of the drive without paint: world x, y of its positions, metres, (n, 2).
+        canvas: place of the canvas in the world.
+        horizon_m: driven distance before the canvas' near edge from which on the canvas counts as seen, metres.
 
     Raises:
         EpisodeError: the path is empty, or has NaN or infinite values.
@@ -57,8 +57,8 @@ def deviation_m(clean: Path2D, painted: Float[np.ndarray, "m 2"]) -> float:
     ended before all instants had passed, each direction is the mean over the positions there are.
 
     Args:
-        clean: positions without the pattern.
-        painted: positions with it.
+        clean: positions of the drive without the pattern: world x, y, metres, (n, 2).
+        painted: positions of the drive with the pattern, (m, 2).
 
     Raises:
         EpisodeError: a path is empty, or has NaN or infinite values.
@@ -78,8 +78,8 @@ def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[n
     Positions before its beginning or beyond its end are compared with the line that goes on straight.
 
     Args:
-        reference: the path, in the order it was driven.
-        positions: what to compare.
+        reference: the path, world x, y in the order of driving, metres, (n, 2).
+        positions: positions to compare with the path, (m, 2).
 
     Raises:
         EpisodeError: a path is empty or not finite, or the reference does not move.
@@ -111,7 +111,7 @@ def _check_path(path: np.ndarray, name: str) -> None:
 
 
 def path_of(episode: Episode) -> Path2D:
-    """World x, y of the car at each observation."""
+    """World x, y of the car at each observation of an episode, metres, (n, 2)."""
     return np.column_stack([episode.x_m, episode.y_m])
 
 

@@ -40,11 +40,11 @@ class Conditions:
 
     Args:
         paint: name of what is painted; "clean" is the bare road.
-        weather: in which.
-        cars: others on the road.
-        pedestrians: people about.
-        seed: of both.
-        start: how it begins.
+        weather: weather of the drive.
+        cars: number of other cars on the road.
+        pedestrians: number of pedestrians.
+        seed: seed of cars and pedestrians.
+        start: offset of the drive's start from the scenario's.
     """
 
     paint: str
@@ -57,15 +57,15 @@ class Conditions:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Episodes:
-    """Makes drives that are not there yet, and judges them. Travels between processes if its driver can.
+    """Makes drives that the folder lacks, and judges drives. It can be pickled if its driver can.
 
     Args:
-        driver: who drives.
-        scenario: where.
-        paints: what is painted, by name.
-        digests: hash of each of them, and of none for the bare road.
-        folder: they are in its folder "episodes".
-        parts: all that every drive depends on.
+        driver: controller, or function, that drives.
+        scenario: scenario that is driven.
+        paints: canvas pictures of what is painted, by name.
+        digests: hash of each paint, by name, with the bare road's under "clean".
+        folder: folder whose subfolder "episodes" has the drives.
+        parts: everything that all drives depend on, by name.
     """
 
     driver: AnyDriver
@@ -83,7 +83,7 @@ class Episodes:
         paints: Mapping[str, PatternImage],
         folder: Path,
     ) -> Episodes:
-        """Those that a driver makes in a simulator."""
+        """The store of the drives that a driver makes in a simulator."""
         hashed = {name: paint.tobytes() for name, paint in paints.items()} | {CLEAN: b""}
         return Episodes(
             driver=driver,
@@ -96,12 +96,12 @@ class Episodes:
 
     @property
     def made_of(self) -> dict[str, object]:
-        """The parts, with the controller's answers apart from what it is called."""
+        """The parts that identify the drives, with the digest of a controller's answers apart from its name."""
         driver, answers = cast("list[object]", self.parts["driver"])
         return {**self.parts, "driver": driver, ANSWERS: digest(stated(answers))}
 
     def file(self, drive: Conditions) -> str:
-        """What it is called."""
+        """The file name of a drive's episode."""
         parts = [stated(self.parts), self.digests[drive.paint]]
         parts += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
         parts += [] if drive.start == NOMINAL else [repr(drive.start)]
@@ -109,11 +109,11 @@ class Episodes:
         return f"{drive.weather}-{among}-{drive.paint}-{digest(stated(parts))[:12]}.npz"
 
     def has(self, drive: Conditions) -> bool:
-        """Whether it was made before."""
+        """Whether a drive is in the folder already."""
         return self._path(drive).exists()
 
     def make(self, simulator: Simulator, drive: Conditions) -> None:
-        """Make it and keep it; one that is there is left as it is.
+        """Make a drive and keep it; a drive that is in the folder already is left as it is.
 
         Raises:
             SimulatorError, ControllerError: as `rollout` does.
@@ -134,14 +134,14 @@ class Episodes:
         self.put(drive, episode)
 
     def put(self, drive: Conditions, episode: Episode) -> None:
-        """Keep one that was made elsewhere."""
+        """Keep an episode that was made elsewhere."""
         episode.save(self._path(drive))
 
     def trial(self, clean: Conditions, painted: Conditions) -> Trial:
         """What paint did, from two drives that differ in it alone.
 
         Raises:
-            EpisodeError: one is missing or damaged.
+            EpisodeError: a drive is missing or damaged.
         """
         return judge(
             Episode.load(self._path(clean)),
@@ -161,7 +161,7 @@ def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
     """Drives by their file names.
 
     Raises:
-        EpisodeError: one is missing or damaged.
+        EpisodeError: a drive is missing or damaged.
     """
     return tuple(Episode.load(inside(folder / "episodes", name, "episode", EpisodeError)) for name in names)
 
@@ -172,7 +172,7 @@ def driver_in_words(driver: AnyDriver) -> str:
 
 
 def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[str, object]:
-    """Everything that all drives depend on, by name. A controller is known by what it answers."""
+    """Everything that all drives depend on, by name; a controller is identified by what it answers."""
     view = simulator.input
     answers = answers_of(driver, (view.height_px, view.width_px)) if isinstance(driver, Controller) else []
     parts: dict[str, object] = {

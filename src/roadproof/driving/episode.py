@@ -31,22 +31,21 @@ class Episode(Saved):
         scenario: name of the scenario.
         weather: the weather of the drive.
         painted: whether there was a pattern on the canvas.
-        paint: how the simulator puts a pattern there. Files that do not say it are older than the word, when the town
-            alone was driven.
-        cars: how many other cars were asked for.
-        pedestrians: how many people were asked for.
-        seed: seed of cars and people.
+        paint: how the simulator put the pattern on the road; rendered in older files, which are all of the town.
+        cars: number of other cars that were asked for.
+        pedestrians: number of pedestrians that were asked for.
+        seed: seed of cars and pedestrians.
         dt_s: seconds per step.
         ending: why the drive ended.
-        events: what happened, in order.
+        events: events of the drive, in order.
         time_s: seconds since the reset at each observation, (n,).
         x_m: world x of the car at each observation in metres, (n,); y_m and z_m likewise.
         yaw_rad: heading at each observation in radians, left positive, (n,).
         speed_mps: speed at each observation in m/s, (n,).
         command: what the route asks, in CARLA's codes (`datatypes.Command`), (n,).
         steer: steering given after each observation but the last, in [−1, 1], right positive, (n − 1,).
-        throttle: given with it, in [0, 1], (n − 1,).
-        brake: given with it, in [0, 1], (n − 1,).
+        throttle: throttle given with each steering, in [0, 1], (n − 1,).
+        brake: brake given with each steering, in [0, 1], (n − 1,).
 
     Raises:
         EpisodeError: there is no observation, lengths differ, or a value is not finite.
@@ -85,7 +84,7 @@ class Episode(Saved):
         return self.time_s.size
 
     def state(self, step: int) -> VehicleState:
-        """Where the car was at an observation, and how fast."""
+        """Pose and speed of the car at an observation."""
         return VehicleState(*(float(getattr(self, name)[step]) for name in VehicleState.__slots__))
 
 

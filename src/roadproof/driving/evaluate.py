@@ -58,21 +58,20 @@ def evaluate(
         simulator: an open one, or a function that makes one, such as `TownSimulator`; needed for several processes.
             What a recorded world answers is predicted, and the evaluation says so.
         driver: a controller, or a function as `training.expert.expert`; for several processes it must be picklable.
-        scenario: where.
-        pattern: what is painted.
-        folder: keeps every drive; an interrupted evaluation goes on from it.
-        driver_name: what reports call the driver; by default its type or name.
-        weathers: in which; the paper's four by default.
-        starts: drives alone a weather, each from a start drawn from `start_range`; 0 drives once from the scenario's.
-        start_range: by default 0.3 m and 0.05 rad to either side and up to 2 m/s faster.
-        runs: drives with traffic a weather, each with a seed and a start of its own.
-        cars: others on the road in those.
-        pedestrians: people about in those.
-        seed: of the first run, and of the starts.
-        baseline: other patterns to compare with: each driven alone from one of the starts in turn, and in turn with
-            traffic.
-        processes: drives made at once, each in a process with a simulator of its own.
-        on_drive: told after each drive how many are done, and of how many.
+        scenario: scenario that is driven.
+        pattern: pattern that is painted, or a picture of the canvas.
+        folder: folder that keeps every drive, so that an interrupted evaluation goes on from it.
+        driver_name: name of the driver in reports; by default its type or name.
+        weathers: weathers of the drives; the paper's four by default.
+        starts: number of drives alone per weather, each from a drawn start; 0 for one from the scenario's own start.
+        start_range: range of the starts; by default 0.3 m and 0.05 rad to either side and up to 2 m/s faster.
+        runs: number of drives with traffic per weather, each with a seed of its own, from the starts in turn.
+        cars: number of other cars in drives with traffic.
+        pedestrians: number of pedestrians in drives with traffic.
+        seed: seed of the first run with traffic, from which the others count on, and of the starts.
+        baseline: other patterns to compare with, driven alone from the starts in turn, and in turn with traffic.
+        processes: number of drives made at once, each in a process with a simulator of its own.
+        on_drive: called after each drive with the number of drives done and of all drives.
 
     Raises:
         EpisodeError: there is nothing to drive, several processes are asked for with an open simulator, or a drive in
@@ -153,7 +152,7 @@ def _planned(
     pedestrians: int,
     seed: int,
 ) -> list[tuple[Conditions, Conditions]]:
-    """Every clean drive with each painted one that is compared with it."""
+    """Pairs of every clean drive with each painted drive that is compared with it."""
     random = [name for name in paints if name != ATTACK]
     pairs: list[tuple[Conditions, Conditions]] = []
     for weather in weathers:
@@ -174,14 +173,14 @@ def make_together(
     processes: int,
     on_done: Callable[[int], object],
 ) -> None:
-    """Deal the drives out to processes; what is done shows in the folder.
+    """Share drives out among processes; progress is read from the folder.
 
     Args:
-        factory: makes a simulator in each of them.
-        episodes: where the drives are kept.
-        drives: that are missing.
-        processes: how many at most.
-        on_done: told how many of them are there.
+        factory: function that makes a simulator, called in each process.
+        episodes: store of the drives.
+        drives: drives that are missing from the store.
+        processes: largest number of processes.
+        on_done: called with the number of these drives that are done.
 
     Raises:
         SimulatorError: a process died, or the simulator refuses the conditions.
@@ -203,7 +202,7 @@ def make_together(
 
 
 def _make_share(factory: SimulatorFactory, episodes: Episodes, drives: Sequence[Conditions]) -> None:
-    """What one process does."""
+    """Make one process' share of the drives."""
     torch.set_num_threads(1)
     with factory() as world:
         for drive in drives:

@@ -49,19 +49,19 @@ class Row:
 
     Args:
         pattern: "attack" or "random".
-        weather: None for all weathers together.
-        traffic: whether there were other cars and people.
-        deviation_m: the paper's deviation.
-        lateral_m: largest offset from the clean path, to whichever side.
-        count: how many trials.
-        median_m: of the deviation.
-        least_m: of it, as most_m.
+        weather: weather of the trials; None for all weathers together.
+        traffic: whether there were other cars and pedestrians.
+        deviation_m: mean of the paper's deviation, metres.
+        lateral_m: mean of the largest offset from the clean path, to whichever side, metres.
+        count: number of trials.
+        median_m: median of the deviation, metres.
+        least_m: smallest deviation, metres; most_m is the largest.
         left_lane: share of the drives that leave their lane (`Trial.leaves_lane`): the success rate.
-        points: infraction points with paint; None where nothing is known of them, as for the next three.
-        clean_points: without.
-        leaderboard: the Leaderboard's factor with paint.
-        failed: share of the drives with any event.
-        first_event_s: over the drives with an event; None where there is none.
+        points: mean infraction points with paint; None, as in the next three, if infractions are not known.
+        clean_points: mean infraction points without paint.
+        leaderboard: mean of the Leaderboard's factor with paint.
+        failed: share of the painted drives with any event.
+        first_event_s: mean time of the first event over the drives that have one, seconds; None if there is none.
     """
 
     pattern: str
@@ -83,23 +83,22 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Evaluation:
-    """How one pattern fared, closed loop.
+    """The outcome of driving over one pattern in many conditions, closed loop.
 
     Args:
-        scenario: that was driven.
-        controller: who drove, in words.
-        weathers: in which.
-        runs: drives with traffic, per weather.
-        cars: on the road in those.
-        pedestrians: about in those.
-        seed: of the first run; the others count on from it.
-        starts: drives alone in each weather, each from a start of its own; 0 where there was one from the scenario's.
-        start_range: what those are drawn from.
-        trials: every drive over paint.
-        simulator_calls: drives that all this takes, clean ones included; 0 where they are predicted.
-        seconds: wall time of the drives made now; those found in the folder cost nothing.
-        paint: how the simulator puts a pattern on the road; files that do not say it are older than the word, when the
-            town alone was driven.
+        scenario: scenario that was driven.
+        controller: name of the driver.
+        weathers: weathers of the drives.
+        runs: number of drives with traffic per weather.
+        cars: number of other cars in drives with traffic.
+        pedestrians: number of pedestrians in drives with traffic.
+        seed: seed of the first run with traffic; the others count on from it.
+        starts: number of drives alone per weather, each from a drawn start; 0 for one from the scenario's own start.
+        start_range: range that the starts were drawn from.
+        trials: comparison of every drive over paint with its clean drive.
+        simulator_calls: number of drives that the evaluation takes, clean ones included; 0 if they are predicted.
+        seconds: wall time in seconds of the drives made in this call; those found in the folder cost nothing.
+        paint: how the simulator put a pattern on the road; rendered in older files, which are all of the town.
     """
 
     scenario: Scenario
@@ -118,7 +117,7 @@ class Evaluation:
 
     @property
     def predicted(self) -> bool:
-        """Whether all this is predicted, and nothing was driven for real."""
+        """Whether the drives are predicted, and nothing was driven for real."""
         return self.paint.predicted
 
     @property
@@ -127,7 +126,7 @@ class Evaluation:
         return len({name for trial in self.trials for name in (trial.clean, trial.painted)})
 
     def of(self, pattern: str = ATTACK, *, traffic: bool, weather: Weather | None = None) -> tuple[Trial, ...]:
-        """The trials of "attack" or "random" in one weather, or in all."""
+        """The trials of "attack" or "random", with or without traffic, in one weather, or in all."""
         return tuple(
             trial
             for trial in self.trials
@@ -148,7 +147,7 @@ class Evaluation:
         return tuple(found)
 
     def shown(self) -> Trial:
-        """The trial that stands for all in pictures: the first weather's, without traffic."""
+        """The trial that stands for all in pictures: the first over the pattern without traffic."""
         return self.of(traffic=False)[0]
 
     def _repr_html_(self) -> str:
@@ -177,7 +176,7 @@ class Evaluation:
 
     @staticmethod
     def load(folder: AnyPath) -> Evaluation:
-        """Read what `save` wrote.
+        """Read the evaluation that `save` wrote.
 
         Raises:
             EpisodeError: a file is missing, damaged or of another format.
@@ -203,7 +202,7 @@ EVALUATION_FILE = RecordFile(
 
 
 def kind_of(paint: PaintKind) -> str:
-    """What numbers over such paint are called in files."""
+    """What numbers over paint of this kind are called in files: "predicted" or "closed loop"."""
     return "predicted" if paint.predicted else "closed loop"
 
 
@@ -250,7 +249,7 @@ def _shown(row: Row) -> tuple[object, ...]:
 
 
 def _save_scenario(scenario: Scenario, folder: Path) -> None:
-    """The scenario, and its map where that is a file."""
+    """Write the scenario, and its map if that is a file."""
     source = Path(scenario.map_name)
     if source.suffix == ".xodr" and source.resolve().parent != folder.resolve():
         write_atomically(folder / source.name, lambda part: shutil.copyfile(source, part))
@@ -259,7 +258,7 @@ def _save_scenario(scenario: Scenario, folder: Path) -> None:
 
 
 def load_paint(folder: Path) -> PatternImage:
-    """What was painted in an evaluation.
+    """The picture of what was painted in an evaluation.
 
     Raises:
         PatternError: the file is missing or damaged.

@@ -51,7 +51,7 @@ def counted(events: Sequence[Event]) -> tuple[Event, ...]:
     changes nothing.
 
     Args:
-        events: of one drive, in order.
+        events: events of one drive, in order of time.
     """
     kept: list[Event] = []
     last_s: dict[tuple[str, ...], float] = {}

@@ -19,8 +19,8 @@ class Mean:
     Args:
         value: the mean.
         low: lower end of the interval; None for fewer than two values.
-        high: its upper end.
-        count: how many values.
+        high: upper end of the interval; None for fewer than two values.
+        count: number of values.
     """
 
     value: float

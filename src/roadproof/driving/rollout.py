@@ -54,22 +54,22 @@ def rollout(
         simulator: an open simulator.
         driver: a controller, or a function that is given the simulator after each reset, such as
             `training.expert.expert` or `replay`.
-        scenario: start, goal, canvas, time limit and map.
-        weather: of the drive.
-        pattern: painted on the canvas; None leaves the road bare.
-        cars: others on the road.
-        pedestrians: people about.
-        seed: of cars and people.
+        scenario: scenario with start, goal, canvas, time limit and map.
+        weather: weather of the drive, clear noon by default.
+        pattern: pattern painted on the canvas, or a picture of the canvas; None leaves the road bare.
+        cars: number of other cars on the road.
+        pedestrians: number of pedestrians.
+        seed: seed of cars and pedestrians.
         full_pictures: which observations show the full camera picture to driver and `on_step`.
-        on_step: told of each step; the simulator still is where the observation was made.
-        until: stops the drive at the first observation it says yes to.
+        on_step: called after each step; the simulator is then still at the state of the observation.
+        until: condition that ends the drive at the first observation for which it is true; None for none.
 
     Raises:
         SimulatorError: the simulator is not open, an argument does not fit, or a driver's control is not finite.
         ScenarioError: the scenario does not fit its map.
         PatternError: the pattern is a batch.
         ControllerError: the controller takes frames of another size, raises, or answers with something that is no
-            control; the message names its author's line.
+            control; the message names the line of its author's code.
     """
     if isinstance(driver, Controller):
         _check_size(driver, simulator)
@@ -119,7 +119,7 @@ def rollout(
 def replay(episode: Episode) -> Driver[Simulator]:
     """A driver that gives an episode's controls again: same scenario and seed, same states, whatever is painted.
 
-    After the last of them it brakes.
+    After the last control it brakes.
     """
 
     def begin(_: Simulator) -> Policy:
@@ -136,14 +136,14 @@ def replay(episode: Episode) -> Driver[Simulator]:
 
 
 def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:
-    """What a driver does in a drive that has just begun."""
+    """The policy of a driver for a drive that has just begun."""
     if not isinstance(driver, Controller):
         return driver(simulator)
     return lambda seen: act_of(driver, seen.frame, seen.state.speed_mps, int(seen.command))
 
 
 def _check_size(controller: Controller, simulator: Simulator) -> None:
-    """Before the town is built, and also for controllers that would not complain themselves."""
+    """Refuse frames of the wrong size before the town is built, also for controllers that would not complain."""
     size, view = frame_size_of(controller), simulator.input
     if size is not None and size != (view.height_px, view.width_px):
         raise ControllerError(

@@ -19,9 +19,9 @@ class StartOffset:
     """How a drive's start differs from its scenario's.
 
     Args:
-        right_m: to the right.
-        turned_rad: heading, left positive.
-        faster_mps: speed; nobody drives backwards.
+        right_m: shift to the right, metres.
+        turned_rad: turn of the heading, radians, left positive.
+        faster_mps: increase of speed, m/s; the resulting speed is never below 0.
     """
 
     right_m: float = 0.0
@@ -29,7 +29,7 @@ class StartOffset:
     faster_mps: float = 0.0
 
     def of(self, scenario: Scenario) -> Scenario:
-        """The scenario that begins so."""
+        """The scenario with its start shifted by this offset."""
         start = scenario.start
         moved = replace(
             start,
@@ -46,12 +46,12 @@ NOMINAL = StartOffset()
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StartRange:
-    """What starts are drawn from, uniformly.
+    """The range from which starts are drawn uniformly.
 
     Args:
-        right_m: at most so far to either side.
-        turned_rad: at most so much to either side.
-        faster_mps: up to so much faster: scenarios may begin from a stand.
+        right_m: largest shift to either side, metres.
+        turned_rad: largest turn to either side, radians.
+        faster_mps: largest increase of speed, m/s; there is no decrease, since scenarios may begin from a stand.
 
     Raises:
         EpisodeError: a number is below 0, or so large that a car would not stand on its lane.
@@ -67,7 +67,7 @@ class StartRange:
                 raise EpisodeError(f"{name} of the starts is {value}, expected 0 to {most:g}")
 
     def draw(self, count: int, seed: int) -> tuple[StartOffset, ...]:
-        """So many starts; the same for the same seed."""
+        """Draw `count` starts; the same for the same seed."""
         low, high = np.array([-self.right_m, -self.turned_rad, 0.0]), np.array(list(asdict(self).values()))
         drawn = np.random.default_rng((seed, 0x57A27)).uniform(low, high, (count, 3)).round(4)
         return tuple(StartOffset(right_m=r, turned_rad=t, faster_mps=f) for r, t, f in drawn.tolist())

@@ -22,26 +22,26 @@ class Trial:
 
     Args:
         pattern: "attack", or "random-N".
-        weather: of both drives.
-        traffic: whether there were other cars and people.
-        seed: of cars and people.
-        clean: file of the drive without paint, in the episodes' folder.
-        painted: file of the drive with it.
-        deviation_m: between them (`driving.deviation`).
-        lateral_m: largest offset from the clean path, left positive.
-        points: infraction points with paint; None where nothing is known of them, as for the next three.
-        clean_points: without.
-        leaderboard: the Leaderboard's factor with paint.
-        clean_leaderboard: without.
-        first_event_s: when something first went wrong; None where nothing did, or nothing is known of it.
-        clean_first_event_s: the same without paint.
+        weather: weather of both drives.
+        traffic: whether there were other cars and pedestrians.
+        seed: seed of cars and pedestrians.
+        clean: file name of the drive without paint, in the episodes' folder; empty if it was not kept.
+        painted: file name of the drive over paint, in the episodes' folder; empty if it was not kept.
+        deviation_m: the paper's deviation between the two drives, metres (`driving.deviation`).
+        lateral_m: largest offset of the painted drive from the clean path, metres, left positive.
+        points: infraction points with paint; None, as in the next three, if infractions are not known.
+        clean_points: infraction points without paint.
+        leaderboard: the Leaderboard's factor with paint, in (0, 1].
+        clean_leaderboard: the Leaderboard's factor without paint, in (0, 1].
+        first_event_s: time of the first event with paint, seconds; None if there is none, or none is known.
+        clean_first_event_s: time of the first event without paint, seconds; None if there is none, or none is known.
         ending: why the painted drive ended.
-        events: of the painted drive, those that count (`infractions.counted`), so that anyone can count again.
-        clean_events: of the clean one.
-        start: how both drives begin.
+        events: events of the painted drive that count (`infractions.counted`), so that anyone can count again.
+        clean_events: events of the clean drive that count.
+        start: offset of both drives' start from the scenario's.
 
     Raises:
-        EpisodeError: the name of an episode's file is not a plain one.
+        EpisodeError: the name of an episode's file is not a plain name that ends in .npz.
     """
 
     pattern: str

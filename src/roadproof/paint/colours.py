@@ -36,16 +36,16 @@ Planes = tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, " p"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AllowedColours:
-    """The map to allowed colours.
+    """The map that brings colours to allowed ones.
 
     Args:
-        palette: the only colours that there are; None where all of C are.
-        planes: A and b; None where nothing lies outside.
-        middle: a point well inside C.
-        asphalt: a; None where contrast is not limited.
-        nearest: the point of C nearest to a.
-        farthest: the corner of C farthest from a.
-        contrast: least and most.
+        palette: the only colours allowed, RGB in [0, 1], (c, 3); None if all colours of C are allowed.
+        planes: the planes A and b of C; None if no colour lies outside.
+        middle: a point well inside C, (3,).
+        asphalt: the asphalt's colour a, (3,); None if contrast is not limited.
+        nearest: the point of C nearest to the asphalt, (3,).
+        farthest: the corner of C farthest from the asphalt, (3,).
+        contrast: least and largest contrast to the asphalt, each in [0, 1].
     """
 
     palette: Float[Tensor, "c 3"] | None
@@ -57,7 +57,7 @@ class AllowedColours:
     contrast: tuple[float, float]
 
     def __call__(self, colours: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """The allowed colour of each; a palette passes gradients on as if it were not there."""
+        """The allowed colour of each colour; gradients pass a palette as if it were not there."""
         if self.palette is not None:
             known = self.palette.to(colours)
             chosen = known[(colours.detach()[..., None, :] - known).square().sum(-1).argmin(-1)]
@@ -88,17 +88,17 @@ def allowed_colours(
     limit: tuple[float, float] | None,
     asphalt: Rgb | None,
 ) -> AllowedColours:
-    """The colours that all limits leave.
+    """The map to the colours that all limits together allow.
 
     Args:
-        albedo: lowest and highest value of a channel.
-        palette: the only colours allowed; empty for all.
-        printable: whether print must be able to mix them.
-        limit: least and most contrast to the asphalt.
-        asphalt: the paint that looks like the bare road.
+        albedo: lowest and highest value of a channel, each in [0, 1].
+        palette: the only colours allowed, as "#d6a83d"; empty if all are allowed.
+        printable: whether offset print must be able to mix the colours.
+        limit: least and largest contrast to the asphalt, each in [0, 1]; None for no limit.
+        asphalt: colour of the paint that looks like the bare road, RGB in [0, 1]; None where it is not known.
 
     Raises:
-        PatternError: they leave none; the message says which limit does.
+        PatternError: the limits allow no colour; the message says which limit is at fault.
     """
     rows, bounds = _box(*albedo)
     if printable:
@@ -158,7 +158,7 @@ def _box(low: float, high: float) -> Planes:
 
 
 def _hull(points: Float[np.ndarray, "n 3"]) -> Planes:
-    """The planes through three points each that have all others on one side."""
+    """The planes of the convex hull: those through three points that have all other points on one side."""
     rows: list[np.ndarray] = []
     bounds: list[float] = []
     for three in combinations(points, 3):
@@ -173,7 +173,7 @@ def _hull(points: Float[np.ndarray, "n 3"]) -> Planes:
 
 
 def _corners(rows: Float[np.ndarray, "p 3"], bounds: Float[np.ndarray, " p"]) -> Float[np.ndarray, "v 3"]:
-    """Where three planes meet, as far as no other cuts that off."""
+    """The corners of C: points where three planes meet and that no other plane cuts off."""
     met: list[np.ndarray] = []
     for three in combinations(range(len(rows)), 3):
         some = rows[list(three)]
@@ -184,7 +184,7 @@ def _corners(rows: Float[np.ndarray, "p 3"], bounds: Float[np.ndarray, " p"]) ->
 
 
 def _nearest(point: np.ndarray, rows: np.ndarray, bounds: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """The point of C nearest to another, by Dykstra's projections; drawn inside by what they leave."""
+    """The point of C nearest to another, by Dykstra's projections, drawn towards the middle by what they leave."""
     if (rows @ point <= bounds).all():
         return point
     at, left = point.copy(), np.zeros_like(rows)
@@ -206,7 +206,7 @@ def _inside(colours: Tensor, rows: Tensor, bounds: Tensor, middle: Tensor) -> Te
 
 
 def _until(colours: Tensor, target: Tensor, asphalt: Tensor, radius: float) -> Tensor:
-    """Colours moved towards a target until they are so far from the asphalt: the last such point of the way."""
+    """Colours moved towards a target until their contrast to the asphalt is a given one, at the last such point."""
     way, gap = target - colours, colours - asphalt
     a = way.square().sum(-1, keepdim=True).clamp_min(1e-12)
     b = (way * gap).sum(-1, keepdim=True)

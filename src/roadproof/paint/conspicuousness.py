@@ -34,14 +34,14 @@ _OTHER_DIRECTION_RAD, _OTHER_COLOUR = np.pi / 4, 0.25
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Conspicuousness:
-    """How much a pattern catches the eye; None for what is not known of the road.
+    """How much a pattern catches the eye; a field is None if the road is not known well enough to say.
 
     Args:
-        figures: how many figures it has.
-        area_m2: the sum of their areas.
-        contrast: the mean of the figures' contrast to the asphalt, weighted by area; 0 none, 1 black on white.
-        mark_distance_m: from the nearest figure's edge to the edge of a lane mark; 0 where they touch.
-        mark_likeness: how like a lane mark its most similar figure is, from 0 to 1.
+        figures: number of figures.
+        area_m2: sum of the figures' areas, m².
+        contrast: mean contrast of the figures to the asphalt, weighted by area; 0 is none, 1 is black on white.
+        mark_distance_m: least distance from a figure's edge to the edge of a lane mark, metres; 0 if they touch.
+        mark_likeness: likeness of the most similar figure to a lane mark, from 0 to 1.
     """
 
     figures: int
@@ -52,7 +52,7 @@ class Conspicuousness:
 
     @property
     def sentence(self) -> str:
-        """In words, for people."""
+        """The measures as one sentence for people."""
         told = [f"{self.figures} figure{'' if self.figures == 1 else 's'}"]
         told += [] if self.area_m2 is None else [f"{self.area_m2:.2f} m² of paint"]
         told += [] if self.contrast is None else [f"contrast {self.contrast:.2f} to the asphalt"]
@@ -107,7 +107,7 @@ def _likeness(
     widths: np.ndarray,
     paints: tuple[str, ...],
 ) -> float:
-    """Of one figure, whose longer edge is its direction, to the most similar piece of a mark."""
+    """Likeness of one figure, whose longer edge is its direction, to the most similar piece of a mark, in [0, 1]."""
     short, long = sorted((across, along), key=lambda edge: float(np.linalg.norm(edge)))
     width = 2 * float(np.linalg.norm(short))
     unit = (ends[:, 1] - ends[:, 0]) / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[:, None]
@@ -132,7 +132,7 @@ def _inside(corners: np.ndarray, point: np.ndarray) -> bool:
 
 
 def _between(p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Distance of two segments."""
+    """Distance between the segments from p to q and from a to b; 0 if they cross."""
     if _left(p, q, a) * _left(p, q, b) < 0 and _left(a, b, p) * _left(a, b, q) < 0:
         return 0.0
     return min(_to(p, a, b), _to(q, a, b), _to(a, p, q), _to(b, p, q))

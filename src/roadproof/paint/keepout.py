@@ -31,14 +31,14 @@ _INSIDE = 1 - 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeepOut:
-    """The map to figures that stay clear.
+    """The map that brings figures to ones that stay clear of lane marks.
 
     Args:
-        size_m: of the canvas.
-        middle: of each rectangle around a mark, canvas metres.
-        axes: along and across it, unit length.
-        extents: its half extents along those.
-        free: for every cell of the canvas the nearest place where a middle may lie, canvas metres.
+        size_m: width and length of the canvas, metres.
+        middle: middle of each rectangle around a mark, canvas metres, (q, 2).
+        axes: unit vectors along and across each rectangle, (q, 2, 2).
+        extents: half of each rectangle's length and width, metres, (q, 2).
+        free: for every cell of the canvas, the nearest place where a figure's middle may lie, canvas metres, (r, c, 2).
     """
 
     size_m: tuple[float, float]
@@ -73,7 +73,7 @@ class KeepOut:
         return (beside.abs() - self.extents.to(points)).amax(-1).amin(-1)
 
     def _share(self, boxes: Tensor) -> Float[Tensor, "*b k"]:
-        """The largest t of every figure, above 0."""
+        """The largest scale t of every figure at which it touches no rectangle."""
         centre, across, along = half_edges_m(boxes, self.size_m)
         middle, axes, extents = (each.to(boxes) for each in (self.middle, self.axes, self.extents))
         gap = (centre[..., None, :] - middle)[..., None, :]
@@ -86,13 +86,13 @@ class KeepOut:
 
 
 def _normal(edge: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-    """Of unit length, normal to an edge."""
+    """The unit vector normal to each edge."""
     turned = torch.stack([-edge[..., 1], edge[..., 0]], -1)
     return turned / turned.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
 
 
 def keep_out(site: Site, distance_m: float) -> KeepOut | None:
-    """The map for a distance from all lane marks of a site; None where there are none.
+    """The map that keeps a distance from all lane marks of a site, in metres; None if it has no marks.
 
     Raises:
         PatternError: no place on the canvas is so far from all marks.
@@ -124,7 +124,7 @@ def keep_out(site: Site, distance_m: float) -> KeepOut | None:
 
 
 def _nearest(cells: Float[np.ndarray, "r c 2"], free: Bool[np.ndarray, "r c"]) -> Float[np.ndarray, "r c 2"]:
-    """For every cell the nearest free one."""
+    """For every cell, the nearest free cell."""
     places, found = cells[free], cells.copy()
     found[~free] = [places[np.square(place - places).sum(-1).argmin()] for place in cells[~free]]
     return found

@@ -28,13 +28,13 @@ class PaintLimits:
     """What paint may be; a field that is left out limits nothing.
 
     Args:
-        max_area_m2: the largest sum of the figures' areas; the widths of all figures shrink together.
-        colours: the only paints that there are, as "#d6a83d".
+        max_area_m2: largest sum of the figures' areas, m²; the widths of all figures shrink together to keep it.
+        colours: the only paints allowed, as "#d6a83d"; empty allows all.
         printable: whether offset print must be able to mix the paint (`colours.PRINT`).
-        contrast: the least and the most contrast to the asphalt, 0 none, 1 black on white.
-        keep_out_m: the least distance of every figure's edge from the edge of every lane mark.
-        asphalt: the colour of the bare road as paint, as "#5a5a5b"; measured in the recordings by default.
-        marks: the lane marks; those that the recordings carry by default.
+        contrast: least and largest contrast of paint to the asphalt; 0 is none, 1 is black on white.
+        keep_out_m: least distance of every figure's edge from the edge of every lane mark, metres.
+        asphalt: colour of the bare road as paint, such as "#5a5a5b"; measured in the recordings by default.
+        marks: lane marks of the road; those that the recordings carry by default.
 
     Raises:
         PatternError: a value is out of its range.
@@ -59,7 +59,7 @@ class PaintLimits:
             rgb_of(colour)
 
     def site(self, known: Site) -> Site:
-        """A site with what these limits say of it in place of what is known."""
+        """The known site, with what these limits themselves say of asphalt and marks in its place."""
         return replace(
             known,
             asphalt=rgb_of(self.asphalt) if self.asphalt else known.asphalt,
@@ -67,16 +67,16 @@ class PaintLimits:
         )
 
     def check(self, site: Site, *, albedo: tuple[float, float], black: bool, measured: bool = True) -> None:
-        """See that a site is known well enough, and that the limits leave a pattern there.
+        """Check that a site is known well enough, and that the limits leave a pattern there.
 
         Args:
-            site: the site, as `site` gives it.
-            albedo: the lowest and highest value of a channel.
-            black: whether only black is painted.
-            measured: whether the asphalt must be known by now; before recordings are made it is not.
+            site: the stretch of road, as `site` returns it.
+            albedo: lowest and highest value of a colour channel, each in [0, 1].
+            black: whether the search paints only black.
+            measured: whether the asphalt must be known by now; False before recordings are made.
 
         Raises:
-            PatternError: something is not known, or no pattern is left; the message says what to do.
+            PatternError: the site is not known well enough, or no pattern is left; the message says what to do.
         """
         if site.size_m is None and (self.max_area_m2 is not None or self.keep_out_m is not None):
             raise PatternError(
@@ -99,13 +99,13 @@ class PaintLimits:
             raise PatternError("only black paint is searched, but the limits on colour leave no black; let colour vary")
 
     def applied(self, pattern: Pattern, site: Site, *, albedo: tuple[float, float], max_share: float | None) -> Pattern:
-        """The pattern that obeys, near one that may not; differentiable.
+        """A pattern that obeys the limits, near the one given; differentiable.
 
         Args:
-            pattern: one, or a batch.
-            site: that was checked.
-            albedo: of the search space.
-            max_share: the largest share of the canvas that may be painted, besides `max_area_m2`.
+            pattern: one pattern or a batch, which may break the limits.
+            site: the stretch of road, checked by `check`.
+            albedo: lowest and highest value of a colour channel in the search space.
+            max_share: largest share of the canvas that may be painted, besides `max_area_m2`; None for no such limit.
         """
         colours, clear = _maps(self, site, albedo)
         boxes = pattern.boxes if clear is None else clear(pattern.boxes)
@@ -118,7 +118,7 @@ class PaintLimits:
 
 @lru_cache(maxsize=32)
 def _maps(limits: PaintLimits, site: Site, albedo: tuple[float, float]) -> tuple[AllowedColours, KeepOut | None]:
-    """What brings colours and boxes to allowed ones."""
+    """The maps that bring colours and boxes to allowed ones; no map of boxes without a keep-out or marks."""
     colours = allowed_colours(
         albedo=albedo,
         palette=limits.colours,

@@ -29,7 +29,7 @@ def rgb_of(text: str) -> Rgb:
     """The colour of a text such as "#d6a83d", in [0, 1].
 
     Raises:
-        PatternError: it is none.
+        PatternError: the text is not such a colour.
     """
     if not re.fullmatch("#[0-9a-fA-F]{6}", text):
         raise PatternError(f"colour is {text!r:.40}, expected # and six hexadecimal digits, as #d6a83d")
@@ -38,7 +38,7 @@ def rgb_of(text: str) -> Rgb:
 
 
 def hex_of(rgb: Rgb) -> str:
-    """A colour as text, "#d6a83d"."""
+    """The text of an RGB colour in [0, 1], such as "#d6a83d"."""
     return "#" + "".join(f"{round(255 * channel):02x}" for channel in rgb)
 
 
@@ -47,9 +47,9 @@ class LaneMark:
     """One painted line of the road, on the canvas or near it; a broken line counts as if it had no gaps.
 
     Args:
-        points_m: its middle line, two points or more in canvas metres; parts outside the canvas count too.
-        width_m: the width of the line.
-        colour: its paint, as "#dededa".
+        points_m: middle line of the mark, two points or more in canvas metres; parts outside the canvas count too.
+        width_m: width of the mark, metres.
+        colour: colour of the mark's paint, such as "#dededa".
 
     Raises:
         PatternError: there are fewer than two points, or a value is out of its range.
@@ -74,9 +74,9 @@ class Site:
     """What is known of the road under a canvas.
 
     Args:
-        size_m: the extent of the canvas across and along the road; None where it is not known.
-        asphalt: the paint that would look like the bare road, RGB in [0, 1]; None where nothing was measured.
-        marks: the lane marks on the canvas and near it; None where they are not known, empty where there are none.
+        size_m: extent of the canvas across and along the road, metres; None if it is not known.
+        asphalt: paint that would look like the bare road, RGB in [0, 1]; None if nothing was measured.
+        marks: lane marks on the canvas and near it; None if they are not known, empty if there are none.
     """
 
     size_m: tuple[float, float] | None = None
@@ -104,7 +104,7 @@ def metres_per_px(size_m: tuple[float, float]) -> tuple[float, float]:
 def half_edges_m(
     boxes: Float[Tensor, "*b k 5"], size_m: tuple[float, float]
 ) -> tuple[Float[Tensor, "*b k 2"], Float[Tensor, "*b k 2"], Float[Tensor, "*b k 2"]]:
-    """Of every box its middle, and half of its edges across and along: a parallelogram in canvas metres."""
+    """Middle of every box, and half of its edges across and along, which span a parallelogram in canvas metres."""
     x, y, width, length, rotation_deg = boxes.unbind(-1)
     scale = boxes.new_tensor(metres_per_px(size_m))
     angle = torch.deg2rad(rotation_deg)

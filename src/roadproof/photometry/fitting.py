@@ -39,15 +39,15 @@ class FitReport:
     """How well a colour transform predicts, in 8-bit levels, per sample and channel, after clipping.
 
     Args:
-        model: what was fitted.
-        samples: how many samples it was fitted to.
-        saturated: share of their values that lay at the end of the scale.
-        residual: mean absolute error on those samples.
-        left_out: mean absolute error on groups left out of the fit in turn, in at most twelve folds; none where the
-            rest of the groups does not determine the model.
-        left_out_channel: the same per channel.
-        worst: the painted colour with the largest mean error, in [0, 1]; left out where possible.
-        worst_error: its error.
+        model: name of the fitted model: "film" or "affine", with " + radial shading" where that was fitted.
+        samples: number of samples it was fitted to.
+        saturated: share of the seen values that lay at the end of the scale, in [0, 1].
+        residual: mean absolute error on the fitted samples, 8-bit levels.
+        left_out: mean absolute error on groups left out of the fit in turn, in at most twelve folds, 8-bit levels; None
+            if the rest of the groups does not determine the model.
+        left_out_channel: mean absolute error on left-out groups per channel, 8-bit levels; None if `left_out` is None.
+        worst: painted colour with the largest mean error, RGB in [0, 1]; judged on left-out groups if there are any.
+        worst_error: mean absolute error of that colour, 8-bit levels.
     """
 
     model: str
@@ -75,18 +75,18 @@ def fit_colour(
     response: FittedKind | None = None,
     shading: bool | None = None,
 ) -> ColourFit:
-    """Fit painted → seen, choosing by cross-validation what is not said.
+    """Fit the transform from painted to seen colour; what is not given is chosen by cross-validation.
 
     Args:
-        samples: what was painted and seen.
-        response: the kind of response.
-        shading: whether to fit a radial shading; needs samples with pixels.
+        samples: painted and seen colours.
+        response: kind of response to fit; None tries both kinds.
+        shading: whether to fit a radial shading, which needs samples with pixels; None tries both if there are pixels.
 
     Returns:
-        The fit whose error on left-out groups is smallest, or, where that cannot be found, on the samples.
+        The fit with the smallest error on left-out groups or, if that cannot be computed, on the samples.
 
     Raises:
-        ColourError: no samples, too few colours, too many saturated, or shading asked for without pixels.
+        ColourError: there are no samples, too few colours, too many saturated, or shading is asked for without pixels.
 
     References:
         The paper, section on colour (C, b), for the affine response; the rest is our own.
@@ -139,7 +139,7 @@ def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | C
 
 
 def _left_out_errors(samples: ColourSamples, kind: FittedKind, shade: bool, start: Tensor) -> Tensor | None:
-    """Errors of each sample under a fit to the other groups, (N, 3); none where those do not determine it."""
+    """Errors of each sample under a fit to the other groups, (N, 3); None if those do not determine the model."""
     errors = torch.zeros_like(samples.seen, dtype=torch.float64)
     fold = samples.groups % _FOLDS
     for left_out in range(min(_FOLDS, int(fold.max()) + 1)):
@@ -154,7 +154,7 @@ def _left_out_errors(samples: ColourSamples, kind: FittedKind, shade: bool, star
 
 
 def _errors(transform: ColourTransform, samples: ColourSamples) -> Float[Tensor, "n 3"]:
-    """Absolute errors in 8-bit levels."""
+    """Absolute errors of the predicted colours in 8-bit levels."""
     pixel = torch.zeros(len(samples), 2, dtype=torch.float64) if samples.pixel is None else samples.pixel
     return 255 * (transform(samples.painted.double(), pixel.double()) - samples.seen).abs()
 

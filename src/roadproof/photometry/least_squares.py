@@ -20,7 +20,7 @@ class Problem(Protocol):
     """N residuals of P parameters."""
 
     def residuals(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, " n"]:
-        """What should be small."""
+        """The residuals, which should be small."""
         ...
 
     def jacobian(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "n p"]:

@@ -26,10 +26,10 @@ class PixelMaps:
     """Colour of every pixel of a drive at the controller's input, seen = gain ⊙ response(painted) + offset.
 
     Args:
-        gain: (F, H, W, 3); 1 where the canvas is not seen.
-        offset: (F, H, W, 3); 0 where the canvas is not seen.
+        gain: gain of every pixel, (F, H, W, 3); 1 where the canvas is not seen.
+        offset: offset of every pixel, (F, H, W, 3); 0 where the canvas is not seen.
         visible: share of the pixel through which the canvas is seen, (F, H, W), in [0, 1].
-        response: what gain and offset apply to.
+        response: response to whose value gain and offset apply.
     """
 
     gain: Float[Tensor, "f h w 3"]
@@ -62,11 +62,11 @@ def pixel_maps_from_two_paints(
     a shadow meets the edge of the canvas, the two cannot be told apart, and a few pixels are off.
 
     Args:
-        light_frames: the drive with the whole canvas painted `light`.
-        dark_frames: the same frames with it painted `dark`.
-        light: a paint light enough to see and not so light that it saturates, in [0, 1].
-        dark: a paint darker in every channel, in [0, 1].
-        response: what gain and offset apply to; by default the painted colour itself.
+        light_frames: frames of the drive with the whole canvas painted `light`, (F, H, W, 3).
+        dark_frames: the same frames with the whole canvas painted `dark`, of the same shape.
+        light: RGB of the light paint in [0, 1]; light enough to be seen, not so light that it saturates.
+        dark: RGB of the dark paint in [0, 1]; darker than `light` in every channel.
+        response: response to whose value gain and offset apply; by default the painted colour itself.
 
     Raises:
         ColourError: frames of different shapes, no difference between them, paints too much alike, or a light paint

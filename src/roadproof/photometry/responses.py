@@ -39,7 +39,7 @@ class Response(Protocol):
     """Painted colour → flat seen colour, differentiable."""
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """The seen colour."""
+        """The seen colour of each painted colour."""
         ...
 
 
@@ -48,8 +48,8 @@ class AffineResponse:
     """The paper's seen = C · painted + b.
 
     Args:
-        matrix: C, one row a seen channel, (3, 3).
-        offset: b, (3,).
+        matrix: the matrix C, one row per seen channel, (3, 3).
+        offset: the offset b, (3,).
 
     References:
         The paper, section on colour (C, b).
@@ -59,7 +59,7 @@ class AffineResponse:
     offset: Float[Tensor, " 3"]
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """The seen colour."""
+        """The seen colour of each painted colour."""
         return painted @ self.matrix.to(painted).mT + self.offset.to(painted)
 
     @classmethod
@@ -69,7 +69,7 @@ class AffineResponse:
 
     @classmethod
     def from_parameters(cls, parameters: Float[Tensor, " 12"]) -> AffineResponse:
-        """C row by row, then b."""
+        """The response from twelve parameters: C row by row, then b."""
         return cls(parameters[:9].reshape(3, 3), parameters[9:])
 
 
@@ -85,9 +85,9 @@ class FilmResponse:
     black beside a strong other one; y is clipped at 0 there, softly, so that a gradient always remains.
 
     Args:
-        exposure: light that falls on the road times the camera's exposure, per channel, above 0.
-        contrast: n, of the curve in its middle, above 0.
-        encoding: k; 1 for pictures that were encoded twice on their way (CARLA 0.8), about 2.4 for once.
+        exposure: light that falls on the road times the camera's exposure, one number per channel, above 0, (3,).
+        contrast: exponent n, the contrast of the curve in its middle, above 0.
+        encoding: exponent k; 1 for pictures that were encoded twice on their way (CARLA 0.8), about 2.4 for once.
 
     References:
         The Academy Color Encoding System's reference rendering transform, as real-time renderers approximate it;
@@ -99,7 +99,7 @@ class FilmResponse:
     encoding: Float[Tensor, ""]
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """The seen colour."""
+        """The seen colour of each painted colour."""
         to_wide = torch.tensor(_AP1_FROM_SRGB, dtype=torch.float64)
         before = _saturation(_SATURATION_BEFORE) @ to_wide @ torch.diag(self.exposure.double())
         after = cast("Tensor", torch.linalg.inv(to_wide)) @ _saturation(_SATURATION_AFTER)
@@ -110,7 +110,7 @@ class FilmResponse:
 
     @classmethod
     def from_parameters(cls, parameters: Float[Tensor, " 5"]) -> FilmResponse:
-        """Logarithms of the three exposures, the contrast and the encoding."""
+        """The response from five parameters: the logarithms of the three exposures, the contrast and the encoding."""
         positive = parameters.exp()
         return cls(positive[:3], positive[3], positive[4])
 
@@ -121,9 +121,9 @@ def fit_affine(
     """The paper's C and b by least squares, one seen channel at a time.
 
     Args:
-        painted: what was painted.
-        seen: what was seen of it.
-        keep_saturated: also use values near 0 or 1, as the paper's code does.
+        painted: painted colours in [0, 1], (N, 3).
+        seen: colour seen of each, in [0, 1], (N, 3).
+        keep_saturated: whether to use values near 0 or 1 too, as the paper's code does.
 
     Raises:
         ColourError: a channel has fewer than four usable colours, or they do not span the colour space.

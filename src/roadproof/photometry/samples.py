@@ -14,15 +14,15 @@ from roadproof.errors import ColourError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourSamples:
-    """N looks at painted road.
+    """N samples of painted road: painted colour and seen colour.
 
     Args:
-        painted: the colours painted, (N, 3), in [0, 1].
-        seen: the mean colours seen, (N, 3), in [0, 1].
+        painted: painted colours, RGB in [0, 1], (N, 3).
+        seen: mean colour seen of each, RGB in [0, 1], (N, 3).
         group: colours that cross-validation leaves out together, such as the shades of one hue, (N,); by default each
             painted colour is a group of its own.
-        pixel: where in the camera picture, (N, 2); needed for shading.
-        size_px: columns and rows of that picture; needed with `pixel`.
+        pixel: camera pixel (column, row) at which each was seen, (N, 2); needed for shading.
+        size_px: columns and rows of the camera picture; needed with `pixel`.
 
     Raises:
         ColourError: lengths differ, a value is NaN, infinite or outside [0, 1], all seen values are saturated, or there
@@ -65,14 +65,14 @@ class ColourSamples:
         return distinct(key)[1]
 
     def at(self, rows: Bool[Tensor, " n"]) -> ColourSamples:
-        """Some of the samples."""
+        """The samples of some rows."""
         group = None if self.group is None else self.group[rows]
         pixel = None if self.pixel is None else self.pixel[rows]
         return ColourSamples(self.painted[rows], self.seen[rows], group, pixel, self.size_px)
 
 
 def distinct(rows: Float[Tensor, "n c"] | Int[Tensor, "n c"]) -> tuple[Tensor, Int[Tensor, " n"]]:
-    """The different rows, sorted, and which of them each row is."""
+    """The different rows, sorted, and for each row the index of its own among them."""
     return cast("tuple[Tensor, Tensor]", torch.unique(rows, dim=0, return_inverse=True))
 
 
@@ -90,11 +90,11 @@ def samples_from_pictures(
     keeps what is smooth.
 
     Args:
-        painted: the colour of each picture, in [0, 1].
-        pictures: what the camera saw.
-        mask: where the canvas is seen.
-        group: of each picture, for cross-validation.
-        patch_px: side of a patch.
+        painted: painted colour of each picture, RGB in [0, 1], (N, 3).
+        pictures: camera pictures of the canvas, one for each colour, (N, H, W, 3).
+        mask: which camera pixels show the canvas, (H, W).
+        group: group of each picture for cross-validation, (N,); by default every colour is a group of its own.
+        patch_px: side of a square patch, px; 16 by default.
 
     Raises:
         ColourError: as many pictures as colours are not given, or no patch lies inside the mask.

@@ -29,10 +29,10 @@ class RadialShading:
     the picture where the canvas happened to lie holds in the rest of it.
 
     Args:
-        width_px: columns of the camera picture.
-        height_px: rows of the camera picture.
-        gain: g.
-        offset: o.
+        width_px: number of columns of the camera picture.
+        height_px: number of rows of the camera picture.
+        gain: coefficient g of the gain.
+        offset: coefficient o of the offset.
     """
 
     width_px: int
@@ -54,11 +54,11 @@ def squared_radius(pixel: Float[Tensor, "*b 2"], width_px: int, height_px: int) 
 
 @dataclass(frozen=True, slots=True)
 class ColourTransform:
-    """Painted colour → seen colour at a camera pixel.
+    """The transform from painted colour to seen colour at a camera pixel.
 
     Args:
-        response: flat seen colour of a painted colour.
-        shading: gain and offset at a camera pixel; none means 1 and 0.
+        response: response, which gives the flat seen colour of a painted colour.
+        shading: shading, which gives gain and offset at a camera pixel; None means 1 and 0.
     """
 
     response: Response
@@ -70,7 +70,7 @@ class ColourTransform:
         return (gain * self.response(painted) + offset).clamp(0.0, 1.0)
 
     def gain_and_offset(self, pixel: Float[Tensor, "*b 2"]) -> Pair:
-        """What shading does at camera pixels (x right, y down, centres at integers)."""
+        """Gain and offset of the shading at camera pixels (x right, y down, centres at integers)."""
         if self.shading is not None:
             return self.shading(pixel)
         one = torch.ones(*pixel.shape[:-1], 3, dtype=pixel.dtype, device=pixel.device)

@@ -18,26 +18,25 @@ class Budget:
     """How much is spent on one scenario, and how.
 
     Args:
-        method: of the search: by gradient, improved or published, or without gradients.
+        method: search method: by gradient, improved or published, or without gradients.
         objective: what the search makes large: a path deviation in the recorded world, or a steering shift.
-        trajectories: the drives that are recorded. For a path deviation the default has a pair pushed aside and a pair
-            that weaves, so that frames look where an attacked car looks.
-        window: which of their frames are kept; for a path deviation by default from where deviation is measured from,
-            however small the canvas is there.
-        pooled: attack all drives together also where they were pushed right and left: the paper's Group-All.
-        calibration: how the drives are calibrated.
-        select: candidates driven once each, of which the strongest is kept; 1 verifies the first choice, 0 believes it.
-        weathers: of the evaluation.
-        starts: drives of the evaluation in each weather alone, each from a start of its own.
-        start_range: what those are drawn from.
-        runs: drives with traffic in each weather.
-        rounds: of searching on along the way that the attacked car took (`rounds`).
-        attack_weathers: of the recordings; the search is for what is strongest on average, and candidates are driven
-            in the first. By default the first of `weathers` alone.
+        trajectories: trajectories that are recorded. For a path deviation the default has a pair pushed aside and a
+            pair that weaves, so that frames look where an attacked car looks.
+        window: which frames of each drive are kept; by default at most 40 that show at least 8 pixels of the canvas.
+        pooled: whether drives pushed right and left are attacked together too, as in the paper's Group-All.
+        calibration: calibration method of the drives.
+        select: number of candidates driven over, of which the strongest is kept; 1 verifies the first, 0 drives none.
+        weathers: weathers of the evaluation.
+        starts: number of the evaluation's drives alone in each weather, each from a start of its own.
+        start_range: range from which these starts are drawn.
+        runs: number of the evaluation's drives with traffic in each weather.
+        rounds: number of re-recording rounds, which search on along the path of the attacked car (`rerecording`).
+        attack_weathers: weathers of the recordings, over which the search takes the mean; candidates are driven in the
+            first. By default the first of `weathers` alone.
 
     Raises:
-        RoadproofError: rounds without candidates to drive, a number of them below 0, several weathers with colours that
-            hold in one alone, or a published search with something that was not published.
+        RoadproofError: a number is below 0, rounds have no candidates to drive, weathers repeat or do not suit the
+            calibration, or the search does not suit the drives or the published settings.
     """
 
     method: Method = field(default_factory=lambda: GradOpt(restarts=3))

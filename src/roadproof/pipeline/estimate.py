@@ -40,13 +40,13 @@ _USUAL, _MEASURED = "from usual costs", "the controller measured here, drives fr
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Estimate:
-    """What work takes.
+    """An estimate of drives, time and disk space that some work takes.
 
     Args:
-        drives: of the simulator.
-        seconds: wall time.
-        megabytes: on the disk.
-        basis: what the seconds come from, in words.
+        drives: number of simulator drives.
+        seconds: wall time, seconds.
+        megabytes: disk space, megabytes.
+        basis: what the seconds were measured on, in words.
     """
 
     drives: int = 0
@@ -63,7 +63,7 @@ class Estimate:
         )
 
     def times(self, count: int, *, at_once: int = 1) -> Estimate:
-        """The same work so many times, so many at once."""
+        """The estimate of the same work done `count` times, `at_once` of them side by side."""
         seconds = self.seconds * math.ceil(count / at_once)
         return replace(self, drives=self.drives * count, seconds=seconds, megabytes=self.megabytes * count)
 
@@ -99,14 +99,14 @@ def frame_seconds(controller: Controller, *, gradients: bool = True) -> float:
 def of_search(
     method: Method, objective: Objective, frames: int, controller: Controller, *, groups: int = 2
 ) -> Estimate:
-    """A search for patterns.
+    """Estimate a search for patterns.
 
     Args:
-        method: how is searched.
-        objective: what for; a path is driven step by step.
-        frames: of a group of drives.
-        controller: is measured.
-        groups: searched at once.
+        method: search method.
+        objective: objective of the search; for a path deviation the car is driven step by step.
+        frames: number of frames in a group of drives.
+        controller: controller that is timed.
+        groups: number of groups searched.
     """
     steps = STRETCH_STEPS if isinstance(objective, PathDeviation) else frames
     if isinstance(method, GradOpt):
@@ -123,7 +123,7 @@ def of_search(
 
 
 def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Estimate:
-    """Drives in the town, alone and in traffic."""
+    """Estimate drives in the town, alone and in traffic."""
     seconds = (alone * DRIVE_S + crowded * CROWDED_S) / processes
     return Estimate(drives=alone + crowded, seconds=seconds, megabytes=(alone + crowded) * EPISODE_MB)
 
@@ -131,7 +131,7 @@ def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Estimate:
 def of_evaluation(
     weathers: int, starts: int, runs: int, *, random: int = 0, film: bool = True, processes: int = 1
 ) -> Estimate:
-    """An evaluation: every clean drive and every painted one, and what is filmed after them."""
+    """Estimate an evaluation: every clean drive, every painted one, and the film made after them."""
     alone = weathers * (2 * max(starts, 1) + random)
     crowded = weathers * runs * (3 if random else 2)
     return of_drives(alone, crowded, processes=processes) + Estimate(
@@ -140,13 +140,13 @@ def of_evaluation(
 
 
 def of_run(budget: Budget, controller: Controller, *, film: bool = True, processes: int = 1) -> Estimate:
-    """A whole stress test of one scenario.
+    """Estimate a whole stress test of one scenario.
 
     Args:
-        budget: of it.
-        controller: is measured.
-        film: whether the report's drives are made.
-        processes: drives of the evaluation at once.
+        budget: budget of the stress test.
+        controller: controller that is timed.
+        film: whether the film of two drives is made.
+        processes: number of drives of the evaluation made at once.
     """
     count, weathers = budget.trajectories.count, len(budget.recorded_in)
     replays = RUNS * count + len(PAINTS) if budget.calibration is Calibration.PUBLISHED else 2 * count

@@ -31,12 +31,12 @@ class Agreement:
     """How well composited frames stand for rendered ones of the same drive.
 
     Args:
-        frames: how many frames were compared.
-        paint_error: the mean absolute difference in the paint, in 8-bit levels.
-        elsewhere_error: the same outside it, where both should show the bare road.
+        frames: number of frames that were compared.
+        paint_error: mean absolute difference within the paint, in 8-bit levels.
+        elsewhere_error: mean absolute difference off the paint, where both should show bare road, in 8-bit levels.
         steer_error: the mean absolute difference between the controller's answers, in steer units.
-        predicted_shift: the mean shift of steering a frame that the composites predict; positive = right.
-        rendered_shift: the same on the rendered frames.
+        predicted_shift: mean shift of steering per frame that the composites predict, positive to the right.
+        rendered_shift: mean shift of steering per frame on the rendered frames, positive to the right.
     """
 
     frames: int
@@ -54,13 +54,13 @@ class Fidelity(Saved):
     Args:
         drive: the name of the recorded drive.
         frame_number: the step of each frame in its drive.
-        clean: the frames without paint.
-        composited: the same with the pattern composited in: the surrogate's.
-        rendered: the same over the real paint: the simulator's.
-        clean_steer: the controller's answers to the frames without paint; positive = right.
-        composited_steer: its answers to the surrogate's frames, which are what the search predicts.
-        rendered_steer: its answers to the simulator's frames.
-        agreement: how close composited and rendered are.
+        clean: frames without paint, RGB, (F, H, W, 3).
+        composited: the same frames with the pattern composited in, (F, H, W, 3).
+        rendered: the same frames as the simulator renders them over the real paint, (F, H, W, 3).
+        clean_steer: controller's answers to the clean frames, steer units, positive to the right, (F,).
+        composited_steer: controller's answers to the composited frames, which the search predicts with, (F,).
+        rendered_steer: controller's answers to the rendered frames, (F,).
+        agreement: summary of how close composited and rendered frames are.
     """
 
     drive: str
@@ -93,14 +93,14 @@ def measure_fidelity(
 
     Args:
         simulator: an open simulator of the kind that the set was recorded in.
-        controller: who drove; it computes on `device`.
-        scenario: where the set was recorded.
-        pattern: what is painted.
-        recordings: the calibrated set.
+        controller: controller that drove; it computes on `device`.
+        scenario: scenario that the set was recorded in.
+        pattern: pattern that is painted; one pattern, not a batch.
+        recordings: calibrated set of recordings.
         folder: the folder of the evaluation, which gets fidelity.npz.
         weather: the weather in which the set was recorded.
         clean: the clean drive that was recorded; driven again where it is not given.
-        device: where to composite.
+        device: torch device on which frames are composited.
 
     Returns:
         The comparison; None where the set holds no clean drive, or one that this controller would not drive here.
@@ -137,12 +137,12 @@ def compare_with_rendered(
     replayed over the bare road.
 
     Args:
-        pattern: what was painted.
-        recordings: the calibrated set.
-        controller: whose answers are compared; it computes on `device`.
+        pattern: pattern that was painted; one pattern, not a batch.
+        recordings: calibrated set of recordings.
+        controller: controller whose answers are compared; it computes on `device`.
         rendered: the simulator's frames over the paint, one for each of the drive's (`rendered_frames`).
         drive: the name of one drive of the set.
-        device: where to composite.
+        device: torch device on which frames are composited.
 
     Raises:
         RecordingError: there is no such drive, or it has another number or size of frames.
@@ -183,7 +183,7 @@ def rendered_frames(
     """A drive's controls given again over the painted road: what the controller would have seen at some of its steps.
 
     Raises:
-        RecordingError: the drive has fewer steps.
+        RecordingError: the drive has fewer steps than are asked for.
     """
     wanted = set(frame_number.tolist())
     if not wanted or min(wanted) < 0 or max(wanted) >= len(episode):
@@ -236,12 +236,12 @@ def agreement(
     """Compare composites with what a simulator rendered from the same places.
 
     Args:
-        composited: recorded frames with the pattern composited in.
-        rendered: the same frames with the pattern really there.
-        paint: which pixels the pattern covers.
+        composited: recorded frames with the pattern composited in, (F, H, W, 3).
+        rendered: the same frames as rendered over the real paint, (F, H, W, 3).
+        paint: pixels that the pattern covers, (F, H, W).
         clean_steer: the controller's answers to the frames without paint, in steer units.
-        composited_steer: its answers to the composited ones.
-        rendered_steer: its answers to the rendered ones.
+        composited_steer: controller's answers to the composited frames, in steer units, (F,).
+        rendered_steer: controller's answers to the rendered frames, in steer units, (F,).
 
     Raises:
         EpisodeError: no pixel shows paint.

@@ -45,10 +45,10 @@ class Strip:
     """Pictures of one passage over the canvas, at the same instants of both drives.
 
     Args:
-        time_s: seconds since the start, of each picture.
-        lateral_m: how far the painted drive is beside the clean path then, in metres, left positive.
-        clean: camera pictures of the drive over the bare road.
-        painted: camera pictures of the drive over the paint.
+        time_s: time of each picture since the start, seconds, (n,).
+        lateral_m: distance of the painted drive beside the clean path at each picture, metres, left positive, (n,).
+        clean: camera pictures of the drive over the bare road, (n, h, w, 3).
+        painted: camera pictures of the drive over the paint, (n, h, w, 3).
     """
 
     time_s: Float[np.ndarray, " n"]
@@ -57,17 +57,17 @@ class Strip:
     painted: UInt8[np.ndarray, "n h w 3"]
 
     def save(self, path: Path) -> None:
-        """Write one NumPy archive.
+        """Write the strip as one NumPy archive.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         write_archive(path, {name: getattr(self, name) for name in self.__slots__})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Side:
-    """One of the two drives: what the film says of it, and its camera pictures as JPEG, a tenth of the memory."""
+    """One of the two drives: its title, colour and episode, and its camera pictures as JPEG, a tenth of the memory."""
 
     title: str
     colour: tuple[int, int, int]
@@ -89,8 +89,8 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
 
     Args:
         simulator: an open simulator of the kind that the evaluation used.
-        evaluation: the drives that were judged.
-        paint: the canvas as it was painted.
+        evaluation: evaluation whose shown trial is filmed.
+        paint: picture of the canvas as it was painted.
         folder: the folder of the evaluation, which gets film.mp4, film.jpg and strip.npz.
 
     Returns:
@@ -161,7 +161,7 @@ def _pictures(simulator: Simulator, start: Scenario, episode: Episode, paint: Pa
 
 
 def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: int) -> Image.Image:
-    """One image of the film."""
+    """One image of the film, with both drives side by side."""
     large, small = _font(26), _font(19)
     page = Image.new("RGB", (2 * VIEW[0], VIEW[1] + CAPTION_PX), PAPER)
     pen = ImageDraw.Draw(page)
@@ -188,9 +188,9 @@ def last_event(episode: Episode, step: int, shown: int) -> tuple[str, bool]:
     """What a drive's caption says at a step.
 
     Args:
-        episode: the drive.
-        step: counted from its start.
-        shown: how many of its steps the film shows.
+        episode: episode of the drive.
+        step: number of the step, counted from the drive's start.
+        shown: number of the drive's steps that the film shows.
 
     Returns:
         An event of the last three seconds, and True; else, with the last picture, how the drive ends, and False; else

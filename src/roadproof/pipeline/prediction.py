@@ -20,20 +20,20 @@ from roadproof.recordings import RecordingSet
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Prediction(Saved):
-    """One pattern, foretold and driven over.
+    """The predicted drive over one pattern beside the real one.
 
     Args:
-        predicted_m: the paper's deviation in the recorded world, against its own bare road; mean over small errors of
-            steering.
-        least_m: of it over those errors.
-        most_m: of it over those errors.
-        driven_m: the same in the simulator.
-        path_error_m: mean distance between the predicted and the driven position at the same instants.
-        gap_m: the most that the predicted path is aside of a recorded pose.
-        gap_rad: the most that it is turned from one.
-        clean_xy: world x, y of the clean drive while the canvas is in view.
-        predicted_xy: of the predicted one.
-        driven_xy: of the driven one.
+        predicted_m: the paper's deviation in the recorded world, metres, from the drive over the bare road there; mean
+            over small errors of steering.
+        least_m: least predicted deviation over those errors, metres.
+        most_m: largest predicted deviation over those errors, metres.
+        driven_m: the paper's deviation of the drive in the simulator, metres.
+        path_error_m: mean distance between predicted and driven positions at the same instants, metres.
+        gap_m: largest distance of the predicted path across the heading from the recorded poses shown, metres.
+        gap_rad: largest difference of heading from the recorded poses shown, radians.
+        clean_xy: world x, y of the clean drive while the canvas is in view, metres, (t, 2).
+        predicted_xy: world x, y of the predicted drive at the same instants, metres, (t, 2).
+        driven_xy: world x, y of the drive over the pattern at those instants, metres, (u, 2).
     """
 
     predicted_m: float
@@ -74,15 +74,15 @@ def predict(
     """Drive over a pattern in the recorded world, and compare with a drive over it in the simulator.
 
     Args:
-        recordings: with canvas and tracks; the drives' weather is the first.
-        controller: on `device`; the one that drove.
-        pattern: one pattern.
-        clean: the simulator's drive over the bare road, the recorded one.
-        painted: its drive over the pattern.
-        device: where to predict.
+        recordings: recordings with canvas and tracks; the weather of the two drives must be the first of the set.
+        controller: controller that drove, on `device`.
+        pattern: the pattern that was driven over; one pattern, not a batch.
+        clean: episode of the recorded drive over the bare road, in the simulator.
+        painted: episode of the drive over the pattern, in the simulator.
+        device: torch device on which the recorded world computes.
 
     Raises:
-        RecordingError: the set cannot be driven in.
+        RecordingError: the recordings lack a canvas or tracks, or no vehicle can be identified from them.
     """
     world = RecordedWorld(recordings.by_weather()[0], device=device)
     world.fit(controller)

@@ -35,12 +35,12 @@ from roadproof.simulators.protocol import Simulator
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Round:
-    """A search and the drives over what it found.
+    """One re-recording round: its search and the drives over what it found.
 
     Args:
-        attack: the search; its numbers are the surrogate's.
-        selection: the drives over its candidates; closed loop.
-        simulator_calls: drives of this round: recording, calibration and selection.
+        attack: result of the search; its numbers are predictions of the surrogate.
+        selection: outcome of the drives over its candidates, closed loop.
+        simulator_calls: number of drives in this round: recording, calibration and selection.
     """
 
     attack: AttackResult
@@ -50,12 +50,12 @@ class Round:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Rounds:
-    """What came of the rounds.
+    """The outcome of all re-recording rounds.
 
     Args:
-        first: the choice before them.
-        done: each of them.
-        stopped: why there are fewer than asked for; empty where there are not.
+        first: selection before the rounds.
+        done: finished rounds, in order.
+        stopped: why there are fewer rounds than asked for; empty if there are not.
     """
 
     first: Selection
@@ -64,12 +64,12 @@ class Rounds:
 
     @property
     def best(self) -> Selection:
-        """The choice that deviated most when driven, of all rounds and the one before."""
+        """The selection with the largest deviation when driven, of all rounds and the one before."""
         return max((self.first, *(each.selection for each in self.done)), key=lambda chosen: chosen.deviation_m)
 
     @property
     def simulator_calls(self) -> int:
-        """Drives of all rounds."""
+        """Number of simulator drives in all rounds."""
         return sum(each.simulator_calls for each in self.done)
 
 
@@ -90,29 +90,29 @@ def search_on(
     device: torch.device | str = "cpu",
     on_step: Callable[[int, int, str], object] = lambda _done, _total, _word: None,
 ) -> Rounds:
-    """Search on for some rounds, each with one drive more.
+    """Search on for some rounds, each with the recording of one more drive.
 
     A round is the search before, but no starts compete: every start is a pattern that was found before. It ends the
     rounds when the drive cannot be calibrated, because it shows too little of the canvas.
 
     Args:
         simulator: an open simulator.
-        controller: on `device`.
-        drives: recorded without paint; gives scenario and weather.
-        recordings: calibrated; those the search before was on.
-        groups: of it.
-        found: by it.
-        selection: of it; its drives are in `folder`/selection.
-        objective: what the search before made large, and each round's search makes large.
-        rounds: how many.
-        best: candidates driven in each.
-        method: of calibration.
-        folder: of the run; what it holds is not done again.
-        device: where to search.
-        on_step: told how much is done, of how much, and a word on it.
+        controller: controller that is attacked; it computes on `device`.
+        drives: drives recorded without paint; they give scenario and weather.
+        recordings: calibrated recordings that the search before used.
+        groups: groups of drives of the search before.
+        found: result of the search before.
+        selection: selection after the search before, whose drives are in `folder`/selection.
+        objective: objective of the search before, which every round's search shares.
+        rounds: number of rounds.
+        best: number of candidates driven over in each round.
+        method: calibration method for the recorded drives.
+        folder: path of the run folder; what it holds is not done again.
+        device: torch device on which the search computes.
+        on_step: called with the number of steps done, the number of all steps, and a word on the current one.
 
     Raises:
-        RoadproofError: as the stages do.
+        RoadproofError: as recording, search and selection do; a failed calibration ends the rounds without an error.
     """
     clean = Drives(settings=drives.settings, drives=drives.drives[:1])
     steps = _gone_on(found.method).steps(objective)
@@ -164,22 +164,22 @@ def search_on(
 
 @dataclass(frozen=True, slots=True)
 class _Driven:
-    """A choice and where its drives are."""
+    """A selection and the folder of its drives."""
 
     selection: Selection
     folder: Path
 
     def bare(self) -> Episode:
-        """The drive without paint."""
+        """The episode of the drive over the bare road."""
         return load_episodes(self.folder, [self.selection.driven[0].trial.clean])[0]
 
     def over_chosen(self) -> Episode:
-        """The drive over the pattern that was chosen."""
+        """The episode of the drive over the pattern that was chosen."""
         return load_episodes(self.folder, [self.selection.driven[self.selection.chosen].trial.painted])[0]
 
 
 def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Candidate]]:
-    """What was found, with its deviation when driven: the largest first, then what was not driven."""
+    """The candidates found with their deviation when driven, metres: the largest first, then those not driven."""
     driven = {each.rank: each.trial.deviation_m for each in selection.driven}
     ranked = [(driven.get(rank, -1.0), candidate) for rank, candidate in enumerate(found.candidates, 1)]
     return sorted(ranked, key=lambda each: -each[0])
@@ -188,7 +188,7 @@ def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Cand
 def _recorded(
     simulator: Simulator, controller: Controller, clean: Drives, last: _Driven, method: Calibration, place: Path
 ) -> tuple[Recording, int]:
-    """The way that the last pattern took the car, without the paint and calibrated, and the drives that took."""
+    """The recording of the last pattern's path, without paint and calibrated, and the number of drives it took."""
     drive = record_along(simulator, controller, clean, last.over_chosen(), name=place.name, folder=place)
     both = replace(clean, drives=(*clean.drives, drive))
     calibrated = Calibrated.kept(place, both, method)
@@ -201,5 +201,5 @@ def _recorded(
 
 
 def _gone_on(method: Method) -> Method:
-    """The method with as many starts as it ended with, none of which compete."""
+    """The method with as many starts as it ended with, none of which compete (no successive halving)."""
     return replace(method, halving=False) if isinstance(method, GradOpt) else method

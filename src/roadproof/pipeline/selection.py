@@ -32,9 +32,9 @@ class Driven:
     """One candidate and the drive over it, closed loop.
 
     Args:
-        group: what it was found on.
-        rank: its place by the surrogate, 1 the strongest.
-        trial: what came of the drive.
+        group: name of the group of drives that the candidate was found on.
+        rank: rank of the candidate by the surrogate, 1 for the strongest.
+        trial: comparison of the drive over the candidate with the clean drive.
     """
 
     group: str
@@ -47,15 +47,15 @@ class Selection:
     """The candidate that deviated most when driven.
 
     Args:
-        pattern: the pattern of that candidate.
-        driven: every candidate driven, in the surrogate's order.
-        chosen: index of that candidate among them.
-        simulator_calls: drives, the clean one included where it was made for this; 0 where they are predicted.
+        pattern: pattern of the chosen candidate.
+        driven: candidates that were driven over, in the surrogate's order.
+        chosen: index of the chosen candidate in `driven`.
+        simulator_calls: number of drives, the clean one included if it was made for this; 0 if they are predicted.
         predicted: whether the drives are predicted, and nothing was driven for real.
-        made_of: what tells it from a choice among others (`io.identity`); empty in files older than the word.
+        made_of: identity of the selection, by name (`io.identity`); empty in files of earlier versions.
 
     Raises:
-        RoadproofError: `chosen` is none of the candidates.
+        RoadproofError: `chosen` is not an index of the candidates.
     """
 
     pattern: Pattern
@@ -86,7 +86,7 @@ class Selection:
 
     @staticmethod
     def load(folder: AnyPath) -> Selection:
-        """Read what `save` wrote.
+        """Read the selection that `save` wrote.
 
         Raises:
             RoadproofError: a file is missing or damaged.
@@ -126,14 +126,14 @@ def select_by_driving(
 
     Args:
         simulator: an open simulator.
-        controller: that was attacked.
-        scenario: where.
-        candidates: the strongest first, as in `AttackResult.candidates`.
-        best: how many are driven; every group gets its share, since the surrogate does not know which side gives way.
-        weather: of the drives.
-        folder: keeps every drive and the choice; what it holds is not done again.
-        clean: the drive over the bare road, where it was made already.
-        on_drive: told after each drive how many are done, and the largest deviation so far.
+        controller: controller that was attacked.
+        scenario: scenario that is driven.
+        candidates: candidates, the strongest first, as in `AttackResult.candidates`.
+        best: number of candidates driven over, shared among the groups, as either side may give way.
+        weather: weather of the drives, clear noon by default.
+        folder: folder that keeps every drive and the choice; what it holds is not done again.
+        clean: drive over the bare road; None to make it here.
+        on_drive: called after each drive with the number done, the clean one included, and the largest deviation, m.
 
     Raises:
         RoadproofError: there is nothing to drive, the folder is damaged, or it holds a choice among others.

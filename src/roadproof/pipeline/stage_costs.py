@@ -24,11 +24,11 @@ _EVERY_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """What a stage took.
+    """The cost of one stage of a run.
 
     Args:
-        seconds: wall time.
-        simulator_calls: drives.
+        seconds: wall time, seconds.
+        simulator_calls: number of simulator drives.
     """
 
     seconds: float = 0.0
@@ -37,7 +37,7 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """run.json; in files of earlier versions an identity as text and the controller's answers stand for its parts."""
+    """The content of run.json; earlier versions have an identity as text and the controller's answers."""
 
     cost: dict[str, StageCost]
     made_of: dict[str, Any] = field(default_factory=dict[str, Any])
@@ -61,16 +61,16 @@ _FILE = RecordFile(kind=_Run, name="roadproof-run", error=RoadproofError, remedy
 
 
 class Ledger:
-    """Writes down what stages take.
+    """Records the cost of each stage of a run in run.json.
 
     Args:
-        folder: folder of the run.
-        made_of: what tells this run from another, by name (`io.identity`).
-        stages: names of all its stages, in order.
+        folder: path of the run folder.
+        made_of: identity of the run, by name (`io.identity`).
+        stages: names of all stages of the run, in order.
 
     Raises:
-        RoadproofError: the folder is another run's; the message names what differs.
-        OutputError: it cannot be written.
+        RoadproofError: the folder belongs to another run; the message names what differs.
+        OutputError: run.json cannot be written.
     """
 
     def __init__(self, folder: Path, made_of: Mapping[str, object], stages: Sequence[str]) -> None:
@@ -86,7 +86,7 @@ class Ledger:
 
     @contextmanager
     def stage(self, name: str) -> Generator[None]:
-        """Time a stage; one that is gone on with adds to what it took before."""
+        """Time a stage; a resumed stage adds to the time it took before."""
         self._current, self._since = name, time.perf_counter()
         try:
             yield
@@ -95,12 +95,12 @@ class Ledger:
             self._current = ""
 
     def step(self) -> None:
-        """Note the time from time to time, so that a killed process loses a second of it at most."""
+        """Write the time down at intervals, so that a killed process loses a second of it at most."""
         if self._current and time.perf_counter() - self._since >= _EVERY_S:
             self._note()
 
     def calls(self, name: str, simulator_calls: int) -> None:
-        """Say how many drives a stage took, from its beginning."""
+        """Record how many drives a stage took since the run began."""
         self.cost[name] = replace(self.cost[name], simulator_calls=simulator_calls)
 
     def _note(self) -> None:
@@ -116,10 +116,10 @@ class Ledger:
 
 
 def read_cost(folder: Path) -> dict[str, StageCost]:
-    """What the stages of a run took, in their order; nothing where the run keeps no ledger.
+    """Cost of each stage of a run, in their order; empty if the run has no run.json.
 
     Raises:
-        RoadproofError: the ledger is damaged.
+        RoadproofError: run.json is damaged.
     """
     path = folder / FILE
     return _FILE.read(path).cost if path.exists() else {}

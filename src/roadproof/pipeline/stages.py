@@ -59,7 +59,7 @@ class Stages:
 
     @property
     def made_of(self) -> dict[str, object]:
-        """What tells this run from another."""
+        """What identifies this run, by name."""
         size = self.simulator.input.height_px, self.simulator.input.width_px
         return {
             "scenario": self.scenario,
@@ -73,7 +73,7 @@ class Stages:
         }
 
     def record(self, number: int) -> Drives:
-        """The drives past the bare canvas in one of the weathers."""
+        """Record the drives past the bare canvas in the weather of this number."""
         budget, wanted = self.budget, self.budget.trajectories
         total = wanted.count * len(budget.recorded_in)
         return record(
@@ -90,7 +90,7 @@ class Stages:
         )
 
     def calibrate(self, number: int, drives: Drives) -> RecordingSet:
-        """Those drives, calibrated."""
+        """Calibrate the drives of the weather of this number."""
         place, each = self._folder_of(number), replays_needed(drives, self.budget.calibration)
         done, total = Calibrated.kept(place, drives, self.budget.calibration), each * len(self.budget.recorded_in)
         if done is None:
@@ -108,10 +108,10 @@ class Stages:
         return done.recordings
 
     def check_paint(self) -> None:
-        """See, before anything is driven, that the method knows the patterns and the limits on paint leave some.
+        """Check, before anything is driven, that the method can search the patterns and the limits leave some.
 
         Raises:
-            PatternError: it does not, or they leave none.
+            PatternError: the method cannot search them, or the limits leave none.
         """
         space = self.space
         self.budget.method.check_space(space)
@@ -120,11 +120,11 @@ class Stages:
             space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
-        """The method's own groups, or all drives pooled where the budget says so."""
+        """The groups to attack: the method's own, or all drives pooled if the budget says so."""
         return parse_groups("all", recordings) if self.budget.pooled else self.budget.method.groups(recordings)
 
     def attack(self, recordings: RecordingSet) -> AttackResult:
-        """The search for patterns."""
+        """Search for patterns on the recordings."""
         budget = self.budget
         steps = budget.method.steps(budget.objective)
         return kept_attack(
@@ -141,7 +141,7 @@ class Stages:
         )
 
     def select(self, found: AttackResult, drives: Drives) -> Selection:
-        """The drives over what was found, once each."""
+        """Drive over the strongest candidates once each, and choose one."""
         total = 1 + min(self.budget.select, len(found.candidates))
         return select_by_driving(
             self.simulator,
@@ -157,7 +157,7 @@ class Stages:
         )
 
     def search_on(self, drives: Drives, recordings: RecordingSet, found: AttackResult, selection: Selection) -> Rounds:
-        """The re-recording rounds."""
+        """Run the re-recording rounds that the budget asks for."""
         return search_on(
             self.simulator,
             self.controller,
@@ -178,7 +178,7 @@ class Stages:
     def cheapest(
         self, recordings: RecordingSet, found: AttackResult, wanted_m: float, drives: Drives
     ) -> tuple[Cheapest, Selection] | None:
-        """The least paint for a deviation, and the drive over it; None where nothing found reaches that."""
+        """The least paint for a deviation, and the drive over it; None if nothing found reaches that deviation."""
         folder, total = self.folder / CHEAPEST, 15
         made_of = {"wanted_m": wanted_m, "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]}
         if (folder / "cheapest.json").exists():
@@ -214,7 +214,7 @@ class Stages:
     def predict(
         self, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None
     ) -> Prediction | None:
-        """The predicted path of the chosen pattern beside the one driven over it; kept with the run."""
+        """Predict the path of the chosen pattern, beside the one driven over it; the run folder keeps the result."""
         chosen = selection if rounds is None else rounds.best
         if chosen is None or not self.budget.is_predicted:
             return None
@@ -231,7 +231,7 @@ class Stages:
         return prediction
 
     def evaluate(self, pattern: Pattern) -> Evaluation:
-        """The drives over the chosen pattern that say how bad it is."""
+        """Drive over the chosen pattern in many conditions, to measure how bad it is."""
         return evaluate(
             self.factory if self.factory and self.processes > 1 else self.simulator,
             self.controller,
@@ -251,7 +251,7 @@ class Stages:
     def film(
         self, evaluation: Evaluation, pattern: Pattern, drives: Drives, recordings: RecordingSet
     ) -> Fidelity | None:
-        """What the report shows of driving: two drives as a film, and composites beside renders."""
+        """Film two drives and compare composites with renders, for the report."""
         folder = self.folder / "evaluation"
         film_trial(self.simulator, evaluation, raster(pattern), folder)
         try:
@@ -271,5 +271,5 @@ class Stages:
             return None
 
     def _folder_of(self, number: int) -> Path:
-        """Where the drives of a weather are."""
+        """The folder of the drives in the weather of this number."""
         return self.folder / self.budget.recorded_in[number] if number else self.folder

@@ -50,18 +50,18 @@ STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "eval
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class StressTest:
-    """What came of the whole loop.
+    """The outcome of a whole stress test.
 
     Args:
-        attack: what the search found; its numbers are the surrogate's.
-        selection: the drives over its candidates; None where the surrogate was believed.
-        rounds: the re-recording rounds; None where none was asked for.
+        attack: result of the search; its numbers are predictions of the surrogate.
+        selection: outcome of the drives over its candidates; None if no candidate was driven over.
+        rounds: outcome of the re-recording rounds; None if none was asked for.
         prediction: where the recorded world says the chosen pattern takes the car, beside where it went; None where
             the search did not drive there, or nothing was driven to compare.
-        evaluation: the drives over the chosen pattern, closed loop.
+        evaluation: evaluation of the chosen pattern by drives over it, closed loop.
         fidelity: composited frames of the clean drive beside rendered ones; None without `film`, or where no frame
             shows any paint.
-        cost: what each stage took since the run began.
+        cost: cost of each stage since the run began, by its name.
         cheapest: the least paint for the deviation that was asked for, and the drive over it; None where none was
             asked for, or nothing found reaches it.
     """
@@ -77,7 +77,7 @@ class StressTest:
 
     @property
     def pattern(self) -> Pattern:
-        """The one that was chosen in the end."""
+        """The pattern that was chosen in the end."""
         return _chosen(self.attack, self.selection, self.rounds)
 
     def _repr_html_(self) -> str:
@@ -115,20 +115,19 @@ def stress_test(
         budget: how much is spent, and on which search.
         space: the patterns that are searched; five rectangles of the published family by default.
         seed: the seed of recording, search and traffic.
-        controller_name: what reports call the controller.
-        device: where to search, "cpu" or "cuda:0".
+        controller_name: name of the controller in reports.
+        device: torch device on which the search computes, "cpu" or "cuda:0".
         factory: opens one more simulator of the same kind; needed for several processes.
         processes: how many drives of the evaluation are made at once; the controller must be picklable for several.
         film: whether to film the two drives that the report shows, and to render the recorded frames over the paint,
             which takes three drives more.
         cheapest_m: the deviation, in metres, for which the least paint is looked for and driven over once; None for
             no such search.
-        on_progress: called after every step of every stage.
+        on_progress: called after every step of every stage with the stage, steps done, all steps, and a word.
 
     Raises:
-        RoadproofError: the folder holds a run of something else, another process works in it, or a stage refuses; the
-            message says why.
-        PatternError: the limits on paint leave no pattern, or the search knows none.
+        RoadproofError: the folder holds another run, another process works in it, or a stage refuses; it says why.
+        PatternError: the limits on paint leave no pattern, or the search method cannot search the patterns.
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     folder = as_path(folder)
@@ -164,7 +163,7 @@ def stress_test(
 
 
 def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
-    """All stages, one after another."""
+    """Run all stages, one after another."""
     budget, on_progress = run.budget, run.on_progress
     ledger = Ledger(run.folder, run.made_of, STAGES)
 

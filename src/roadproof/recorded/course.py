@@ -37,10 +37,10 @@ class Place(NamedTuple):
     """Where R cars are beside the clean path.
 
     Args:
-        nearest: index of the nearest known point of it.
-        s_m: arclength.
-        right_m: offset; differentiable in the pose, as turned_rad.
-        turned_rad: heading error, left positive.
+        nearest: index of the nearest known point of the clean path, (R,).
+        s_m: arclength s along the clean path, metres, (R,).
+        right_m: offset d from the clean path, metres, right positive, (R,); differentiable in the pose.
+        turned_rad: heading error e, radians, left positive, (R,); differentiable in the pose.
     """
 
     nearest: Int[Tensor, " r"]
@@ -50,13 +50,13 @@ class Place(NamedTuple):
 
 
 class Course:
-    """The clean drive while the canvas is in view.
+    """The clean drive as a line, with the part of it from which the canvas is in view.
 
     Args:
-        track: of the clean drive.
-        canvas: where it lies.
-        shown: step of the first recorded frame: there is nothing to see before it.
-        device: where it is compared.
+        track: track of the clean drive: its poses and controls.
+        canvas: place of the canvas in the world.
+        shown: number of the step of the first recorded frame; there is no picture before it.
+        device: torch device on which cars are compared with the path.
 
     Raises:
         RecordingError: the drive is too short, or does not move.
@@ -92,7 +92,7 @@ class Course:
         self._law = on_device(np.zeros(3))
 
     def locate(self, poses: Poses) -> Place:
-        """The nearest point of the clean path, and how a car lies to it."""
+        """The nearest point of the clean path to each car, and the car's offset and heading error there."""
         here, path = poses.detached(), self.poses
         index = ((here.x_m[:, None] - path.x_m).square() + (here.y_m[:, None] - path.y_m).square()).argmin(1)
         x, y, yaw = path.x_m[index], path.y_m[index], path.yaw_rad[index]
@@ -103,14 +103,14 @@ class Course:
         return Place(index, self.arclength_m[index] + (c * dx + s * dy).detach(), s * dx - c * dy, turned)
 
     def at(self, values: Float[Tensor, " n"], s_m: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
-        """What has one value a point of the path, at arclengths between them; its ends' values beyond them."""
+        """Values given at the points of the path, interpolated at arclengths; beyond its ends the end's value holds."""
         high = torch.searchsorted(self.arclength_m, s_m.contiguous(), right=True).clamp(1, len(values) - 1)
         start, end = self.arclength_m[high - 1], self.arclength_m[high]
         share = ((s_m - start) / (end - start).clamp_min(1e-6)).clamp(0.0, 1.0)
         return torch.lerp(values[high - 1], values[high], share)
 
     def fit_law(self, poses: Poses, answers: Float[Tensor, " n"]) -> None:
-        """Fit the bare road's law to a controller's answers to recorded frames."""
+        """Fit the law of steering on the bare road to a controller's answers to the recorded frames."""
         place = self.locate(poses)
         d, e = place.right_m, place.turned_rad
         terms = torch.stack([d, e, d * d.abs()], 1)
@@ -119,7 +119,7 @@ class Course:
         self._law = cast("Tensor", torch.linalg.solve(terms.mT @ terms + weight, terms.mT @ left))
 
     def law(self, place: Place) -> Float[Tensor, " r"]:
-        """Steering on the bare road at some places."""
+        """Steering on the bare road at each place, by the fitted law."""
         d = place.right_m.clamp(-_FAR_M, _FAR_M)
         p, q, r = self._slopes()
         return self.at(self.steer, place.s_m) + p * d + q * place.turned_rad + r * d * d.abs()
@@ -128,7 +128,7 @@ class Course:
         return self._law[0], self._law[1], self._law[2]
 
     def feedback(self, place: Place) -> Float[Tensor, " r"]:
-        """Zero, with the slopes of the law: the gradient that the picture would add through the pose."""
+        """Zero, with the gradient of the law in the pose, which stands for what the picture would answer to a move."""
         p, q, _ = self._slopes()
         d, e = place.right_m, place.turned_rad
         return p * (d - d.detach()) + q * (e - e.detach())

@@ -20,8 +20,8 @@ class Light:
     """Gain and offset of the paint, and how much of the canvas nothing hides, in every pixel of every frame.
 
     Args:
-        recordings: calibrated with maps of every pixel, or with one colour for all.
-        device: where it is read.
+        recordings: recordings calibrated with maps of every pixel, or with one colour transform for all.
+        device: torch device of the light's tensors.
     """
 
     def __init__(self, recordings: RecordingSet, device: torch.device) -> None:
@@ -38,10 +38,10 @@ class Light:
         """Gain and offset of pixels of R pictures, and the share of each through which the canvas is seen.
 
         Args:
-            pixel: index into a flattened picture.
-            source: where in its frame each of them comes from, in halves of its width and height from its middle.
-            frame: index of each picture's frame.
-            footprints: of the pixels on the canvas, (R, 1, P, ...).
+            pixel: index of each pixel in its flattened picture, (R, P).
+            source: place of each pixel in the recorded frame, in half widths and heights from its middle, (R, P, 2).
+            frame: index of the recorded frame of each picture, (R,).
+            footprints: footprints of the pixels on the canvas, (R, 1, P, ...).
         """
         share = canvas_share(footprints)[:, 0]
         if self._maps is None:
@@ -79,7 +79,7 @@ def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"
 
 
 def _expected_share(homographies: Float[np.ndarray, "f 3 3"], view: CropResize) -> Float[Tensor, "f h w"]:
-    """Share of every pixel that lies on the canvas, were nothing in its way."""
+    """Share of every pixel that would lie on the canvas if nothing stood in its way."""
     index, centre, jacobian = canvas_pixels(homographies, view)
     footprints = Footprints.of(centre, jacobian, view.resampling)
     share = torch.zeros(len(homographies) * view.height_px * view.width_px)

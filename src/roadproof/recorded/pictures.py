@@ -34,9 +34,9 @@ class Poses(NamedTuple):
     """Where R cars are on the ground, seen from the middle of the canvas; float64.
 
     Args:
-        x_m: east of the canvas' middle, in the world's axes.
-        y_m: north of it.
-        yaw_rad: heading, left positive.
+        x_m: world x from the canvas' middle, metres, (R,).
+        y_m: world y from the canvas' middle, metres, (R,).
+        yaw_rad: heading, radians, left positive, (R,).
     """
 
     x_m: Float[Tensor, " r"]
@@ -44,22 +44,22 @@ class Poses(NamedTuple):
     yaw_rad: Float[Tensor, " r"]
 
     def picked(self, index: Int[Tensor, " p"]) -> Poses:
-        """Some of them."""
+        """The poses with the given indices."""
         return Poses(self.x_m[index], self.y_m[index], self.yaw_rad[index])
 
     def detached(self) -> Poses:
-        """The same without a gradient."""
+        """The same poses without a gradient."""
         return Poses(self.x_m.detach(), self.y_m.detach(), self.yaw_rad.detach())
 
 
 class Gap(NamedTuple):
-    """How far poses are from the recorded ones they are shown from.
+    """How far poses are from the recorded poses whose frames show them.
 
     Args:
-        frame: index of the recorded frame.
-        ahead_m: along the heading, positive where the pose is further on.
-        left_m: across it, positive where the pose is further left.
-        turned_rad: of heading, left positive.
+        frame: index of the recorded frame, (R,).
+        ahead_m: distance along the pose's heading, metres, positive where the pose is further on, (R,).
+        left_m: distance across the pose's heading, metres, positive where the pose is further left, (R,).
+        turned_rad: heading of the pose minus that of the recorded frame, radians, left positive, (R,).
     """
 
     frame: Int[Tensor, " r"]
@@ -69,7 +69,7 @@ class Gap(NamedTuple):
 
 
 class Alike(NamedTuple):
-    """Gaps that count alike when a recorded frame is chosen for a pose: along the heading, across it, and of it."""
+    """Differences of pose that count alike when a frame is chosen: along the heading, across it, and in heading."""
 
     ahead_m: float
     left_m: float
@@ -87,11 +87,11 @@ class FrameBank:
     """All recorded frames of a set with their poses and the light on their canvas, ready to be looked up.
 
     Args:
-        recordings: a set whose canvas and tracks are known.
-        device: where pictures are made.
+        recordings: recordings whose canvas and tracks are known.
+        device: torch device on which pictures are made.
 
     Raises:
-        RecordingError: the canvas' place or the poses of a drive are not known.
+        RecordingError: the set has no place of the canvas, or a drive has no poses.
     """
 
     def __init__(self, recordings: RecordingSet, *, device: torch.device | str = "cpu") -> None:
@@ -129,7 +129,7 @@ class FrameBank:
         return torch.tensor(values, device=self.device, dtype=dtype)
 
     def _set_rays(self) -> None:
-        """What depends on camera, crop and canvas alone."""
+        """Set what depends on camera, crop and canvas alone."""
         camera, view = self.camera, self.view
         pitch = math.radians(camera.pitch_deg)
         horizon = camera.focal_px * math.tan(pitch) + (camera.height_px - 1) / 2
@@ -161,7 +161,7 @@ class FrameBank:
         self._canvas_from_ground = self._exact(np.linalg.inv(ground_from_canvas))
 
     def _recorded_views(self, recordings: RecordingSet) -> Float[Tensor, "n 3 3"]:
-        """G of every recorded frame: from its own homography, so that a camera that leans is where it was."""
+        """G of every recorded frame, from its own homography, so that a camera that leans is where it was."""
         seen = np.concatenate([drive.image_from_canvas for drive in recordings.recordings])
         views = self._exact(recordings.view.input_from_camera @ seen) @ self._canvas_from_ground
         return views / views.square().sum((1, 2), keepdim=True).sqrt()
@@ -181,8 +181,8 @@ class FrameBank:
         """The bare pictures at some poses, and what is needed to paint them.
 
         Args:
-            poses: without a gradient.
-            gap: from `nearest`.
+            poses: the R poses, without a gradient.
+            gap: the recorded frames for these poses, from `nearest`.
         """
         input_from_ground, ground_from_input, source = self._sources(poses, gap)
         shown, beyond = self._sampled(gap, source)
@@ -198,9 +198,9 @@ class FrameBank:
         return Views(frames, self._canvas_views(frames, input_from_ground, ground_from_input, source, gap))
 
     def _sources(self, poses: Poses, gap: Gap) -> tuple[Tensor, Tensor, Float[Tensor, "r 2 n"]]:
-        """G' of each pose and its inverse, (R, 3, 3), and where in its frame every pixel comes from.
+        """G' of each pose and its inverse, (R, 3, 3), and the place in its recorded frame that every pixel comes from.
 
-        In halves of the frame's width and height, from its middle.
+        The place is in half widths and half heights of the frame, from its middle.
         """
         # The car has moved on the ground as a whole: the camera looks at it as it did from the recorded pose.
         wanted = self._input_from_car[gap.frame] @ _inverse(_ground_from_car(poses))
@@ -214,7 +214,7 @@ class FrameBank:
         return wanted, ground_from_input, mapped[:, :2] / mapped[:, 2:]
 
     def _sampled(self, gap: Gap, source: Float[Tensor, "r 2 n"]) -> tuple[Float[Tensor, "r 3 h w"], Tensor]:
-        """Frames looked up there, and how far each pixel lies beyond its frame, in halves of its size."""
+        """Frames sampled at the source places, and how far each pixel lies beyond its frame, in halves of its size."""
         height, width = self.view.height_px, self.view.width_px
         near = source.clamp(-3, 3)
         levels = self.levels.index_select(0, gap.frame)
@@ -230,7 +230,7 @@ class FrameBank:
         source: Float[Tensor, "r 2 n"],
         gap: Gap,
     ) -> OwnViews | None:
-        """The canvas' pixels of each picture with the light on them; None where none shows the canvas."""
+        """The canvas' pixels of each picture with the light on them; None if no picture shows the canvas."""
         width = self.view.width_px
         rows = self._canvas_rows(input_from_ground)
         if rows is None:
@@ -270,7 +270,7 @@ class FrameBank:
         return OwnViews.of(flat, valid, footprints, clean, share * gain, share * (offset - clean), self.colour.response)
 
     def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
-        """The rows between which every picture has its canvas; None where none has any."""
+        """The range of rows in which every picture has its canvas; None if no picture has one."""
         seen = input_from_ground @ self._corners
         ahead, row = seen[:, 2] > 0, seen[:, 1] / seen[:, 2]
         if not bool(ahead.any()):
@@ -284,11 +284,11 @@ class FrameBank:
 
 
 class Views(NamedTuple):
-    """Pictures from R poses.
+    """Pictures from R poses, ready to be painted.
 
     Args:
-        frames: of the bare road, in [0, 1].
-        canvas: their canvas' pixels; None where none of them shows it.
+        frames: pictures of the bare road in [0, 1], (R, 3, H, W).
+        canvas: the canvas' pixels of the pictures; None if no picture shows the canvas.
     """
 
     frames: Float[Tensor, "r 3 h w"]
@@ -296,7 +296,7 @@ class Views(NamedTuple):
 
 
 def _picked(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
-    """Some pixels of each picture."""
+    """The pixels of each picture at the given indices."""
     return planes.gather(2, index[:, None].expand(-1, planes.shape[1], -1))
 
 
@@ -316,7 +316,7 @@ def _inverse(matrix: Float[Tensor, "*b n n"]) -> Float[Tensor, "*b n n"]:
 
 
 def _ground_from_car(poses: Poses) -> Float[Tensor, "r 3 3"]:
-    """The rigid motion from a car's own axes, ahead and left, to the ground."""
+    """The rigid motion from a car's own axes (ahead, left) to the ground, (R, 3, 3)."""
     c, s, o = torch.cos(poses.yaw_rad), torch.sin(poses.yaw_rad), torch.zeros_like(poses.yaw_rad)
     return torch.stack([c, -s, poses.x_m, s, c, poses.y_m, o, o, o + 1], -1).view(-1, 3, 3)
 

@@ -93,9 +93,9 @@ class _Ground:
     """The canvas as each frame sees it.
 
     Args:
-        columns: a, b and o of the notation, one beside the other.
-        normal: n.
-        px_m: w and l by the camera's height, m.
+        columns: columns a, b and o of the notation, side by side, (n, 3, 3).
+        normal: upward normal n of the road, in vehicle axes, (n, 3).
+        px_m: w and l that the camera's height gives in each frame, metres per canvas px, (n, 2).
     """
 
     columns: Float[np.ndarray, "n 3 3"]

@@ -55,9 +55,9 @@ class RecordedGap:
     """How far the car is from the pose of the recorded frame that its picture is made from.
 
     Args:
-        ahead_m: along its heading, positive where the car is further on.
-        left_m: across it, positive where the car is further left.
-        turned_rad: of heading, left positive.
+        ahead_m: distance along the heading, metres, positive where the car is further on.
+        left_m: distance across the heading, metres, positive where the car is further left.
+        turned_rad: difference of heading, radians, positive where the car is turned to the left.
     """
 
     ahead_m: float
@@ -89,10 +89,10 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     scenario's time limit counts from the beginning of the stretch; its goal and its map, and the seed, do not count.
 
     Args:
-        recordings: calibrated, with a canvas and the tracks of the drives; the clean drive among them.
-        vehicle: how the car answers; identified from the drives by default.
-        weather: what the light of the recordings is called. They have one light, so drives in another are refused.
-        device: where pictures are made.
+        recordings: calibrated recordings with a canvas and the tracks of all drives, the clean drive among them.
+        vehicle: model of how the car answers to controls; None identifies it from the drives.
+        weather: weather in whose light the set was recorded; drives in another weather are refused.
+        device: torch device on which pictures are made.
 
     Raises:
         RecordingError: there is no clean drive, poses are not known, or the vehicle cannot be identified.
@@ -118,7 +118,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
 
     @property
     def recordings(self) -> RecordingSet:
-        """What it drives in."""
+        """The recordings in which it drives."""
         return self._world.recordings
 
     @property
@@ -172,7 +172,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         """How far the car is from the recorded pose that its picture is made from.
 
         Raises:
-            SimulatorError: there was no reset.
+            SimulatorError: no reset was made yet.
         """
         return _gap_of(self._world.bank.nearest(_poses(self._running().car)))
 
@@ -180,7 +180,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         """The exact homography of the current state: canvas px to camera px.
 
         Raises:
-            SimulatorError: there was no reset.
+            SimulatorError: no reset was made yet.
         """
         return homography_from_pose(self.camera, self.state, self._world.bank.canvas)
 
@@ -210,7 +210,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         drive.car, drive.state = car, self._state(car)
 
     def _start(self, asked: VehicleState) -> Start:
-        """How an asked start differs from the recorded one; not at all where it is another place."""
+        """The offset of an asked start from the recorded one; zero if it is at another place."""
         here = self.scenario.start
         dx, dy = asked.x_m - here.x_m, asked.y_m - here.y_m
         c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
@@ -251,7 +251,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         return (frames[0] * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
 
     def _enlarged(self, frame: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "hc wc 3"]:
-        """A black camera picture with the frame where it was cut from."""
+        """A black camera picture with the frame at the place it was cut from."""
         view, camera = self.input, self.camera
         picture = Image.new("RGB", (camera.width_px, camera.height_px))
         size = (view.right_px - view.left_px, view.bottom_px - view.top_px)
@@ -268,14 +268,14 @@ def _gap_of(gap: Gap) -> RecordedGap:
 
 
 def check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
-    """See that recordings are of the stretch of road that is to be driven.
+    """Check that recordings are of the stretch of road that is to be driven.
 
     Args:
-        asked: the scenario's canvas.
+        asked: canvas of the scenario that is to be driven.
         recorded: the canvas of the recordings.
 
     Raises:
-        SimulatorError: they lie elsewhere, or have other sizes; the message says by how much.
+        SimulatorError: the two lie apart or differ in size; the message says by how much.
     """
     turned = math.remainder(asked.yaw_rad - recorded.yaw_rad, 2 * math.pi)
     same = replace(asked, yaw_rad=recorded.yaw_rad + turned)

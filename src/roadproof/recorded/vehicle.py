@@ -46,11 +46,11 @@ class Motion(NamedTuple):
     """Cars on the ground, R of them; what passes from one step to the next, all in float64.
 
     Args:
-        x_m: world x, as y_m.
-        yaw_rad: heading, left positive.
-        speed_mps: forward.
-        curvature: κ of the step just done.
-        steer: given at the step before.
+        x_m: world x of each car, metres, (R,); y_m likewise.
+        yaw_rad: heading, radians, left positive, (R,).
+        speed_mps: forward speed, m/s, (R,).
+        curvature: curvature κ in the step just done, 1/m, (R,).
+        steer: steer of the step just done, as the wheels followed it, (R,).
     """
 
     x_m: Float[Tensor, " r"]
@@ -63,16 +63,15 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Vehicle:
-    """The response of one car at one time step; see the notation above.
+    """How one car responds to controls at one time step; see the notation above.
 
     Args:
-        dt_s: seconds a step.
-        curving: a, b, c, k.
-        pulling: e, f, g, h, j.
-        slipping: l, m.
-        steer_rate_per_s: how fast the wheels turn at most, steer units a second.
-        r2: share of the curvature's variance that steering foretells in the drives it was identified from; 1 where the
-            vehicle was given.
+        dt_s: seconds per step.
+        curving: coefficients a, b, c and k of the curvature.
+        pulling: coefficients e, f, g, h and j of the speed.
+        slipping: coefficients l and m of the direction of travel.
+        steer_rate_per_s: highest rate at which the wheels follow the steer, steer units per second; default infinite.
+        r2: share of curvature variance that steering predicts in the identification drives; 1 for a given vehicle.
     """
 
     dt_s: float
@@ -89,14 +88,14 @@ class Vehicle:
         """A kinematic bicycle whose wheels follow the steer with a lag.
 
         Args:
-            wheelbase_m: from axle to axle.
-            steer_range_rad: angle of the front wheels at full steer.
-            lag_s: time constant of the steering.
-            origin_m: of the vehicle's origin before the rear axle; the middle by default.
-            dt_s: seconds a step.
+            wheelbase_m: distance between the axles, metres, above 0.
+            steer_range_rad: angle of the front wheels at full steer, radians, above 0 and below π/2.
+            lag_s: time constant of the steering, seconds, 0 or more.
+            origin_m: distance of the vehicle's origin ahead of the rear axle, metres; half the wheelbase by default.
+            dt_s: seconds per step, above 0.
 
         Raises:
-            RecordingError: a value is not positive.
+            RecordingError: a value is out of its range.
         """
         if not (wheelbase_m > 0 and 0 < steer_range_rad < math.pi / 2 and lag_s >= 0 and dt_s > 0):
             raise RecordingError(
@@ -115,8 +114,8 @@ class Vehicle:
         What the drives do not show, such as a brake never used, stays with the prior.
 
         Args:
-            tracks: of drives with one time step; perturbed ones show more than clean ones.
-            prior: believed as far as the drives say nothing; an ordinary car by default.
+            tracks: tracks of drives with one time step; perturbed drives show more than clean ones.
+            prior: response that holds where the drives say nothing; an ordinary car by default.
 
         Raises:
             RecordingError: time steps differ, too few steps follow each other, or the steering does not explain the
@@ -229,7 +228,7 @@ class _Rows:
 
 
 def _followed(steer: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
-    """What the wheels make of the steer when they turn by at most so much a step."""
+    """The steer that the wheels follow when they turn by at most `reach` per step."""
     if not math.isfinite(reach):
         return steer
     followed, at = np.empty_like(steer), float(steer[0])
@@ -262,7 +261,7 @@ def _steer_rate(stretches: Sequence[tuple[Track, slice]]) -> float:
 
 
 def _explained(stretches: Sequence[tuple[Track, slice]], rate: float, law: Float[np.ndarray, "4"]) -> float:
-    """Share of the curvature's variance that the law foretells from steering alone, not looking at the way taken."""
+    """Share of the curvature's variance that the law predicts from steering alone, without the path taken."""
     told: list[float] = []
     seen: list[float] = []
     a, b, c, k = law.tolist()

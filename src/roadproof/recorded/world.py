@@ -39,10 +39,10 @@ class Start:
     """How a drive differs from the clean one where it begins.
 
     Args:
-        right_m: offset to the right.
-        turned_rad: heading, left positive.
-        faster_mps: speed.
-        steer: added to whatever the controller answers, from there on: stands for what pictures get wrong.
+        right_m: offset to the right, metres.
+        turned_rad: turn of the heading, radians, left positive.
+        faster_mps: speed added to the clean drive's, m/s.
+        steer: steer added to all of the controller's answers, which stands for the errors of pictures.
     """
 
     right_m: float = 0.0
@@ -60,12 +60,13 @@ class Rolled:
     """R drives in the recorded world, T instants each.
 
     Args:
-        x_m: world x, as y_m.
-        yaw_rad: heading, left positive.
-        speed_mps: forward.
-        right_m: offset from the recorded clean path, differentiable in the patterns.
-        steer: given at each instant.
-        ahead_m: of the recorded frame that the picture was made from; as left_m and turned_rad.
+        x_m: world x of each car at each instant, metres, (R, T); y_m likewise.
+        yaw_rad: heading, radians, left positive, (R, T).
+        speed_mps: forward speed, m/s, (R, T).
+        right_m: offset from the recorded clean path, metres, right positive, (R, T); differentiable in the patterns.
+        steer: steer given at each instant, (R, T).
+        ahead_m: distance ahead of the recorded frame that the picture was made from, metres, (R, T); left_m and
+            turned_rad are the other parts of that gap (`pictures.Gap`).
     """
 
     x_m: Float[Tensor, "r t"]
@@ -87,9 +88,9 @@ class RecordedWorld:
     """A set of recordings to drive in.
 
     Args:
-        recordings: calibrated, with a canvas and the tracks of the drives; the clean drive among them.
-        vehicle: how the car answers; identified from the drives by default.
-        device: where pictures are made and shown.
+        recordings: calibrated recordings with a canvas and the tracks of all drives, the clean drive among them.
+        vehicle: model of how the car answers to controls; None identifies it from the drives.
+        device: torch device on which pictures are made and cars are driven.
 
     Raises:
         RecordingError: there is no clean drive, the drives are of several weathers, poses are not known, or the vehicle
@@ -117,10 +118,10 @@ class RecordedWorld:
         self.device = self.bank.device
 
     def fit(self, controller: Controller) -> None:
-        """Ask a controller about all recorded frames, for the bare road's law of its steering.
+        """Fit the law of steering on the bare road, from a controller's answers to all recorded frames.
 
         Raises:
-            ControllerError: it raises, or answers wrongly.
+            ControllerError: the controller raises, or answers wrongly.
         """
         frames = (self.bank.levels, self.bank.speed_mps, self.bank.command)
         with torch.no_grad():
@@ -141,15 +142,15 @@ class RecordedWorld:
         every: int = 1,
         looks: Looks | None = None,
     ) -> Rolled:
-        """Drive past the canvas, closed loop.
+        """Drive R cars past the canvas, closed loop.
 
         Args:
-            controller: on the world's device; `fit` was called with it.
-            pattern: a batch of R / len(starts) patterns; each is driven over from every start, one after another.
-                None leaves the road bare.
-            starts: of the drives.
-            every: steps from one picture to the next; controls are held between.
-            looks: how paint and camera differ from drive to drive, in turn; None for paint and camera as recorded.
+            controller: the controller, on the world's device; `fit` must have been called with it.
+            pattern: batch of R / len(starts) patterns, each driven over from every start before the next one; None
+                leaves the road bare.
+            starts: offsets from the clean drive at which the drives begin.
+            every: number of steps from one picture to the next, 1 or more; controls are held in between.
+            looks: looks of paint and camera, given to the drives in turn; None for paint and camera as recorded.
         """
         count = len(starts) * (1 if pattern is None else len(pattern.boxes))
         if pattern is not None:
@@ -205,10 +206,10 @@ class RecordedWorld:
         """The paper's deviation that each pattern of a batch is predicted to cause, from each start.
 
         Args:
-            controller: as `roll` takes it.
-            patterns: a batch of R.
-            starts: S of them.
-            looks: one for each start, of both drives; None for paint and camera as recorded.
+            controller: the controller, on the world's device; `fit` must have been called with it.
+            patterns: batch of R patterns.
+            starts: S offsets from the clean drive, from each of which every pattern is driven over.
+            looks: one look per start, for the bare and the painted drive alike; None for paint and camera as recorded.
         """
         at_once = max(1, AT_ONCE // len(starts))
         with torch.no_grad():
@@ -225,7 +226,7 @@ class RecordedWorld:
         return np.array(found).reshape(-1, len(starts))
 
     def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:
-        """Cars at the first recorded frame of the clean drive, one for each start, all of them so many times."""
+        """Cars at the first recorded frame of the clean drive, one for each start, repeated `repeats` times."""
         course, first = self.course, self.course.first
 
         def told(name: str) -> Tensor:
@@ -266,7 +267,7 @@ class RecordedWorld:
         return steer_of(controller, frames, speed, command).double()[:, None]
 
     def _recorded_pedals(self, place: Place, car: Motion) -> Float[Tensor, "r 2"]:
-        """What brings a car to the clean drive's speed a little way ahead; of its place alone, a stand has no end."""
+        """Pedals that aim at the clean drive's speed a little way ahead, so that a car does not stand for ever."""
         ahead = _LOOK_AHEAD_M + _LOOK_AHEAD_S * car.speed_mps
         wanted = self.course.at(self.course.speed_mps, place.s_m + ahead)
         e, f, g, h, _ = self.vehicle.pulling

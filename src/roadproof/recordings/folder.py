@@ -62,7 +62,7 @@ class _Drive:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Manifest:
-    """recordings.json."""
+    """The content of recordings.json."""
 
     origin: str = ""
     canvas_px: int = CANVAS_SIZE_PX
@@ -112,9 +112,9 @@ def save_recordings(recordings: RecordingSet, folder: AnyPath, *, compact: bool 
     """Write a set to a new folder, all or nothing.
 
     Args:
-        recordings: the set.
-        folder: must not exist yet, or be empty.
-        compact: one frames.npy a drive instead of a PNG a frame.
+        recordings: the set to write.
+        folder: path of the folder, which must not exist yet or be empty.
+        compact: whether to write one frames.npy per drive instead of one PNG per frame.
 
     Raises:
         OutputError: the folder is there already, or cannot be written.

@@ -35,17 +35,17 @@ class Recording:
     """One drive, as far as the canvas is in view.
 
     Args:
-        name: names its folder.
-        push: how it was perturbed.
-        frames: the controller's input without any paint, (F, H, W, 3).
-        frame_number: of each frame in the drive, rising.
-        image_from_canvas: one homography a frame, canvas px to camera px.
-        speed_mps: m/s, from −1 (rolling back) to `FASTEST_MPS`.
-        command: CARLA's codes (`datatypes.Command`).
-        steer: what the recorded controller answered to each frame, in [−1, 1]; for information.
-        maps: per-pixel gain and offset of the paint, where they were calibrated; to the response of the set's colour.
-        track: poses and controls of the whole drive, where they are known; its steps are numbered as the frames are.
-        weather: what the light is called that it was recorded in; empty where that is not known.
+        name: name of the drive and of its folder.
+        push: how the drive was perturbed.
+        frames: the controller's input without any paint, RGB, (F, H, W, 3).
+        frame_number: number of each frame's step in the drive, rising, (F,).
+        image_from_canvas: one homography per frame, canvas px to camera px, (F, 3, 3).
+        speed_mps: speed at each frame, m/s, from −1 (rolling back) to `FASTEST_MPS`, (F,).
+        command: what the route asks at each frame, in CARLA's codes (`datatypes.Command`), (F,).
+        steer: what the recorded controller answered to each frame, in [−1, 1], (F,); for information.
+        maps: gain and offset of the paint in every pixel, for the response of the set's colour; None if not calibrated.
+        track: poses and controls of the whole drive, its steps numbered as the frames are; None if they are not known.
+        weather: name of the weather that the drive was recorded in; empty if it is not known.
 
     Raises:
         RecordingError: a frame has no pose in the track, lengths differ, a value is not finite or outside its range,
@@ -126,16 +126,16 @@ class RecordingSet:
     """Drives of one scenario with one camera, one controller input and one colour transform.
 
     Args:
-        camera: the camera on the car.
-        view: how the controller's input is made from its picture.
-        colour: painted → seen, common to all drives.
-        recordings: the drives.
-        origin: where they come from, in words.
-        canvas: where it lies in the world of the tracks, where that is known.
-        marks: the lane marks on the canvas and near it; None where they are not known.
+        camera: camera on the car.
+        view: crop and resize that make the controller's input from the camera picture.
+        colour: colour transform from painted to seen, common to all drives.
+        recordings: recordings of the drives, at least one, each with a name of its own.
+        origin: where the drives come from, in words.
+        canvas: place of the canvas in the world of the tracks; None if it is not known.
+        marks: lane marks on the canvas and near it; None if they are not known.
 
     Raises:
-        RecordingError: no drive, two of one name, or frames of another size than the controller's input.
+        RecordingError: there is no drive, two have one name, or frames have another size than the controller's input.
     """
 
     camera: CameraModel
@@ -182,11 +182,11 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
     """The drives of several sets as one, such as the same drives in several weathers.
 
     Args:
-        sets: by name, such as the weather; drives of all but the first are named after theirs, and those that do not
-            know their weather are given it.
+        sets: sets by name, such as the weather; drives of all but the first are named after their set, and drives of
+            unknown weather get its name as their weather.
 
     Raises:
-        RecordingError: there is none, or one differs in camera, crop, colour transform or the place of the canvas;
+        RecordingError: there is no set, or one differs in camera, crop, colour transform or place of the canvas;
             per-pixel maps may differ.
     """
     first = next(iter(sets.values()), None)

@@ -23,14 +23,14 @@ class Track:
 
     Args:
         dt_s: seconds from one step to the next.
-        step: numbers of the steps, rising; where one is left out, nothing is known of it.
-        x_m: world x of the vehicle's origin at each step.
-        y_m: world y.
-        yaw_rad: heading, left positive.
-        speed_mps: forward speed, from −1 (rolling back) to `FASTEST_MPS`.
-        steer: given at each step and held until the next, in [−1, 1], right positive.
-        throttle: the same, in [0, 1].
-        brake: the same, in [0, 1].
+        step: numbers of the steps, rising, (n,); of a number that is left out, nothing is known.
+        x_m: world x of the vehicle's origin at each step, metres, (n,).
+        y_m: world y of the vehicle's origin at each step, metres, (n,).
+        yaw_rad: heading at each step, radians, left positive, (n,).
+        speed_mps: forward speed at each step, m/s, from −1 (rolling back) to `FASTEST_MPS`, (n,).
+        steer: steer given at each step and held until the next, in [−1, 1], right positive, (n,).
+        throttle: throttle given at each step and held until the next, in [0, 1], (n,).
+        brake: brake given at each step and held until the next, in [0, 1], (n,).
 
     Raises:
         RecordingError: lengths differ, a value is not finite or outside its range, steps do not rise, or a pose jumps.
@@ -76,10 +76,10 @@ class Track:
         return self.step.size
 
     def rows(self, numbers: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-        """Index of each of some steps.
+        """Index of each of the steps with the given numbers.
 
         Raises:
-            RecordingError: one of them is not known.
+            RecordingError: a step is not known.
         """
         found = np.searchsorted(self.step, numbers).clip(0, len(self) - 1)
         missing = np.flatnonzero(self.step[found] != numbers)
@@ -88,13 +88,13 @@ class Track:
         return found
 
     def state(self, row: int) -> VehicleState:
-        """Pose and speed at one row, on the ground."""
+        """Pose and speed at one row, as a vehicle state on the ground."""
         return VehicleState(
             float(self.x_m[row]), float(self.y_m[row]), 0.0, float(self.yaw_rad[row]), float(self.speed_mps[row])
         )
 
     def stretches(self) -> Iterator[slice]:
-        """Rows of steps that follow each other without a gap."""
+        """Slices of the rows whose steps follow each other without a gap."""
         ends = np.flatnonzero(np.diff(self.step) != 1) + 1
         bounds = [0, *ends.tolist(), len(self)]
         yield from (slice(first, last) for first, last in pairwise(bounds))

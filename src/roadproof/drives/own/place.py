@@ -22,12 +22,12 @@ _MOST_MISSED_PX = 5.0
 
 
 def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
-    """Poses as they are stated, or summed up from speed and yaw rate.
+    """The poses of a drive as its table states them, or integrated from speed and yaw rate.
 
     Args:
-        own: the plan.
-        table: of the drive.
-        alone: whether it is the only drive; sums begin at the world's origin, which two drives do not share.
+        own: content of drives.toml.
+        table: table of the drive.
+        alone: whether it is the only drive, as integrated poses begin at the world's origin, different for every drive.
 
     Raises:
         RecordingError: the table does not say where the car was, or poses jump.
@@ -70,10 +70,10 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
 
 
 def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
-    """Where the canvas is stated to lie, or on the way of the first drive.
+    """The canvas as drives.toml places it: by its pose, or by a distance along the first drive.
 
     Raises:
-        RecordingError: it is stated twice or not at all, or lies beyond the way.
+        RecordingError: the canvas is placed twice or not at all, or lies beyond the driven path.
     """
     stated = own.canvas
     if stated is None:
@@ -96,14 +96,14 @@ def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
 
 
 def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint]) -> CameraModel:
-    """A camera whose height, pitch and field of view put known points of the ground where they are seen.
+    """The camera with height, pitch and field of view fitted so that known ground points are where they are seen.
 
     Args:
-        camera: where the fit begins; the same where no point is given.
-        ground: three points or more.
+        camera: camera from which the fit begins; it is returned unchanged if no points are given.
+        ground: none, or at least three known points of the ground.
 
     Raises:
-        RecordingError: fewer than three points, or they are missed by more than 5 px.
+        RecordingError: there are one or two points, or the fit misses them by more than 5 px.
     """
     if not ground:
         return camera

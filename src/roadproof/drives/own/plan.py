@@ -16,13 +16,13 @@ PLAN = "drives.toml"
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundPoint:
-    """A point of the ground whose place before the car is known, in the camera's picture.
+    """A ground point at a known place ahead of the car, and where the camera picture shows it.
 
     Args:
-        x_px: column of the picture.
-        y_px: row.
-        ahead_m: before the vehicle's origin.
-        left_m: to its left.
+        x_px: column in the camera picture, px.
+        y_px: row in the camera picture, px.
+        ahead_m: distance ahead of the vehicle's origin, metres.
+        left_m: distance to the left of the vehicle's origin, metres.
     """
 
     x_px: float
@@ -33,15 +33,15 @@ class GroundPoint:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class OwnCanvas:
-    """Where may be painted: a place in the world of the poses, or so far along the way of the first drive.
+    """The road that may be painted, placed by a pose in the world or by a distance along the first drive.
 
     Args:
-        width_m: extent across the road.
-        length_m: extent along it.
-        ahead_m: of its middle, from the first drive's first row along its way; instead of a place.
-        x_m: of its middle.
-        y_m: of its middle.
-        yaw_rad: direction of travel.
+        width_m: extent across the road, metres.
+        length_m: extent along the road, metres.
+        ahead_m: driven distance of its middle from the first row of the first drive, metres; instead of a pose.
+        x_m: world x of its middle, metres.
+        y_m: world y of its middle, metres.
+        yaw_rad: direction of travel, radians, left positive.
     """
 
     width_m: float = 7.6
@@ -54,11 +54,11 @@ class OwnCanvas:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class OwnColour:
-    """How paint looks where it is: what is black and white on a sheet of paper, as the pictures have it, in [0, 1].
+    """The colours of black and white paint as the pictures show them, such as those of a sheet of paper, in [0, 1].
 
     Args:
-        black: RGB of black paint.
-        white: RGB of white paint.
+        black: RGB in which the pictures show black paint.
+        white: RGB in which the pictures show white paint.
     """
 
     black: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -67,13 +67,13 @@ class OwnColour:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class OwnDrive:
-    """One drive.
+    """One drive as drives.toml lists it.
 
     Args:
-        name: of the drive.
-        table: file name of its table.
-        push: whether it was pushed aside: clean, right, left or random.
-        weather: what the light is called.
+        name: name of the drive.
+        table: file name of the drive's table, in the folder.
+        push: how the drive was perturbed: clean, right, left or random.
+        weather: name of the weather; empty if it is not known.
     """
 
     name: str
@@ -84,17 +84,16 @@ class OwnDrive:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class OwnDrives:
-    """drives.toml.
+    """The content of drives.toml.
 
     Args:
         dt_s: seconds from one row of a table to the next.
-        camera: of the pictures, and where it sits on the car.
-        input: what the controller sees of them.
-        drive: the drives; one of them clean.
-        canvas: where may be painted; not needed where the tables give its corners.
-        colour: how paint looks there.
-        ground: known points, from which height, pitch and field of view of the camera are fitted; those stated are
-            where the fit begins.
+        camera: camera that took the pictures, and its place on the car.
+        input: crop and resize that make the controller's input from the pictures.
+        drive: the drives, one of which is clean.
+        canvas: place of the canvas; None if the tables give its corners.
+        colour: how black and white paint look in the pictures.
+        ground: known ground points to which the camera's height, pitch and field of view are fitted.
         origin: where the drives come from, in words.
     """
 
@@ -116,10 +115,10 @@ _FILE = RecordFile(kind=OwnDrives, error=RecordingError, remedy="see docs/record
 
 
 def read_plan(folder: Path) -> OwnDrives:
-    """drives.toml of a folder.
+    """Read drives.toml of a folder.
 
     Raises:
-        RecordingError: it is missing or damaged, or has an unknown key.
+        RecordingError: the file is missing or damaged, or has an unknown key.
     """
     path = folder / PLAN
     content = read_toml(path, RecordingError)

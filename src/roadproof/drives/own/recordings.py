@@ -42,7 +42,7 @@ def import_drives(folder: AnyPath) -> RecordingSet:
     origin; or from the canvas' corners in each picture. Of each drive at most `WINDOW.frames` frames are kept.
 
     Args:
-        folder: with drives.toml.
+        folder: path of a folder with drives.toml, the tables and the pictures.
 
     Returns:
         A set with canvas and tracks, which can be attacked and driven in.

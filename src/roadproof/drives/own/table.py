@@ -33,12 +33,12 @@ _MOST_BYTES = 2**26
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """The rows of a drive.
+    """The table of one drive.
 
     Args:
-        drive: whose.
-        pictures: their files; empty where a step has none.
-        numbers: the columns of numbers, by name.
+        drive: the drive as drives.toml lists it.
+        pictures: file of each step's picture; empty for a step without one.
+        numbers: columns of numbers by name, one value per step.
     """
 
     drive: OwnDrive
@@ -47,18 +47,18 @@ class Table:
 
     @property
     def pictured(self) -> Int[np.ndarray, " f"]:
-        """Steps that have a picture."""
+        """Indices of the steps that have a picture."""
         return np.flatnonzero([bool(name) for name in self.pictures])
 
     def column(self, name: str, usual: float = 0.0) -> Float[np.ndarray, " n"]:
-        """A column, or one value where the table has none."""
+        """The column of a name, or the `usual` value for every step if the table has no such column."""
         return self.numbers.get(name, np.full(len(self.pictures), usual))
 
     def needed(self, name: str) -> Float[np.ndarray, " n"]:
-        """A column that has to be there.
+        """The column of a name that the table must have.
 
         Raises:
-            RecordingError: it is not.
+            RecordingError: the table has no such column.
         """
         if name not in self.numbers:
             raise RecordingError(f"{self.drive.table} has no column {name}; see docs/recordings.md")
@@ -66,10 +66,10 @@ class Table:
 
 
 def read_table(folder: Path, drive: OwnDrive) -> Table:
-    """The table of a drive.
+    """Read the table of a drive.
 
     Raises:
-        RecordingError: the file is missing, too long or no table, a column is unknown, or a number is none; says where.
+        RecordingError: the file is missing, too long, no table, or has an unknown column or a wrong number.
     """
     path = inside(folder, drive.table, f"{folder / PLAN}: table", RecordingError)
     try:
