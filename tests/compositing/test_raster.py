@@ -1,5 +1,7 @@
 """Pictures of the canvas painted into frames, against the figures that they show."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -46,7 +48,7 @@ def test_alpha_and_the_response_of_the_colours_count(recordings):
     """A half transparent paint is half way between the road and the same paint opaque, whatever paint is seen as."""
     bank = FrameBank(recordings)
     views = bank.show(*shown_from(bank, recordings.recordings[0].track, 60))
-    views = views._replace(canvas=views.canvas._replace(response=lambda p: 0.2 + 0.5 * p))
+    views = views._replace(canvas=dataclasses.replace(views.canvas, response=lambda p: 0.2 + 0.5 * p))
     half = MAGENTA.copy()
     half[..., 3] = 127
     opaque, thin = (composite_raster(paint, views.frames, views.canvas) for paint in (MAGENTA, half))

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from roadproof.compositing.rectangles import PaintedRectangles
 from roadproof.compositing.variation import Looks
-from roadproof.compositing.view import CanvasView, OwnViews
+from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews
 from roadproof.coverage import Shape
 from roadproof.patterns import Pattern, coverages, visibilities
 
@@ -127,7 +127,7 @@ def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
     return torch.lerp(clean.expand_as(colours), colours, left[..., None].to(colours))
 
 
-def canvas_colours(pattern: Pattern, view: CanvasView | OwnViews) -> Float[Tensor, "*b p 3"]:
+def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
     seen = view.response(pattern.colours)
     if any(shape is not Shape.RECTANGLE for shape in pattern.shapes):
@@ -138,7 +138,7 @@ def canvas_colours(pattern: Pattern, view: CanvasView | OwnViews) -> Float[Tenso
     return painted[:, : view.clean.shape[-2]].view(*batch, -1, 3)
 
 
-def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasView | OwnViews) -> Tensor:
+def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasPixels) -> Tensor:
     """Eq. composite on the canvas' pixels, (*b, P, 3), clipped to [0, 1], as plain tensor operations."""
     share = visibility.sum(-2)[..., None]
     return (view.clean + view.gain * (visibility.mT @ seen) + view.bias * share).clamp(0.0, 1.0)

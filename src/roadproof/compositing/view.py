@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,29 +16,38 @@ from roadproof.geometry import CANVAS_SIZE_PX, CropResize
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CanvasView:
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class CanvasPixels:
+    """Picture pixels through which the canvas shows, with all that painting needs; * is nothing, or B pictures.
+
+    Args:
+        footprints: footprints on the canvas of these pixels.
+        clean: clean colours of these pixels, (*, P, 3).
+        gain: A = s·gain, (*, P, 3), with s the share of the pixel that lies on the canvas.
+        bias: B = s·(offset − clean), (*, P, 3).
+        response: response from painted to seen colour, before gain and bias.
+        runs: the same pixels cut into runs, for painting rectangles.
+    """
+
+    footprints: Footprints
+    clean: Float[Tensor, "*b p 3"]
+    gain: Float[Tensor, "*b p 3"]
+    bias: Float[Tensor, "*b p 3"]
+    response: Response
+    runs: Runs
+
+
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class CanvasView(CanvasPixels):
     """Recorded frames and the P pixels of theirs through which the canvas shows.
 
     Args:
         frames: clean frames in [0, 1], (F, H, W, 3).
         index: index of the P picture pixels that show the canvas in the flattened frames, (P,).
-        footprints: footprints on the canvas of these P picture pixels.
-        clean: clean colours of these pixels, (P, 3).
-        gain: A = s·gain, (P, 3), with s the share of the pixel that lies on the canvas.
-        bias: B = s·(offset − clean), (P, 3).
-        response: response from painted to seen colour, before gain and bias.
-        runs: the same pixels cut into runs, for painting rectangles.
     """
 
     frames: Float[Tensor, "f h w 3"]
     index: Int[Tensor, " p"]
-    footprints: Footprints
-    clean: Float[Tensor, "p 3"]
-    gain: Float[Tensor, "p 3"]
-    bias: Float[Tensor, "p 3"]
-    response: Response
-    runs: Runs
 
     @property
     def clean_frames(self) -> Float[Tensor, "f 3 h w"]:
@@ -47,7 +55,8 @@ class CanvasView:
         return self.frames.permute(0, 3, 1, 2)
 
 
-class OwnViews(NamedTuple):
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class OwnViews(CanvasPixels):
     """Pictures of B poses and the P pixels of each through which the canvas shows: one picture for each pattern.
 
     Rows with fewer pixels are filled up with copies of their last one, which `valid` leaves out.
@@ -55,36 +64,10 @@ class OwnViews(NamedTuple):
     Args:
         pixel: index of each pixel in its flattened picture, (B, P).
         valid: which pixels are not copies that fill up a row, (B, P).
-        footprints: footprints of the pixels on the canvas, (B, 1, P, ...).
-        clean: clean colours of the pixels, (B, P, 3).
-        gain: A of the pixels, see `CanvasView`, (B, P, 3).
-        bias: B of the pixels, see `CanvasView`, (B, P, 3).
-        response: response from painted to seen colour, before gain and bias.
-        runs: the same pixels cut into runs, for painting rectangles.
     """
 
     pixel: Int[Tensor, "b p"]
     valid: Bool[Tensor, "b p"]
-    footprints: Footprints
-    clean: Float[Tensor, "b p 3"]
-    gain: Float[Tensor, "b p 3"]
-    bias: Float[Tensor, "b p 3"]
-    response: Response
-    runs: Runs
-
-    @staticmethod
-    def of(
-        pixel: Int[Tensor, "b p"],
-        valid: Bool[Tensor, "b p"],
-        footprints: Footprints,
-        clean: Float[Tensor, "b p 3"],
-        gain: Float[Tensor, "b p 3"],
-        bias: Float[Tensor, "b p 3"],
-        response: Response,
-    ) -> OwnViews:
-        """Views from the data of their pixels, which are cut into runs here."""
-        runs = Runs.of(footprints.features[:, 0], clean, gain, bias)
-        return OwnViews(pixel, valid, footprints, clean, gain, bias, response, runs)
 
     def pasted(self, frames: Float[Tensor, "b 3 h w"], colours: Float[Tensor, "b p 3"]) -> Float[Tensor, "b 3 h w"]:
         """The pictures with other colours in the canvas' pixels; the rest is copied bit for bit."""
@@ -131,7 +114,16 @@ def view_canvas(
     gain, offset, share = (part.to(device=device, dtype=dtype) for part in (gain, offset, share[:, None]))
     gain, bias = share * gain, share * (offset - clean)
     runs = Runs.of(footprints.features[None], clean[None], gain[None], bias[None])
-    return CanvasView(levels, place, footprints, clean, gain, bias, colour.response, runs)
+    return CanvasView(
+        frames=levels,
+        index=place,
+        footprints=footprints,
+        clean=clean,
+        gain=gain,
+        bias=bias,
+        response=colour.response,
+        runs=runs,
+    )
 
 
 def canvas_pixels(

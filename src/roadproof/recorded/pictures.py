@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from roadproof.compositing.runs import Runs
 from roadproof.compositing.view import OwnViews
 from roadproof.coverage import Footprints
 from roadproof.errors import RecordingError
@@ -267,7 +268,17 @@ class FrameBank:
         gain, offset, share = self._light.at(flat, _picked(source, flat).mT, gap.frame, footprints)
         share = torch.where(valid, share, 0.0)[..., None]
         clean = _picked(frames.flatten(2), flat).mT
-        return OwnViews.of(flat, valid, footprints, clean, share * gain, share * (offset - clean), self.colour.response)
+        gain, bias = share * gain, share * (offset - clean)
+        return OwnViews(
+            pixel=flat,
+            valid=valid,
+            footprints=footprints,
+            clean=clean,
+            gain=gain,
+            bias=bias,
+            response=self.colour.response,
+            runs=Runs.of(footprints.features[:, 0], clean, gain, bias),
+        )
 
     def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
         """The range of rows in which every picture has its canvas; None if no picture has one."""
