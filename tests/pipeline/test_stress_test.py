@@ -69,7 +69,7 @@ def check_folder(folder, result):
 
 @pytest.mark.parametrize("processes", [0, 2])
 def test_processes_that_have_no_simulator_are_refused_before_anything_is_driven(town, tmp_path, processes):
-    with pytest.raises(RoadproofError, match=f"{processes} processes; expected 1, or more with a function"):
+    with pytest.raises(RoadproofError, match=f"{processes} processes; expected 1, or more with a factory"):
         run(town, tmp_path / "run", processes=processes)
     assert not (tmp_path / "run").exists()
 
