@@ -138,6 +138,8 @@ def run(name: str, folder: Path) -> None:
     with folder.with_suffix(".log").open("a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    # As in a terminal: what a shell runs in the background ignores Ctrl-C, and so would its children.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     BUDGETS["quick"], HARDENING_BUDGETS["quick"] = TINY, HARDENING
     methods.SHIFT_RUNGS = (Rung(3, 12, every=2),)
     # One place for what all runs of a command are given: it is a part of what they leave.
