@@ -54,7 +54,7 @@ def _entry(name: str) -> str:
 
 def _commands(app: Any) -> list[tuple[str, ...]]:  # noqa: ANN401
     """The words of every command."""
-    own = [(each.name or each.callback.__name__.replace("_", "-"),) for each in app.registered_commands]
+    own = [(each.name or each.callback.__name__,) for each in app.registered_commands]
     return own + [(each.name, *words) for each in app.registered_groups for words in _commands(each.typer_instance)]
 
 

@@ -22,7 +22,7 @@ from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.io.files import AnyPath, as_path, write_atomically
-from roadproof.io.html import png
+from roadproof.io.html import content_of
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import RecordFile
 from roadproof.limits import MAX_FIGURES
@@ -65,7 +65,7 @@ class Pattern:
 
     def _repr_png_(self) -> bytes | None:
         """How a notebook shows one pattern; a batch is shown in words."""
-        return png(raster(self)) if self.boxes.ndim == 2 else None
+        return content_of(Image.fromarray(raster(self)), "PNG") if self.boxes.ndim == 2 else None
 
 
 _FILL = {Shape.RECTANGLE: 1.0, Shape.ELLIPSE: torch.pi / 4, Shape.TRIANGLE: 0.5, Shape.DIAMOND: 0.5}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from own_drives import CORNER_NAMES, INPUT, PLAN, changed_table, write_own
+from own_drives import CORNER_NAMES, PLAN, changed_table, write_own
 from paint_shy import PaintShy
 from recorded_drives import CANVAS, track
 from roadproof.attacks import GradOpt, PathDeviation, attack
@@ -14,7 +14,7 @@ from roadproof.drives.own import import_drives, preview
 from roadproof.drives.own.place import fitted_camera
 from roadproof.drives.own.plan import GroundPoint
 from roadproof.errors import RecordingError
-from roadproof.geometry import CIL_CAMERA, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, homography_from_pose
 from roadproof.io.pictures import read_picture
 from roadproof.recordings import Push
 from roadproof.search_space import SearchSpace
@@ -35,7 +35,7 @@ def test_poses_place_the_canvas_in_every_frame(own):
         np.testing.assert_allclose(seen, homography_from_pose(CIL_CAMERA, driven.state(number), CANVAS), rtol=1e-12)
     first = int(clean.frame_number[0])
     picture = read_picture(own / "clean" / f"{first}.png", RecordingError, "")
-    assert np.array_equal(clean.frames[0], INPUT(picture))
+    assert np.array_equal(clean.frames[0], CIL_INPUT(picture))
     np.testing.assert_array_equal(clean.track.steer, driven.steer)
     assert preview(recordings).size == (3 * 400, 3 * 176)
 

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from recorded_drives import CANVAS, track
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, apply_homography, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
 
 PLAN = """
 dt_s = 0.05
@@ -86,6 +86,3 @@ def changed_table(path, row, **values):
         rows = list(csv.DictReader(file))
     rows[row] |= values
     write_table(path, rows)
-
-
-INPUT = CIL_INPUT

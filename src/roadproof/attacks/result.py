@@ -16,7 +16,7 @@ from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.html import picture, png, table
+from roadproof.io.html import picture, table
 from roadproof.io.records import Form, RecordFile, plain
 from roadproof.paint import Conspicuousness
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
@@ -122,7 +122,7 @@ class AttackResult:
             ("took", f"{self.cost.seconds:.0f} s, {self.cost.simulator_calls} simulator calls"),
             *(("look at", f"{each.name}: {each.finding}") for each in self.checks if not each.passed),
         )
-        shown = picture(png(raster(self.pattern)), "the strongest pattern", 200)
+        shown = picture(raster(self.pattern), "the strongest pattern", 200)
         return shown + table(("attack", ""), [(name, value) for name, value in known if value])
 
     def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:

@@ -47,6 +47,7 @@ app = typer.Typer(
 )
 VERBS = (
     verb(demo, estimates=True),
+    import_,
     verb(record, estimates=True),
     verb(calibrate),
     verb(attack, estimates=True),
@@ -54,6 +55,7 @@ VERBS = (
     verb(evaluate, estimates=True),
     report,
     compare,
+    open_,
     verb(check, estimates=True),
     verb(drive),
     scenarios,
@@ -64,9 +66,7 @@ VERBS = (
     verb(harden, estimates=True),
 )
 for each in VERBS:
-    app.command()(each)
-app.command("import")(import_)
-app.command("open")(open_)
+    app.command(each.__name__.rstrip("_").replace("_", "-"))(each)
 app.add_typer(carla, name="carla")
 app.add_typer(study, name="study")
 

@@ -19,14 +19,14 @@ def compare(
 ) -> None:
     """Compare runs: one page with their numbers, paths and patterns side by side."""
     from roadproof.report.comparison import write_comparison
-    from roadproof.report.formatting import mean_in_words, range_in_words
+    from roadproof.report.formatting import mean_in_words
 
     runs = write_comparison(folders, out)
     kinds = sorted({each.predicted for each in runs})
     names = ("predicted m" if kind else "driven m" for kind in kinds)
     shown = table(("run", "controller", "street"), (*names, "change m", "leaves lane"))
     for each in runs:
-        metres = (range_in_words(each.whole) if kind == each.predicted else "" for kind in kinds)
+        metres = (each.whole.metres if kind == each.predicted else "" for kind in kinds)
         evaluation, left = each.judged.evaluation, f"{each.whole.left_lane:.0%}"
         shown.add_row(
             each.name, evaluation.controller, evaluation.scenario.name, *metres, mean_in_words(each.change, 2), left

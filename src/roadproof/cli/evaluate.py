@@ -144,7 +144,7 @@ def _check_recorded(runs: int | None, recordings: Path | None) -> None:
 
 
 def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, compared: bool) -> None:
-    from roadproof.report.formatting import UNKNOWN, mean_in_words, range_in_words
+    from roadproof.report.formatting import UNKNOWN, mean_in_words
 
     columns, title = ("drives", "deviation m", "aside m", "left lane", "points", "clean"), None
     if evaluation.predicted:
@@ -159,7 +159,7 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
             row.weather or "all",
             "traffic" if row.traffic else "nobody",
             str(row.count),
-            range_in_words(row),
+            row.metres,
             mean_in_words(row.lateral_m, 2),
             f"{row.left_lane:.0%}",
             *([UNKNOWN] if row.failed is None else points),

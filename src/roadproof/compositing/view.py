@@ -149,7 +149,8 @@ def canvas_pixels(
     with np.errstate(divide="ignore", invalid="ignore"):
         centre = mapped[..., :2] / mapped[..., 2:]
         inside = (mapped[..., 2] > 0) & ((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(-1)
-    touches = _dilated(inside.reshape(-1, view.height_px, view.width_px)).reshape(inside.shape) & (mapped[..., 2] > 0)
+    pictures = torch.from_numpy(inside.reshape(-1, view.height_px, view.width_px))
+    touches = dilated(pictures).numpy().reshape(inside.shape) & (mapped[..., 2] > 0)
     if not touches.any():
         raise GeometryError("no frame shows the canvas; check the homographies, or record nearer to it")
     frame, pixel = np.nonzero(touches)
@@ -159,11 +160,15 @@ def canvas_pixels(
     return frame * (view.height_px * view.width_px) + pixel, seen, jacobian
 
 
-def _dilated(mask: Bool[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+def dilated(mask: Bool[Tensor, "f h w"]) -> Bool[Tensor, "f h w"]:
     """A mask grown by one pixel to every side: as far as the widest filter reaches."""
-    padded = np.pad(mask, ((0, 0), (1, 1), (1, 1)))
-    rows = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]
-    return rows[:, :, :-2] | rows[:, :, 1:-1] | rows[:, :, 2:]
+    wide = mask.clone()
+    wide[:, :, 1:] |= mask[:, :, :-1]
+    wide[:, :, :-1] |= mask[:, :, 1:]
+    grown = wide.clone()
+    grown[:, 1:] |= wide[:, :-1]
+    grown[:, :-1] |= wide[:, 1:]
+    return grown
 
 
 def camera_points(index: Int[Tensor, "*n"], view: CropResize) -> Float[Tensor, "*n 2"]:

@@ -80,6 +80,11 @@ class Row:
     failed: float | None
     first_event_s: Mean | None
 
+    @property
+    def metres(self) -> str:
+        """The deviations in metres as people read them: the median, and in brackets the least and the most."""
+        return f"{self.median_m:.2f} ({self.least_m:.2f}–{self.most_m:.2f})"
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Evaluation:
@@ -243,9 +248,8 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
 
 def _shown(row: Row) -> tuple[object, ...]:
     points = "not known" if row.points is None else f"{row.points.value:.1f}"
-    metres = f"{row.median_m:.2f} ({row.least_m:.2f}–{row.most_m:.2f})"
     traffic = "yes" if row.traffic else "no"
-    return row.pattern, row.weather or "all", traffic, row.count, metres, f"{row.left_lane:.0%}", points
+    return row.pattern, row.weather or "all", traffic, row.count, row.metres, f"{row.left_lane:.0%}", points
 
 
 def _save_scenario(scenario: Scenario, folder: Path) -> None:

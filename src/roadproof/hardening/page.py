@@ -10,8 +10,9 @@ import roadproof
 from roadproof.hardening.harden import Hardened
 from roadproof.hardening.judgement import Judged
 from roadproof.io.files import write_atomically
+from roadproof.io.html import encoded
 from roadproof.patterns import load_pattern, raster
-from roadproof.report.html import encoded, environment
+from roadproof.report.html import environment
 
 _BADGES = {"helped": "holds", "not shown": "swayed", "did not help": "fails"}
 

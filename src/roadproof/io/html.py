@@ -1,4 +1,4 @@
-"""Small pieces of HTML: how results show themselves in a notebook. Everything is escaped."""
+"""Small pieces of HTML, for pages and for results in a notebook. Everything is escaped."""
 
 from __future__ import annotations
 
@@ -38,20 +38,29 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> Markup:
     return Markup("<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table>").format(cells, body)
 
 
-def png(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
-    """A picture, RGB or RGBA, as the bytes of a PNG."""
+def content_of(image: Image.Image, kind: str) -> bytes:
+    """A picture as the content of a file; `kind` is "PNG" or "JPEG"."""
     out = io.BytesIO()
-    Image.fromarray(pixels).save(out, format="PNG")
+    image.save(out, format=kind, quality=84, optimize=True)
     return out.getvalue()
 
 
-def picture(content: bytes, words: str, width_px: int) -> Markup:
-    """A PNG within the page.
+def data_url(kind: str, content: bytes | None) -> str | None:
+    """A file's content as a data URL of its media type; None where there is no content."""
+    return None if content is None else f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def encoded(image: Image.Image, kind: str) -> str:
+    """A picture as a data URL; `kind` is "PNG" or "JPEG"."""
+    return data_url(f"image/{kind.lower()}", content_of(image, kind)) or ""
+
+
+def picture(pixels: UInt8[np.ndarray, "h w c"], words: str, width_px: int) -> Markup:
+    """A picture within the page.
 
     Args:
-        content: its bytes.
-        words: what is read out instead of it.
-        width_px: as wide as it is shown.
+        pixels: RGB or RGBA, (H, W, 3 or 4).
+        words: text that is read out instead of the picture.
+        width_px: width at which it is shown.
     """
-    shown = f"data:image/png;base64,{base64.b64encode(content).decode()}"
-    return Markup('<img alt="{}" width="{}" src="{}">').format(words, width_px, shown)
+    return Markup('<img alt="{}" width="{}" src="{}">').format(words, width_px, encoded(Image.fromarray(pixels), "PNG"))

@@ -18,12 +18,12 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from roadproof.compositing.runs import Runs
-from roadproof.compositing.view import OwnViews
+from roadproof.compositing.view import OwnViews, dilated
 from roadproof.coverage import Footprints
 from roadproof.errors import RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
@@ -245,7 +245,7 @@ class FrameBank:
         seen = mapped[:, :2] / depth[:, None]
         middle = (CANVAS_SIZE_PX - 1) / 2
         inside = ((seen - middle).abs_().amax(1) < CANVAS_SIZE_PX / 2) & ahead
-        touches = _dilated(inside.view(len(inside), -1, width)).flatten(1) & ahead
+        touches = dilated(inside.view(len(inside), -1, width)).flatten(1) & ahead
         counts = touches.sum(1)
         most = int(counts.max())
         if most == 0:
@@ -309,17 +309,6 @@ class Views(NamedTuple):
 def _picked(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
     """The pixels of each picture at the given indices."""
     return planes.gather(2, index[:, None].expand(-1, planes.shape[1], -1))
-
-
-def _dilated(mask: Bool[Tensor, "r h w"]) -> Bool[Tensor, "r h w"]:
-    """A mask grown by one pixel to every side: as far as the widest filter reaches."""
-    wide = mask.clone()
-    wide[:, :, 1:] |= mask[:, :, :-1]
-    wide[:, :, :-1] |= mask[:, :, 1:]
-    grown = wide.clone()
-    grown[:, 1:] |= wide[:, :-1]
-    grown[:, :-1] |= wide[:, 1:]
-    return grown
 
 
 def _inverse(matrix: Float[Tensor, "*b n n"]) -> Float[Tensor, "*b n n"]:

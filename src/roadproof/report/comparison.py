@@ -16,10 +16,11 @@ from roadproof.driving.intervals import Mean, mean_95
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.io.html import encoded
 from roadproof.report import charts
-from roadproof.report.html import encoded, environment
+from roadproof.report.html import environment
 from roadproof.report.road_view import on_asphalt
-from roadproof.report.run import Judged, Run, read_run
+from roadproof.report.run import Judged, read_run
 from roadproof.report.top_view import top_view
 from roadproof.report.verdict import Verdict, verdict
 
@@ -32,19 +33,17 @@ class Compared:
 
     Args:
         name: what it is called: its folder's name, with the folder above where two have the same.
-        run: everything that the run folder holds.
         judged: the evaluation of the run.
         verdict: what the run shows.
-        whole: the run's drives over the pattern, all weathers together; those alone on the road where it has such.
+        alone: the run's drives over the pattern, alone on the road, in each weather, and in all together under None.
         change: mean change of the deviation against the first run over drives alone on the road, metres; None for the
             first run, and where no drive has weather and start in common with one of the first run's.
     """
 
     name: str
-    run: Run
     judged: Judged
     verdict: Verdict
-    whole: Row
+    alone: dict[Weather | None, Row]
     change: Mean | None
 
     @property
@@ -52,12 +51,10 @@ class Compared:
         """Whether the run's drives are predicted."""
         return self.judged.evaluation.predicted
 
-    def in_weather(self, weather: Weather) -> Row | None:
-        """The run's drives in one weather, alone on the road; None where there are none."""
-        rows = self.judged.evaluation.rows()
-        return next(
-            (row for row in rows if row.pattern == "attack" and row.weather == weather and not row.traffic), None
-        )
+    @property
+    def whole(self) -> Row:
+        """The run's drives in all weathers together; in the one weather, where there is one alone."""
+        return self.alone.get(None) or next(iter(self.alone.values()))
 
 
 def compared(folders: Sequence[AnyPath]) -> tuple[Compared, ...]:
@@ -81,10 +78,11 @@ def compared(folders: Sequence[AnyPath]) -> tuple[Compared, ...]:
     for path, run in runs:
         if run.judged is None:
             raise RoadproofError(f"{path} has no evaluation, so there is nothing to compare; finish it, or evaluate")
-        whole = _whole(run.judged)
-        alone = run.judged.evaluation.of(traffic=False)
-        change = _change(found[0].judged.evaluation.of(traffic=False), alone) if found else None
-        found.append(Compared(_name(path, paths), run, run.judged, verdict(run), whole, change))
+        evaluation = run.judged.evaluation
+        rows = {row.weather: row for row in evaluation.rows() if row.pattern == ATTACK and not row.traffic}
+        first = found[0].judged.evaluation if found else None
+        change = first and _change(first.of(traffic=False), evaluation.of(traffic=False))
+        found.append(Compared(_name(path, paths), run.judged, verdict(run), rows, change))
     return tuple(found)
 
 
@@ -105,15 +103,16 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
     runs = compared(folders)
     weathers = list(dict.fromkeys(weather for each in runs for weather in each.judged.evaluation.weathers))
     first = runs[0].judged.evaluation.scenario
+    kinds = sorted({each.predicted for each in runs})
     same_place = all(each.judged.evaluation.scenario.canvas == first.canvas for each in runs)
     text = environment().get_template("compare.html.jinja").render(
         version=roadproof.__version__,
         runs=runs,
-        kinds=sorted({each.predicted for each in runs}),
+        kinds=kinds,
         weathers=weathers,
         cautions=_cautions(runs, same_place=same_place),
         offsets=charts.offsets([(each.name, each.judged.clean, each.judged.painted) for each in runs], first.canvas)
-        if same_place and len({each.predicted for each in runs}) == 1
+        if same_place and len(kinds) == 1
         else None,
         patterns=[encoded(on_asphalt(each.judged.paint, 360, _size(each)), "PNG") for each in runs],
         above=[_above(each, number) for number, each in enumerate(runs)],
@@ -136,11 +135,6 @@ def _name(path: Path, paths: Sequence[Path]) -> str:
     whole = path.resolve()
     shared = sum(each.resolve().name == whole.name for each in paths) > 1
     return f"{whole.parent.name}/{whole.name}" if shared else whole.name
-
-
-def _whole(judged: Judged) -> Row:
-    rows = [row for row in judged.evaluation.rows() if row.pattern == ATTACK and not row.traffic]
-    return next((row for row in rows if row.weather is None), rows[0])
 
 
 def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Mean | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from roadproof.calibration.report import Spread
-from roadproof.driving.evaluation import Row
 from roadproof.driving.intervals import Mean
 
 MISSING = "–"
@@ -22,11 +21,6 @@ def mean_in_words(mean: Mean | None, digits: int) -> str:
     if mean.high is None:
         return f"{mean.value:.{digits}f}"
     return f"{mean.value:.{digits}f} ± {mean.high - mean.value:.{digits}f}"
-
-
-def range_in_words(row: Row) -> str:
-    """The deviations of a row of drives in metres: the median, and in brackets the least and the most."""
-    return f"{row.median_m:.2f} ({row.least_m:.2f}–{row.most_m:.2f})"
 
 
 def aside_in_words(left_m: float) -> str:

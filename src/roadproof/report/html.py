@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +13,8 @@ from jaxtyping import UInt8
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
-from roadproof.report.formatting import aside_in_words, in_words, mean_in_words, range_in_words, spread_in_words
+from roadproof.io.html import data_url, encoded
+from roadproof.report.formatting import aside_in_words, in_words, mean_in_words, spread_in_words
 
 
 def environment() -> Environment:
@@ -35,7 +34,6 @@ def environment() -> Environment:
         "jpeg": partial(_picture, kind="JPEG"),
         "mean": mean_in_words,
         "png": partial(_picture, kind="PNG"),
-        "range": range_in_words,
         "spread": spread_in_words,
         "words": in_words,
     }
@@ -49,15 +47,3 @@ def _data(content: bytes, kind: str) -> str | None:
 
 def _picture(pixels: UInt8[np.ndarray, "h w 3"], *, kind: str) -> str:
     return encoded(Image.fromarray(pixels), kind)
-
-
-def encoded(image: Image.Image, kind: str) -> str:
-    """A picture as a data URL; `kind` is "PNG" or "JPEG"."""
-    out = io.BytesIO()
-    image.save(out, format=kind, quality=84, optimize=True)
-    return data_url(f"image/{kind.lower()}", out.getvalue()) or ""
-
-
-def data_url(kind: str, content: bytes | None) -> str | None:
-    """A file's content as a data URL of its media type; None where there is no content."""
-    return None if content is None else f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -15,14 +15,16 @@ import numpy as np
 import roadproof
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
+from roadproof.drives.record import evenly
 from roadproof.driving.infractions import counted
 from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording
 from roadproof.report import charts
 from roadproof.report.commands import commands_of
-from roadproof.report.html import encoded, environment
+from roadproof.report.html import environment
 from roadproof.report.road_view import on_asphalt
 from roadproof.report.run import Run, read_run
 from roadproof.report.top_view import top_view
@@ -87,7 +89,7 @@ def render(run: Run) -> str:
             pattern=_pattern(run),
             attack=run.attack,
             fidelity=fidelity,
-            shown_frames=np.unique(np.linspace(0, frames - 1, SHOWN_COMPOSITES).round().astype(int)).tolist(),
+            shown_frames=evenly(frames, SHOWN_COMPOSITES).tolist(),
             recorded=_recorded(run),
             recordings=run.recordings,
             calibration=run.calibration,

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from roadproof.attacks import AttackResult, ShownDrive
+from roadproof.drives.record import evenly
 from roadproof.io.files import write_atomically
 
 LINE_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
@@ -71,7 +72,7 @@ def in_units(objective: str) -> str:
 
 def _film_strip(drive: ShownDrive, columns: int = 6) -> Figure:
     """Clean frames above, the same with the pattern below, and what the controller answers to every frame."""
-    shown = np.unique(np.linspace(0, len(drive.clean) - 1, columns).round().astype(int))
+    shown = evenly(len(drive.clean), columns)
     rows = (("clean", drive.clean, drive.clean_steer), ("painted", drive.painted, drive.painted_steer))
     figure = Figure(figsize=(2.3 * len(shown) + 0.6, 4.6), layout="constrained")
     title = f"{drive.name}: predicted steering on composited frames, mean shift {drive.mean_shift:+.2f}"

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import roadproof
 from roadproof.io.files import write_atomically
+from roadproof.io.html import data_url
 from roadproof.report.formatting import in_words
-from roadproof.report.html import data_url, environment
+from roadproof.report.html import environment
 from roadproof.report.plots import save
 from roadproof.study.charts import Picture, by_figures, progress
 from roadproof.study.folder import reference_of

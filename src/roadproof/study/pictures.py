@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from roadproof.drives.record import evenly
 from roadproof.errors import ScenarioError
 from roadproof.patterns import raster
 from roadproof.report.formatting import in_words
@@ -50,7 +51,7 @@ def examples(results: Results, count: int) -> tuple[str, ...]:
     for number, kind in enumerate(kinds):
         ranked = sorted((name for name, own in results.kinds.items() if own == kind), key=lambda name: -reached[name])
         share = count // len(kinds) + (number < count % len(kinds))
-        at = np.unique(np.linspace(0, len(ranked) - 1, min(share, len(ranked))).round().astype(int))
+        at = evenly(len(ranked), share)
         chosen += [ranked[k] for k in at]
     return tuple(chosen)
 
