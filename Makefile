@@ -39,10 +39,11 @@ lint: $(STAMP)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
 
-# The documentation as a site that needs no network: out/docs/index.html. A warning is an error.
+# The documentation as a site that needs no network: out/docs/index.html. A warning is an error, and every page is read
+# again: a link may miss in a page that has not changed.
 docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --group docs
-	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html docs out/docs
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env --builder html docs out/docs
 
 # What needs no development data; each file of benchmarks/ says how to run it.
 bench: $(STAMP)
