@@ -36,7 +36,7 @@ from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.memory import keep_freed_memory
 from roadproof.photometry import AffineResponse, ColourTransform
-from roadproof.recordings import Push, Recording, RecordingSet, load_recordings
+from roadproof.recordings import Recording, RecordingSet, Side, load_recordings
 from roadproof.search_space import SearchSpace
 
 
@@ -50,7 +50,7 @@ def synthetic_drive(frames: int) -> RecordingSet:
     ]
     drive = Recording(
         name="clean",
-        push=Push.CLEAN,
+        side=Side.CLEAN,
         frames=rng.integers(60, 160, (frames, 88, 200, 3), dtype=np.uint8),
         frame_number=np.arange(frames),
         image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, state, canvas) for state in states]),

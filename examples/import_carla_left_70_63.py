@@ -2,7 +2,7 @@
 
     python examples/import_carla_left_70_63.py DATA OUT
 
-DATA is a folder with t1, t2, t3 (clean, pushed right, pushed left) and colour. The homographies and the colours of the
+DATA is a folder with t1, t2, t3 (clean, right, left) and colour. The homographies and the colours of the
 paint come from the authors' own calibration runs; what is imported is what their attack saw. Poses were not recorded:
 they, and the size of the canvas in metres, follow from the homographies.
 """
@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from roadproof import Push, Recording, RecordingSet, save_recordings
+from roadproof import Recording, RecordingSet, Side, save_recordings
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.photometry import ColourFit, fit_colour, samples_from_pictures
 from roadproof.recorded import placed
 
-DRIVES = {"t1": Push.CLEAN, "t2": Push.RIGHT, "t3": Push.LEFT}
+DRIVES = {"t1": Side.CLEAN, "t2": Side.RIGHT, "t3": Side.LEFT}
 DT_S = 0.1
 
 
@@ -30,14 +30,14 @@ def read_log(folder: Path) -> dict[int, dict[str, str]]:
         return {int(row["frame"]): row for row in csv.DictReader(file)}
 
 
-def read_drive(folder: Path, push: Push) -> Recording:
+def read_drive(folder: Path, side: Side) -> Recording:
     """One drive: the frames whose homography agrees with the known camera."""
     stored = np.load(folder / "homographies.npz", allow_pickle=False)
     numbers = stored["frame"][stored["consistent"].astype(bool)]
     log = read_log(folder)
     return Recording(
-        name=str(push),
-        push=push,
+        name=str(side),
+        side=side,
         frames=np.stack([np.asarray(Image.open(folder / "frames" / f"{n}.png").convert("RGB")) for n in numbers]),
         frame_number=numbers.astype(np.int64),
         image_from_canvas=stored["H"][stored["consistent"].astype(bool)],
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     args = parser.parse_args()
     colours = read_colours(args.data / "colour")
-    drives = {name: read_drive(args.data / name, push) for name, push in DRIVES.items()}
+    drives = {name: read_drive(args.data / name, side) for name, side in DRIVES.items()}
     unplaced = RecordingSet(
         camera=CIL_CAMERA,
         view=CIL_INPUT,

@@ -69,6 +69,11 @@ def invoke(monkeypatch, capsys):
     return call
 
 
+def pytest_runtest_setup() -> None:
+    """Check the first calls of every function in this test, too."""
+    type_checks.begin_test()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files with slow tests first, so that workers end at the same time."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}

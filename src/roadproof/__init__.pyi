@@ -18,9 +18,9 @@ from roadproof.patterns import save_pattern as save_pattern
 from roadproof.pipeline.budget import Budget as Budget
 from roadproof.pipeline.stress_test import stress_test as stress_test
 from roadproof.recorded import RecordedSimulator as RecordedSimulator
-from roadproof.recordings import Push as Push
 from roadproof.recordings import Recording as Recording
 from roadproof.recordings import RecordingSet as RecordingSet
+from roadproof.recordings import Side as Side
 from roadproof.recordings import load_recordings as load_recordings
 from roadproof.recordings import save_recordings as save_recordings
 from roadproof.report.page import write_report as write_report

@@ -254,7 +254,7 @@ def test_the_published_measure_sums_frames_as_the_paper_does():
     published = PublishedMeasure(recordings, pull_to_the_right(), (RIGHT_GROUP,), masks="antialiased")
     exact = Surrogate(recordings, pull_to_the_right(), (RIGHT_GROUP,))
     unit = space.random((1, 2), torch.Generator().manual_seed(0))
-    # Six frames: three of the clean drive and three of the one pushed right.
+    # Six frames: three of the clean drive and three of the one to the right.
     torch.testing.assert_close(published.values(space, unit), 6 * exact.values(space, unit), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(published.readings(space, unit)[0], exact.values(space, unit), rtol=1e-4, atol=1e-4)
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from roadproof.attacks import GradOpt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Direction, divergence, parse_groups
 from roadproof.errors import RecordingError
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 from scenes import recording_set
 
 SHIFT = torch.tensor([0.3, 0.1, -0.2, -0.6])
@@ -36,8 +36,8 @@ def test_mirrored_steering_swaps_the_sides(seed):
 
 def test_the_paper_s_groups_share_the_clean_drive():
     recordings = recording_set()
-    assert [drive.push for drive in RIGHT_GROUP.select(recordings)] == [Push.CLEAN, Push.RIGHT]
-    assert [drive.push for drive in LEFT_GROUP.select(recordings)] == [Push.CLEAN, Push.LEFT]
+    assert [drive.side for drive in RIGHT_GROUP.select(recordings)] == [Side.CLEAN, Side.RIGHT]
+    assert [drive.side for drive in LEFT_GROUP.select(recordings)] == [Side.CLEAN, Side.LEFT]
 
 
 def test_groups_are_read_from_words():

@@ -16,8 +16,8 @@ def test_pictures_and_tables_become_recordings(tmp_path):
     assert read_picture(out / "preview.png", RecordingError, "").shape == (3 * 176, 3 * 400, 3)
 
 
-def test_what_is_there_already_is_kept(tmp_path):
-    folder, out = write_own(tmp_path / "mine", ["clean"]), tmp_path / "set"
+def test_what_is_there_already_is_kept_and_nothing_is_read(tmp_path):
+    folder, out = tmp_path / "not there", tmp_path / "set"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     done = roadproof("import", folder, "--out", out)

@@ -16,7 +16,7 @@ from roadproof.drives.own.plan import GroundPoint
 from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, homography_from_pose
 from roadproof.io.pictures import read_picture
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 from roadproof.search_space import SearchSpace
 
 
@@ -27,7 +27,7 @@ def own(tmp_path_factory):
 
 def test_poses_place_the_canvas_in_every_frame(own):
     recordings = import_drives(own)
-    assert [each.push for each in recordings.recordings] == [Push.CLEAN, Push.RIGHT, Push.LEFT]
+    assert [each.side for each in recordings.recordings] == [Side.CLEAN, Side.RIGHT, Side.LEFT]
     assert recordings.is_placed
     assert recordings.canvas == CANVAS
     clean, driven = recordings.recordings[0], track()
@@ -109,7 +109,9 @@ def test_black_and_white_are_seen_as_stated(tmp_path):
         (PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 1e4"), "expected 0 to 4"),
         (PLAN[: PLAN.index("[canvas]")], r"no table \[canvas\]"),
         (PLAN + "\n[colour]\nblack = [0.9, 0, 0]\nwhite = [0.8, 1, 1]\n", "0 ≤ black < white ≤ 1"),
-        (PLAN.replace("[camera]", "[camera]\nlens = 3"), "unknown field 'lens'"),
+        (PLAN.replace("[camera]", "[camera]\nlens = 3"), "camera has an unknown key 'lens'; did you mean"),
+        (PLAN.replace("fov_deg = 100.0", 'fov_deg = "wide"'), "camera.fov_deg is 'wide', expected float"),
+        (PLAN.replace("fov_deg = 100.0\n", ""), "camera lacks fov_deg"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused(tmp_path, own, plan, message):

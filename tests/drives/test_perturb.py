@@ -11,7 +11,7 @@ from roadproof.drives import SteeringNoise
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, swerving
 from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 
 DT_S, SPEED_MPS = 0.05, 7.0
 FRAME = np.zeros((4, 4, 3), np.uint8)
@@ -68,23 +68,23 @@ def test_where_a_car_is_beside_the_path_is_told_in_metres_to_the_right():
     assert path.locate(aside, s)[0] == pytest.approx(s)
 
 
-@pytest.mark.parametrize("push", [Push.RIGHT, Push.LEFT, Push.RANDOM])
+@pytest.mark.parametrize("side", [Side.RIGHT, Side.LEFT, Side.RANDOM])
 @pytest.mark.parametrize("gain", [0.23, 0.42])
-def test_a_swerve_has_the_size_that_was_asked_for_whatever_the_car(push, gain):
+def test_a_swerve_has_the_size_that_was_asked_for_whatever_the_car(side, gain):
     path = CleanPath.of(episode(*drive(bend, gain)))
-    wanted = offsets(push, 1.5, 15.0, 45.0, float(path.arclength_m[-1]), np.random.default_rng(3))
+    wanted = offsets(side, 1.5, 15.0, 45.0, float(path.arclength_m[-1]), np.random.default_rng(3))
     answers = []
     states, controls = drive(swerving(lambda _: Control(0.9, throttle=0.4), path, wanted, answers.append), gain, 130)
     aside = np.array([path.locate(state, None)[1] for state in states])
-    side = {Push.RIGHT: aside, Push.LEFT: -aside, Push.RANDOM: np.abs(aside)}[push]
-    assert side.max() == pytest.approx(1.5, rel=0.1)
-    assert push is Push.RANDOM or side.min() > -0.05, "one-sided"
+    towards = {Side.RIGHT: aside, Side.LEFT: -aside, Side.RANDOM: np.abs(aside)}[side]
+    assert towards.max() == pytest.approx(1.5, rel=0.1)
+    assert side is Side.RANDOM or towards.min() > -0.05, "one-sided"
     assert set(answers) == {0.9}
     assert {control.throttle for control in controls} == {0.4}
 
 
 def test_offsets_begin_at_zero_with_the_view_and_differ_by_seed():
-    first, second = (offsets(Push.RIGHT, 1.0, 10.0, 40.0, 60.0, np.random.default_rng(seed)) for seed in (1, 2))
+    first, second = (offsets(Side.RIGHT, 1.0, 10.0, 40.0, 60.0, np.random.default_rng(seed)) for seed in (1, 2))
     assert first.at(9.0) == (0.0, 0.0, 0.0)
     assert first.at(40.0)[0] == pytest.approx(1.0)
     assert np.abs(first.offset_m - second.offset_m).max() > 0.02
@@ -93,13 +93,13 @@ def test_offsets_begin_at_zero_with_the_view_and_differ_by_seed():
 def test_a_weave_turns_the_car_both_ways_about_the_clean_path():
     path = CleanPath.of(episode(*drive(bend, 0.3)))
     length_m = float(path.arclength_m[-1])
-    for push, side in ((Push.RIGHT, 1.0), (Push.LEFT, -1.0)):
-        wanted = offsets(push, 0.5, 15.0, 45.0, length_m, np.random.default_rng(3), weaves=True)
+    for side, sign in ((Side.RIGHT, 1.0), (Side.LEFT, -1.0)):
+        wanted = offsets(side, 0.5, 15.0, 45.0, length_m, np.random.default_rng(3), weaves=True)
         states, _ = drive(swerving(lambda _: Control(0.0, throttle=0.4), path, wanted, lambda _: None), 0.3, 130)
         placed = [path.locate(state, None) for state in states]
         s, aside = np.array(placed).T
         turned = np.array([state.yaw_rad - path.at(path.heading_rad, at) for state, at in zip(states, s, strict=True)])
-        assert (side * aside[(s > 15.0) & (s < 20.0)]).max() > 0.3, "begins to its own side"
+        assert (sign * aside[(s > 15.0) & (s < 20.0)]).max() > 0.3, "begins to its own side"
         assert aside.min() < -0.3
         assert aside.max() > 0.3
         assert turned.min() < -0.2
@@ -109,8 +109,8 @@ def test_a_weave_turns_the_car_both_ways_about_the_clean_path():
 def test_published_noise_is_whole_degrees_to_one_side_for_two_seconds():
     clean = episode(*drive(bend, 0.3))
     draws = [
-        steering_noise(push, SteeringNoise(4, 20), clean, 100, np.random.default_rng(0))
-        for push in (Push.RIGHT, Push.LEFT, Push.RANDOM)
+        steering_noise(side, SteeringNoise(4, 20), clean, 100, np.random.default_rng(0))
+        for side in (Side.RIGHT, Side.LEFT, Side.RANDOM)
     ]
     for noise in draws:
         steps = np.flatnonzero(noise)

@@ -12,7 +12,7 @@ from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, 
 from roadproof.drives.folder import write_settings
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 from roadproof.scenarios import find_scenario
 from roadproof.training.expert import expert
 
@@ -34,7 +34,7 @@ def drives(town, folder):
 
 
 def test_the_drives_go_as_far_astray_as_was_asked_and_to_their_side(drives):
-    assert [drive.push for drive in drives.drives] == [Push.CLEAN, Push.RIGHT, Push.LEFT]
+    assert [drive.side for drive in drives.drives] == [Side.CLEAN, Side.RIGHT, Side.LEFT]
     clean, right, left = drives.drives
     assert clean.offset_m == 0.0
     assert 1.0 < right.offset_m < 1.3
@@ -71,7 +71,7 @@ def test_what_the_driver_answered_is_kept_not_what_was_done(drives):
     np.testing.assert_array_equal(clean.steer, clean.episode.steer[clean.frame_number])
     done = right.episode.steer[right.frame_number]
     assert np.abs(right.steer - done).max() > 0.02
-    # Pushed to the right, the expert wants back to the left.
+    # Perturbed to the right, the expert wants back to the left.
     assert right.steer[-1] < clean.steer[-1]
 
 
@@ -144,7 +144,7 @@ def test_a_folder_that_cannot_be_written_is_named(town, tmp_path):
 def test_a_drive_made_before_is_recorded_over_the_bare_road(drives, town, tmp_path):
     right = drives.drives[1]
     along = record_along(town, PaintShy(), drives, right.episode, name="round-1", folder=tmp_path)
-    assert along.push is Push.RIGHT
+    assert along.side is Side.RIGHT
     assert along.offset_m == pytest.approx(right.offset_m, abs=0.02)
     np.testing.assert_array_equal(along.frames, right.frames)
     np.testing.assert_array_equal(along.frame_number, right.frame_number)

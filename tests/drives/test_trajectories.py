@@ -10,7 +10,7 @@ def test_a_group_is_the_clean_drive_and_pairs_to_both_sides_of_the_sizes_in_turn
     plans = Trajectories(count=5, perturbation=Swerve((0.7, 1.5))).plans()
     assert [plan.name for plan in plans] == ["clean", "right", "left", "right-2", "left-2"]
     assert [plan.offset_m for plan in plans] == [0.0, 0.7, 0.7, 1.5, 1.5]
-    assert [str(plan.push) for plan in plans] == ["clean", "right", "left", "right", "left"]
+    assert [str(plan.side) for plan in plans] == ["clean", "right", "left", "right", "left"]
     assert [plan.name for plan in Trajectories(count=1).plans()] == ["clean"]
     assert len({plan.name for plan in Trajectories(count=7).plans()}) == 7
 
@@ -20,9 +20,9 @@ def test_a_weaving_pair_comes_after_the_swerves():
     assert [(plan.offset_m, plan.weaves) for plan in plans[1:]] == [(1.5, False)] * 2 + [(0.5, True)] * 2
 
 
-def test_random_drives_are_pushed_at_random_each_with_draws_of_its_own():
+def test_random_drives_are_perturbed_at_random_each_with_draws_of_its_own():
     plans = Trajectories(count=5, scheme=Scheme.RANDOM).plans()
-    assert [str(plan.push) for plan in plans] == ["clean", *["random"] * 4]
+    assert [str(plan.side) for plan in plans] == ["clean", *["random"] * 4]
     assert len({plan.stream for plan in plans}) == 5
 
 

@@ -40,7 +40,7 @@ def test_the_imported_drives_are_placed_and_hold_what_was_applied(imported):
     assert {track.dt_s for track in (clean, right, left)} == {0.1}
     assert [len(track) for track in (clean, right, left)] == [23, 17, 20]
     at = 46
-    assert right.steer[right.rows(np.array([at]))[0]] == pytest.approx(0.05298, abs=1e-5), "the push, not the answer"
+    assert right.steer[right.rows(np.array([at]))[0]] == pytest.approx(0.05298, abs=1e-5), "the noise, not the answer"
     assert clean.steer[clean.rows(np.array([at]))[0]] == pytest.approx(-0.05631, abs=1e-5)
     assert left.throttle.min() > 0.4
     assert not clean.brake.any()

@@ -48,7 +48,16 @@ def test_the_second_is_told_who_works_there(child):
     process.wait()
     with working_in(place):
         pass
-    assert list(place.iterdir()) == []
+    assert not place.exists(), "nothing came of it"
+
+
+def test_a_folder_stays_where_it_was_there_before_or_something_came_of_it(tmp_path):
+    before, made = tmp_path / "before", tmp_path / "made"
+    before.mkdir()
+    with working_in(before), working_in(made):
+        (made / "result").write_text("it")
+    assert list(before.iterdir()) == []
+    assert [path.name for path in made.iterdir()] == ["result"]
 
 
 def test_a_killed_worker_leaves_the_folder_free(child):

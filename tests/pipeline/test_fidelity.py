@@ -21,7 +21,7 @@ from roadproof.pipeline.fidelity import (
     measure_fidelity,
     rendered_frames,
 )
-from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet, Side
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
@@ -51,7 +51,7 @@ def drive():
     maps = pixel_maps_from_two_paints(light, dark)
     recording = Recording(
         name="clean",
-        push=Push.CLEAN,
+        side=Side.CLEAN,
         frames=np.stack(frames)[STEPS],
         frame_number=STEPS,
         image_from_canvas=np.stack(homographies)[STEPS],

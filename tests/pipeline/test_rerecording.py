@@ -18,7 +18,7 @@ from roadproof.driving.drive_store import load_episodes
 from roadproof.errors import CalibrationError, RoadproofError
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.stress_test import stress_test
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 from roadproof.search_space import SearchSpace
 
 pytestmark = pytest.mark.slow
@@ -70,7 +70,7 @@ def test_a_round_records_the_bare_road_where_the_attacked_car_went(done):
     steps = drive.frame_number
     np.testing.assert_allclose(drive.episode.x_m[steps], attacked.x_m[steps], atol=1e-6)
     assert not drive.episode.painted
-    assert drive.push is (Push.RIGHT if drive.offset_m > 0 else Push.LEFT)
+    assert drive.side is (Side.RIGHT if drive.offset_m > 0 else Side.LEFT)
     # This driver swerves to the right, away from the paint, and sees none of it here.
     assert drive.offset_m > 0.1
     assert (drive.steer == 0).all()

@@ -14,7 +14,7 @@ from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.patterns import Pattern
 from roadproof.recorded.pictures import FrameBank, Poses
-from roadproof.recordings import Push, RecordingSet
+from roadproof.recordings import RecordingSet, Side
 from roadproof.search_space import SearchSpace
 from scenes import PLAIN
 
@@ -140,7 +140,7 @@ def test_the_nearest_frame_weighs_heading_against_distance(bank):
 
 def test_what_a_turned_car_sees_comes_from_a_frame_that_looked_that_way(bank):
     road = recorded_road()
-    turned = recorded(Push.LEFT, 0.6, yaw_rad=0.3, name="left-2")
+    turned = recorded(Side.LEFT, 0.6, yaw_rad=0.3, name="left-2")
     there = picture(pose(-14.0, 0.1, 0.3)).astype(float)
     poses = Poses(*(torch.tensor([value], dtype=torch.float64) for value in (-14.0, 0.1, 0.3)))
     straight_on = bank.nearest(poses)

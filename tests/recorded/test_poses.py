@@ -17,7 +17,7 @@ from roadproof.geometry import (
     homography_from_pose,
 )
 from roadproof.recorded.poses import placed
-from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet, Side
 from scenes import PLAIN
 
 DT_S = 0.1
@@ -28,7 +28,7 @@ def drive(name, image_from_canvas, *, speed_mps=6.0, first=10):
     count = len(image_from_canvas)
     return Recording(
         name=name,
-        push=Push(name),
+        side=Side(name),
         frames=np.zeros((count, 2, 2, 3), np.uint8),
         frame_number=np.arange(first, first + count),
         image_from_canvas=image_from_canvas,
@@ -211,13 +211,13 @@ def test_controls_that_do_not_fit_are_refused():
 def real(carla_data):
     """Three drives of CARLA 0.8.2 round a bend, placed."""
     drives = []
-    for folder, push in (("t1", Push.CLEAN), ("t2", Push.RIGHT), ("t3", Push.LEFT)):
+    for folder, side in (("t1", Side.CLEAN), ("t2", Side.RIGHT), ("t3", Side.LEFT)):
         stored = np.load(carla_data / folder / "homographies.npz", allow_pickle=False)
         good = stored["consistent"].astype(bool)
         with (carla_data / folder / "log.csv").open() as file:
             speed = {int(row["frame"]): float(row["speed_mps"]) for row in csv.DictReader(file)}
         numbers = stored["frame"][good].astype(int)
-        one = drive(str(push), stored["H"][good], speed_mps=[speed[number] for number in numbers])
+        one = drive(str(side), stored["H"][good], speed_mps=[speed[number] for number in numbers])
         drives.append(replace(one, frame_number=numbers))
     return placed(recording_set(*drives), dt_s=DT_S)
 

@@ -12,7 +12,7 @@ from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
 from roadproof.recorded.vehicle import Vehicle
 from roadproof.recorded.world import UNSURE, RecordedWorld, Start
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 
 VEHICLE = dataclasses.replace(
     Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
@@ -67,7 +67,7 @@ def test_a_prediction_has_a_value_for_every_start(world):
 
 
 def test_a_controller_that_only_steers_drives_off_where_the_clean_drive_stood_first():
-    drives = (recorded(stands=12), recorded(Push.RIGHT, -1.5), recorded(Push.LEFT, 1.5))
+    drives = (recorded(stands=12), recorded(Side.RIGHT, -1.5), recorded(Side.LEFT, 1.5))
     world = RecordedWorld(dataclasses.replace(recorded_road(), recordings=drives), vehicle=VEHICLE)
     world.fit(RampFollower())
     rolled = world.roll(RampFollower())
@@ -133,7 +133,7 @@ def test_the_gap_says_how_far_the_pictures_are_from_recorded_ones(world):
 
 
 def test_sets_too_thin_to_drive_in_are_one_clear_line():
-    aside = recorded(Push.RIGHT, -1.0, every=8)
+    aside = recorded(Side.RIGHT, -1.0, every=8)
     road = recorded_road(every=8)
     with pytest.raises(RecordingError, match="no clean drive"):
         RecordedWorld(dataclasses.replace(road, recordings=(aside,)), vehicle=VEHICLE)

@@ -11,7 +11,7 @@ import torch
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
-from roadproof.recordings import Push, RecordingSet, Track, load_recordings, pooled, save_recordings
+from roadproof.recordings import RecordingSet, Side, Track, load_recordings, pooled, save_recordings
 from scenes import PLAIN, recording, recording_set
 
 PER_FRAME = ("frames", "frame_number", "image_from_canvas", "speed_mps", "command", "steer")
@@ -64,14 +64,14 @@ def test_a_saved_set_is_the_same_when_loaded(tmp_path, compact):
     assert loaded.view == original.view
     assert loaded.colour.to_dict() == original.colour.to_dict()
     for ours, theirs in zip(loaded.recordings, original.recordings, strict=True):
-        assert (ours.name, ours.push) == (theirs.name, theirs.push)
+        assert (ours.name, ours.side) == (theirs.name, theirs.side)
         for field in PER_FRAME:
             np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
 def test_pixel_maps_travel_with_their_drive(tmp_path):
-    drive = recording(Push.CLEAN, frames=2)
+    drive = recording(Side.CLEAN, frames=2)
     maps = PixelMaps(torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200), PLAIN.response)
     one = replace(recording_set(), recordings=(replace(drive, maps=maps),))
     save_recordings(one, tmp_path / "set")
@@ -82,14 +82,14 @@ def test_pixel_maps_travel_with_their_drive(tmp_path):
 
 def test_a_thinned_drive_ends_with_the_same_frame_and_keeps_what_belongs_to_each():
     maps = PixelMaps(torch.rand(8, 88, 200, 3), torch.zeros(8, 88, 200, 3), torch.ones(8, 88, 200), PLAIN.response)
-    drive = replace(recording(Push.CLEAN, frames=8), maps=maps)
+    drive = replace(recording(Side.CLEAN, frames=8), maps=maps)
     few = drive.thinned(3)
     assert few.frame_number.tolist() == [11, 14, 17]
     for field in PER_FRAME:
         np.testing.assert_array_equal(getattr(few, field), getattr(drive, field)[[1, 4, 7]])
     assert torch.equal(few.maps.gain, maps.gain[[1, 4, 7]])
     assert drive.thinned(100).frame_number.tolist() == [17]
-    assert recording(Push.CLEAN).thinned(2).maps is None
+    assert recording(Side.CLEAN).thinned(2).maps is None
 
 
 def test_the_canvas_and_the_tracks_travel_with_the_set(saved_placed):
@@ -131,20 +131,25 @@ def test_a_thinned_drive_keeps_its_whole_track():
 
 def test_a_drive_needs_a_pose_for_every_frame():
     with pytest.raises(RecordingError, match="drive clean: the track has no pose for frame 13"):
-        replace(recording(Push.CLEAN, frames=4), track=track(10, 3))
+        replace(recording(Side.CLEAN, frames=4), track=track(10, 3))
 
 
 def test_the_manifest_says_formats_units_and_drives(saved):
     manifest = json.loads((saved / "recordings.json").read_text())
     assert (manifest["format"], manifest["version"]) == ("roadproof-recordings", 1)
     assert "positive = right" in manifest["units"]["steer"]
-    assert [drive["push"] for drive in manifest["drives"]] == ["clean", "right", "left"]
+    assert [drive["side"] for drive in manifest["drives"]] == ["clean", "right", "left"]
 
 
 def edit_manifest(folder, change):
     manifest = json.loads((folder / "recordings.json").read_text())
     change(manifest)
     (folder / "recordings.json").write_text(json.dumps(manifest))
+
+
+def test_a_manifest_that_calls_the_side_push_as_older_ones_did_is_read(saved):
+    edit_manifest(saved, lambda m: [drive.update(push=drive.pop("side")) for drive in m["drives"]])
+    assert [drive.side for drive in load_recordings(saved).recordings] == [Side.CLEAN, Side.RIGHT, Side.LEFT]
 
 
 def edit_drive(folder, **fields):
@@ -167,7 +172,7 @@ DAMAGE = {
         "plain name",
     ),
     "drive missing": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(name="gone")), "gone"),
-    "unknown push": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(push="up")), "Invalid enum value 'up'"),
+    "unknown side": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(side="up")), "Invalid enum value 'up'"),
     "no drives": (lambda s: edit_manifest(s, lambda m: m.update(drives=[])), "no drives"),
     "frame missing": (lambda s: (s / "clean" / "frames" / "11.png").unlink(), "11.png is missing"),
     "frame cut": (lambda s: cut(s / "clean" / "frames" / "11.png"), "11.png cannot be read"),
@@ -178,7 +183,7 @@ DAMAGE = {
         "image_from_canvas of frame 10 is NaN",
     ),
     "wrong sign": (
-        lambda s: edit_drive(s / "clean", image_from_canvas=-recording(Push.CLEAN, frames=3).image_from_canvas),
+        lambda s: edit_drive(s / "clean", image_from_canvas=-recording(Side.CLEAN, frames=3).image_from_canvas),
         "frame 10: homography has the wrong sign",
     ),
     "rank": (
@@ -201,7 +206,7 @@ DAMAGE = {
         "frame numbers do not rise",
     ),
     "giant homography": (
-        lambda s: edit_drive(s / "clean", image_from_canvas=1e300 * recording(Push.CLEAN, frames=3).image_from_canvas),
+        lambda s: edit_drive(s / "clean", image_from_canvas=1e300 * recording(Side.CLEAN, frames=3).image_from_canvas),
         "no camera's; scale it",
     ),
     "another canvas": (lambda s: edit_manifest(s, lambda m: m.update(canvas_px=800)), "canvas_px is 800, expected 400"),
@@ -339,7 +344,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(saved, monkeypa
 
 
 def test_two_drives_need_two_names():
-    drive = recording(Push.CLEAN)
+    drive = recording(Side.CLEAN)
     with pytest.raises(RecordingError, match="same name"):
         replace(recording_set(), recordings=(drive, drive))
 

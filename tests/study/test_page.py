@@ -6,11 +6,14 @@ import shutil
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from pandas import concat
 from PIL import Image
 
 from made_up_study import METHODS, made_up_study, write_made_up_study
 from roadproof.errors import PatternError, StudyError
+from roadproof.study import charts
 from roadproof.study.folder import write_table
 from roadproof.study.kept_jobs import read_jobs
 from roadproof.study.methods import BlackBoxPlan
@@ -234,3 +237,16 @@ def test_transfer_has_its_matrix_in_the_page(finished, tmp_path):
     assert "driven by" in page.read_text()
     assert (tmp_path / "out" / "figures" / "transfer-deviation.png").exists()
     assert (tmp_path / "out" / "transfer-deviation.tex").exists()
+
+
+@pytest.mark.parametrize("width", [6.0, 10.0])
+def test_a_legend_of_long_names_stays_inside_its_figure(width):
+    figure = Figure(figsize=(width, 5.0), layout="constrained")
+    axes = figure.add_subplot()
+    for number in range(9):
+        axes.plot([0, 1], [number, number], label=f"GradOpt, then CMA-ES {number}")
+    charts.legend(figure)
+    FigureCanvasAgg(figure).draw()
+    (drawn,) = figure.legends
+    extent = drawn.get_window_extent()
+    assert 0 <= extent.x0 < extent.x1 <= figure.bbox.x1

@@ -43,7 +43,7 @@ def made_up_study(**changed):
 
 
 def strength(job, generator):
-    """How far aside a pattern pushes, in metres; more with K, less for black-box searches."""
+    """How far aside a pattern steers, in metres; more with K, less for black-box searches."""
     k = 1 if job.figures == "1-b" else int(job.figures)
     ours = job.method.search == "gradopt"
     typical = (0.7 + 0.12 * k if ours else 0.6 + 0.03 * k) * {"straight": 0.6, "left": 1.2, "right": 1.1}[

@@ -33,7 +33,7 @@ x_m = 130.0
 y_m = -40.0
 yaw_rad = 0.6
 """
-DRIVE = '\n[[drive]]\nname = "{0}"\npush = "{0}"\ntable = "{0}.csv"\n'
+DRIVE = '\n[[drive]]\nname = "{0}"\nside = "{0}"\ntable = "{0}.csv"\n'
 SIDES = {"clean": 0.0, "right": 1.0, "left": -1.0}
 STATED = ("x_m", "y_m", "yaw_rad", "speed_mps", "steer", "throttle")
 CORNERS_PX = np.array([[-0.5, -0.5], [399.5, -0.5], [399.5, 399.5], [-0.5, 399.5]])

@@ -7,7 +7,7 @@ import torch
 
 from roadproof.datatypes import Control, VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
-from roadproof.recordings import Push, Recording, RecordingSet, Track
+from roadproof.recordings import Recording, RecordingSet, Side, Track
 from scenes import PLAIN
 
 CANVAS = CanvasPlacement(x_m=120.0, y_m=-40.0, yaw_rad=0.0)
@@ -40,7 +40,7 @@ def picture(state):
     return np.clip(np.round(shown), 0, 255).astype(np.uint8).T.reshape(VIEW.height_px, VIEW.width_px, 3)
 
 
-def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0):
+def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0):
     """A straight drive past the canvas, so far to the left, looking that way; it may stand for some steps first."""
     speed = np.full(67, SPEED_MPS)
     if stands:
@@ -52,8 +52,8 @@ def recorded(push=Push.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, st
     count = len(ahead)
     states = [pose(ahead[step], left_m, yaw_rad) for step in shown]
     return Recording(
-        name=name or str(push),
-        push=push,
+        name=name or str(side),
+        side=side,
         frames=np.stack([picture(state) for state in states]),
         frame_number=shown,
         image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, state, CANVAS) for state in states]),
@@ -78,8 +78,8 @@ def recorded_road(*, every=1):
     """A clean drive and one a metre and a half to each side."""
     drives = (
         recorded(every=every),
-        recorded(Push.RIGHT, -1.5, every=every),
-        recorded(Push.LEFT, 1.5, every=every),
+        recorded(Side.RIGHT, -1.5, every=every),
+        recorded(Side.LEFT, 1.5, every=every),
     )
     return RecordingSet(camera=CIL_CAMERA, view=VIEW, colour=PLAIN, recordings=drives, canvas=CANVAS)
 

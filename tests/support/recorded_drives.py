@@ -7,7 +7,7 @@ from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homograph
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded.pictures import Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.recordings import Push, Recording, RecordingSet, Track
+from roadproof.recordings import Recording, RecordingSet, Side, Track
 
 CANVAS = CanvasPlacement(x_m=130.0, y_m=-40.0, yaw_rad=0.6)
 VEHICLE = Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.05)
@@ -31,15 +31,15 @@ def track(right_m=0.0, steps=140, speed_mps=6.0):
                  throttle=throttle, brake=brake)  # fmt: skip
 
 
-def drive(push, right_m=0.0, seed=0, speed_mps=6.0):
+def drive(side, right_m=0.0, seed=0, speed_mps=6.0):
     driven = track(right_m, speed_mps=speed_mps)
     ahead = (CANVAS.x_m - driven.x_m) * np.cos(CANVAS.yaw_rad) + (CANVAS.y_m - driven.y_m) * np.sin(CANVAS.yaw_rad)
     # From 29 to 6 m before the canvas' middle, every second step.
     numbers = np.flatnonzero((ahead < 29.0) & (ahead > 6.0))[::2]
     coarse = np.random.default_rng(seed).integers(70, 150, (len(numbers), 11, 25, 3), dtype=np.uint8)
     return Recording(
-        name=str(push),
-        push=push,
+        name=str(side),
+        side=side,
         frames=coarse.repeat(8, 1).repeat(8, 2),
         frame_number=numbers,
         image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, driven.state(int(k)), CANVAS) for k in numbers]),
@@ -51,8 +51,8 @@ def drive(push, right_m=0.0, seed=0, speed_mps=6.0):
 
 
 def drivable_set(speed_mps=6.0, **changes):
-    sides = ((Push.CLEAN, 0.0), (Push.RIGHT, 1.0), (Push.LEFT, -1.0))
-    drives = tuple(drive(push, right_m, seed, speed_mps) for seed, (push, right_m) in enumerate(sides))
+    sides = ((Side.CLEAN, 0.0), (Side.RIGHT, 1.0), (Side.LEFT, -1.0))
+    drives = tuple(drive(side, right_m, seed, speed_mps) for seed, (side, right_m) in enumerate(sides))
     given = {"camera": CIL_CAMERA, "view": CIL_INPUT, "colour": PLAIN, "recordings": drives, "canvas": CANVAS}
     return RecordingSet(**given | {"origin": "test-road, clear-noon, driven by nobody"} | changes)
 

@@ -22,7 +22,7 @@ from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.film import Strip
 from roadproof.pipeline.selection import Driven, Selection
-from roadproof.recordings import Push, save_recordings
+from roadproof.recordings import Side, save_recordings
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
@@ -210,7 +210,7 @@ def write_record(folder, scenario):
         write_drive(
             Drive(
                 name=name,
-                push=Push(name),
+                side=Side(name),
                 episode=driven(scenario, -right_m),
                 frame_number=steps,
                 frames=np.zeros((4, 88, 200, 3), np.uint8),

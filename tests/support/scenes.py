@@ -7,7 +7,7 @@ from references import approach
 from roadproof.datatypes import Control
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.photometry import AffineResponse, ColourTransform
-from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet, Side
 
 PLAIN = ColourTransform(AffineResponse(torch.eye(3), torch.zeros(3)))
 
@@ -18,10 +18,10 @@ def road_frames(count, seed):
     return rng.integers(90, 140, (count, 88, 200, 3), dtype=np.uint8)
 
 
-def recording(push, *, frames=4, lateral_m=0.0, seed=0):
+def recording(side, *, frames=4, lateral_m=0.0, seed=0):
     return Recording(
-        name=str(push),
-        push=push,
+        name=str(side),
+        side=side,
         frames=road_frames(frames, seed),
         frame_number=np.arange(10, 10 + frames),
         image_from_canvas=approach(frames, lateral_m=lateral_m),
@@ -33,9 +33,9 @@ def recording(push, *, frames=4, lateral_m=0.0, seed=0):
 
 def recording_set(frames=4, colour=PLAIN):
     drives = (
-        recording(Push.CLEAN, frames=frames),
-        recording(Push.RIGHT, frames=frames, lateral_m=-0.5, seed=1),
-        recording(Push.LEFT, frames=frames, lateral_m=0.5, seed=2),
+        recording(Side.CLEAN, frames=frames),
+        recording(Side.RIGHT, frames=frames, lateral_m=-0.5, seed=1),
+        recording(Side.LEFT, frames=frames, lateral_m=0.5, seed=2),
     )
     return RecordingSet(camera=CIL_CAMERA, view=CIL_INPUT, colour=colour, recordings=drives)
 

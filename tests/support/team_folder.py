@@ -11,7 +11,7 @@ from roadproof.drives.folder import Settings, write_drive, write_settings
 from roadproof.driving.episode import Episode
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.patterns import Pattern, save_pattern
-from roadproof.recordings import Push, save_recordings
+from roadproof.recordings import Side, save_recordings
 from roadproof.scenarios import Scenario, save_scenarios
 
 SPEED_MPS = 12.0
@@ -92,7 +92,7 @@ def write_recorded(run):
         )  # fmt: skip
         frames = np.zeros((2, 88, 200, 3), np.uint8)
         write_drive(
-            Drive(name=name, push=Push(name), episode=episode, frame_number=np.array([3, 5]), frames=frames,
+            Drive(name=name, side=Side(name), episode=episode, frame_number=np.array([3, 5]), frames=frames,
                   steer=np.zeros(2), right_m=np.full(2, right_m)),
             run / "record",
         )  # fmt: skip

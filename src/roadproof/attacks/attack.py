@@ -59,7 +59,7 @@ def attack(
             in the recordings and needs their tracks; or one of your own.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
         groups: groups of recorded drives, each attacked together. By default, for a method with gradients and drives
-            pushed to both sides, the paper's two sides, of which the stronger is kept; otherwise one group of all
+            perturbed to both sides, the paper's two sides, of which the stronger is kept; otherwise one group of all
             drives, to whichever side they give way.
         seed: seed of everything random, 0 by default.
         device: torch device on which the search computes.
@@ -215,8 +215,8 @@ def kept_attack(
 
 
 def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:
-    """The start candidates of a group as points of the space; a group without pushes, in a simulator, takes all."""
-    points = [space.point(start.pattern) for start in starts if not group.pushes or start.group == str(group)]
+    """The start candidates of a group as points of the space; a group without sides, in a simulator, takes all."""
+    points = [space.point(start.pattern) for start in starts if not group.sides or start.group == str(group)]
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 

@@ -1,7 +1,7 @@
 """What an attack drives up: how far a painted pattern shifts a controller's steering on recorded drives.
 
 The divergence δ of the paper compares the controller's answers to composited frames with its answers to the clean
-ones. Signed for a group of drives (clean and pushed right: to the right is positive; clean and pushed left: to the
+ones. Signed for a group of drives (clean and right: to the right is positive; clean and left: to the
 left), or the absolute value of each drive's sum where all drives are pooled.
 """
 
@@ -17,11 +17,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.errors import RecordingError
-from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet, Side
 
 
 class Direction(StrEnum):
-    """Where an attack pushes: to one side, or to whichever side each drive gives way."""
+    """Where an attack steers: to one side, or to whichever side each drive gives way."""
 
     RIGHT = "right"
     LEFT = "left"
@@ -30,18 +30,18 @@ class Direction(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Drives that are attacked together, and the side the attack pushes to.
+    """Drives that are attacked together, and the side the attack steers to.
 
     Args:
-        pushes: kinds of drives that belong to the group; empty for drives in a simulator.
+        sides: sides of the drives that belong to the group; empty for drives in a simulator.
         direction: "right" or "left" for the paper's Group, "either" for Group-All, Random and a single drive.
     """
 
-    pushes: tuple[Push, ...]
+    sides: tuple[Side, ...]
     direction: Direction
 
     def __str__(self) -> str:
-        return "+".join(self.pushes) if self.direction is not Direction.EITHER else "all"
+        return "+".join(self.sides) if self.direction is not Direction.EITHER else "all"
 
     def select(self, recordings: RecordingSet) -> tuple[Recording, ...]:
         """The drives of a set that belong to this group.
@@ -49,41 +49,41 @@ class Group:
         Raises:
             RecordingError: the set lacks a kind of drive that the group names.
         """
-        have = {recording.push for recording in recordings.recordings}
-        missing = [push for push in self.pushes if push not in have]
+        have = {recording.side for recording in recordings.recordings}
+        missing = [side for side in self.sides if side not in have]
         if missing:
             raise RecordingError(
                 f"group {self} needs a {missing[0]} drive, the set has {', '.join(sorted(have))}; "
                 "record one, or choose other groups"
             )
-        return tuple(recording for recording in recordings.recordings if recording.push in self.pushes)
+        return tuple(recording for recording in recordings.recordings if recording.side in self.sides)
 
 
-RIGHT_GROUP = Group((Push.CLEAN, Push.RIGHT), Direction.RIGHT)
-LEFT_GROUP = Group((Push.CLEAN, Push.LEFT), Direction.LEFT)
+RIGHT_GROUP = Group((Side.CLEAN, Side.RIGHT), Direction.RIGHT)
+LEFT_GROUP = Group((Side.CLEAN, Side.LEFT), Direction.LEFT)
 
 
 def parse_groups(text: str, recordings: RecordingSet) -> tuple[Group, ...]:
     """Groups from words: "clean+right,clean+left" (the paper's Group), or "all" (Group-All, Random, T = 1).
 
     Raises:
-        RecordingError: a word is unknown, or a group mixes or lacks sides.
+        RecordingError: a word is unknown, or a group names both sides or none.
     """
     if text == "all":
-        pushes = tuple(dict.fromkeys(recording.push for recording in recordings.recordings))
-        return (Group(pushes, Direction.EITHER),)
+        sides = tuple(dict.fromkeys(recording.side for recording in recordings.recordings))
+        return (Group(sides, Direction.EITHER),)
     return tuple(_parse_group(part) for part in text.split(","))
 
 
 def _parse_group(text: str) -> Group:
     try:
-        pushes = tuple(Push(word.strip()) for word in text.split("+"))
+        sides = tuple(Side(word.strip()) for word in text.split("+"))
     except ValueError:
         raise RecordingError(f"group {text!r} is unknown; write e.g. clean+right,clean+left or all") from None
-    sides = [push for push in pushes if push in (Push.LEFT, Push.RIGHT)]
-    if len(sides) != 1 or Push.RANDOM in pushes:
+    steered = [side for side in sides if side in (Side.LEFT, Side.RIGHT)]
+    if len(steered) != 1 or Side.RANDOM in sides:
         raise RecordingError(f"group {text!r} needs exactly one of left and right, e.g. clean+right; or write all")
-    return Group(pushes, Direction(sides[0]))
+    return Group(sides, Direction(steered[0]))
 
 
 def divergence(shift: Float[Tensor, "*b f"], lengths: Sequence[int], direction: Direction) -> Float[Tensor, "*b"]:

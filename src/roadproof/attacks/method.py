@@ -29,7 +29,7 @@ class Method:
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
         """The groups of drives attacked together by default.
 
-        With gradients the paper's two sides, each apart, if drives were pushed to both; otherwise all drives.
+        With gradients the paper's two sides, each apart, if drives were perturbed to both; otherwise all drives.
         """
         return (RIGHT_GROUP, LEFT_GROUP) if recordings.has_both_sides else parse_groups("all", recordings)
 

@@ -12,7 +12,7 @@ from roadproof.compositing.view import camera_points, canvas_pixels
 from roadproof.errors import GeometryError
 from roadproof.paint.site import Rgb, Site
 from roadproof.photometry import Response
-from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet
 
 _VISIBLE = 0.5
 _GRID, _ZOOM, _LEVELS = 9, 0.4, 12
@@ -33,7 +33,7 @@ def site_of(recordings: RecordingSet) -> Site:
 
 
 def _asphalt(recordings: RecordingSet) -> Rgb | None:
-    drive = next((each for each in recordings.recordings if each.push is Push.CLEAN), recordings.recordings[0])
+    drive = recordings.clean or recordings.recordings[0]
     # The last frames show the canvas largest; it may have left the very last one.
     for k in reversed(range(len(drive.frames))):
         flat = _flat(recordings, drive, k)

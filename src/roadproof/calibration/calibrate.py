@@ -244,7 +244,7 @@ def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None, weathe
     steps = drive.frame_number[kept]
     return Recording(
         name=drive.name,
-        push=drive.push,
+        side=drive.side,
         frames=drive.frames[kept],
         frame_number=steps,
         image_from_canvas=np.stack(list(geometry.found.values())),

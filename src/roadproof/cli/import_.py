@@ -18,8 +18,9 @@ def import_(
     """Make recordings of drives of your own: pictures, and a table of poses and controls."""
     from roadproof.drives.own import import_drives, preview
     from roadproof.io.files import write_atomically
-    from roadproof.recordings import save_recordings
+    from roadproof.recordings import check_free, save_recordings
 
+    check_free(out)
     recordings = import_drives(folder)
     save_recordings(recordings, out)
     shown = out / "preview.png"

@@ -27,12 +27,12 @@ def record(
         int | None, number("T, how many drives, an odd number.  [default: the budget's]", 1, 7, show_default=False)
     ] = None,
     scheme: Annotated[
-        str, typer.Option(help="group: pairs pushed right and left; random: each to both sides.")
+        str, typer.Option(help="group: pairs to the right and left; random: each to both sides.")
     ] = "group",
     deviation_m: Annotated[
         list[float] | None,
         number(
-            "How far drives are pushed aside; several are taken in turn.  [default: the budget's]",
+            "How far drives are perturbed; several are taken in turn.  [default: the budget's]",
             0.1,
             5.0,
             show_default=False,
@@ -41,7 +41,7 @@ def record(
     noise_deg: Annotated[
         tuple[int, int] | None,
         number(
-            "Push by noise on the steering instead, least and most, as published.",
+            "Perturb by noise on the steering instead, least and most, as published.",
             0,
             57,
             show_default=False,
@@ -56,7 +56,7 @@ def record(
     device: options.Device = "cpu",
     out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
 ) -> None:
-    """Record drives past the canvas: clean, and pushed to the side. A second call goes on where the first ended."""
+    """Record drives past the canvas: clean, and perturbed. A second call goes on where the first ended."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from dataclasses import replace
 
@@ -72,7 +72,7 @@ def record(
     chosen = [options.scenario_of(name, scenarios) for name in dict.fromkeys(names)]
     sky = options.weather_of(weather)
     if noise_deg is not None and deviation_m:
-        raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to push drives aside")
+        raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to perturb drives")
     usual = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
     perturbation = usual.trajectories.perturbation
     if deviation_m:

@@ -1,4 +1,4 @@
-"""Recording a driver: the clean drive, and drives pushed aside, past the canvas."""
+"""Recording a driver: the clean drive, and perturbed ones, past the canvas."""
 
 from roadproof.drives.folder import Drive as Drive
 from roadproof.drives.folder import Drives as Drives

@@ -24,7 +24,7 @@ from roadproof.geometry import CameraModel, CropResize
 from roadproof.io.files import AnyPath, as_path, write_folder_atomically
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
-from roadproof.recordings import Push, Track
+from roadproof.recordings import Side, Track
 from roadproof.scenarios import Scenario
 
 
@@ -34,7 +34,7 @@ class Drive:
 
     Args:
         name: name of the drive and of its folder.
-        push: how the drive was perturbed.
+        side: side to which the drive was perturbed.
         episode: episode of the whole drive; its steering is what was applied.
         frame_number: steps of the episode whose frames are kept, (F,).
         frames: the controller's input at the kept steps, RGB, (F, H, W, 3).
@@ -48,7 +48,7 @@ class Drive:
     """
 
     name: str
-    push: Push
+    side: Side
     episode: Episode
     frame_number: Int[np.ndarray, " f"]
     frames: UInt8[np.ndarray, "f h w 3"]
@@ -139,7 +139,7 @@ class Drives:
     drives: tuple[Drive, ...]
 
     def __post_init__(self) -> None:
-        if not self.drives or self.drives[0].push is not Push.CLEAN:
+        if not self.drives or self.drives[0].side is not Side.CLEAN:
             raise RecordingError("the recording has no clean drive in the first place; record it again")
 
     @property
@@ -246,5 +246,6 @@ _DRIVE = RecordFile(
     error=RecordingError,
     remedy="remove its folder and record it again",
     elsewhere=("name", "episode"),
+    renamed={"push": "side"},
     header="about",
 )

@@ -26,7 +26,7 @@ from roadproof.drives.trajectories import SteeringNoise
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Policy
 from roadproof.errors import RecordingError
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 
 _GAIN_PRIOR = 0.3
 """1/m: between a small car with a small steering angle (0.23) and CARLA's large ones (0.42)."""
@@ -117,7 +117,7 @@ class Offsets:
 
 
 def offsets(
-    push: Push,
+    side: Side,
     size_m: float,
     from_m: float,
     to_m: float,
@@ -129,22 +129,22 @@ def offsets(
     """An offset that grows from 0 while the canvas is in view, to one side or, at random, to both.
 
     Args:
-        push: side of the offset: RIGHT, LEFT or RANDOM.
+        side: side of the offset: RIGHT, LEFT or RANDOM.
         size_m: largest offset, metres.
         from_m: arclength at which the canvas comes into view, metres.
         to_m: arclength at which the canvas is out of view, metres.
         length_m: length of the path, metres.
         rng: random generator that draws where the offset rises and, for RANDOM, its sizes.
-        weaves: whether the offset weaves from side to side, to the pushed side first.
+        weaves: whether the offset weaves from side to side, to the named side first.
     """
     s = np.arange(0.0, length_m + _FINE_M, _FINE_M)
-    side = 1.0 if push is Push.RIGHT else -1.0
+    sign = 1.0 if side is Side.RIGHT else -1.0
     if weaves:
         since_m = np.maximum(s - from_m, 0.0)
         grown = size_m * _smooth(np.minimum(since_m / _WEAVE_BEGINS_M, 1.0))
-        return Offsets.of(s, side * grown * np.sin(math.tau / _WEAVE_M * since_m))
+        return Offsets.of(s, sign * grown * np.sin(math.tau / _WEAVE_M * since_m))
     along = (s - from_m) / (to_m - from_m)
-    if push is Push.RANDOM:
+    if side is Side.RANDOM:
         knots = np.concatenate([[0.0], rng.uniform(-1.0, 1.0, 4)])
         knots *= size_m / np.abs(knots).max()
         at = np.clip(along * 4, 0.0, 4.0)
@@ -152,7 +152,7 @@ def offsets(
         rise = _smooth(at - below)
         return Offsets.of(s, knots[below] + rise * (knots[below + 1] - knots[below]))
     begins, ends = rng.uniform(0.0, 0.2), rng.uniform(0.6, 0.85)
-    return Offsets.of(s, side * size_m * _smooth(np.clip((along - begins) / (ends - begins), 0.0, 1.0)))
+    return Offsets.of(s, sign * size_m * _smooth(np.clip((along - begins) / (ends - begins), 0.0, 1.0)))
 
 
 def _smooth(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -222,12 +222,12 @@ def noisy(
 
 
 def steering_noise(
-    push: Push, noise: SteeringNoise, clean: Episode, last_step: int, rng: np.random.Generator
+    side: Side, noise: SteeringNoise, clean: Episode, last_step: int, rng: np.random.Generator
 ) -> Float[np.ndarray, " n"]:
     """Steering noise: one draw of whole degrees per step, positive to the right, 0 outside the noise's time.
 
     Args:
-        push: side of the noise: RIGHT, LEFT or RANDOM.
+        side: side of the noise: RIGHT, LEFT or RANDOM.
         noise: range of the noise.
         clean: episode of the clean drive to which the noise is added.
         last_step: number of the step at which the canvas is last in view.
@@ -235,6 +235,6 @@ def steering_noise(
     """
     count = clean.steer.size
     draws = rng.integers(noise.low_deg, noise.high_deg + 1, count).astype(np.float64)
-    sides = {Push.RIGHT: np.ones(count), Push.LEFT: -np.ones(count), Push.RANDOM: rng.choice((-1.0, 1.0), count)}
+    signs = {Side.RIGHT: np.ones(count), Side.LEFT: -np.ones(count), Side.RANDOM: rng.choice((-1.0, 1.0), count)}
     since_s = (np.arange(count) - last_step) * clean.dt_s + _NOISE_BEFORE_END_S
-    return np.where((since_s >= 0.0) & (since_s < _NOISE_S), sides[push] * draws, 0.0)
+    return np.where((since_s >= 0.0) & (since_s < _NOISE_S), signs[side] * draws, 0.0)

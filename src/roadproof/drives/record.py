@@ -24,7 +24,7 @@ from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, rep
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.io.files import AnyPath, as_path
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
@@ -47,7 +47,7 @@ def record(
     folder: AnyPath | None = None,
     on_drive: Callable[[int], object] = lambda _done: None,
 ) -> Drives:
-    """Record a driver past a bare canvas: one clean drive, and drives pushed aside.
+    """Record a driver past a bare canvas: one clean drive, and perturbed drives.
 
     A perturbed drive ends behind the canvas. One that hits something or leaves the road before is driven again with a
     smaller perturbation, and says so.
@@ -57,7 +57,7 @@ def record(
         driver: a controller, or a function that is given the simulator after each reset.
         scenario: scenario that is driven.
         weather: weather of all drives, clear noon by default.
-        trajectories: number of drives and their perturbations; by default one clean and one pushed 1.5 m to each side.
+        trajectories: number of drives and their perturbations; by default one clean and one 1.5 m to each side.
         window: which frames of each drive are kept; `Window()` by default.
         seed: seed of the perturbations.
         driver_name: name of the driver in words, for the record; empty by default.
@@ -112,7 +112,7 @@ def record_along(
 ) -> Drive:
     """Record the bare road along a drive made before: its controls given again, open loop, with no paint.
 
-    The paint's effect on the drive is in the path alone; a drive that came to harm is cut there. It counts as pushed to
+    The paint's effect on the drive is in the path alone; a drive that came to harm is cut there. It belongs to
     the side on which it was furthest from the clean drive.
 
     Args:
@@ -149,8 +149,8 @@ def record_along(
     for step, frame in zip(steps.tolist(), frames, strict=True):
         answers[step] = act_of(controller, frame, float(again.speed_mps[step]), int(again.command[step])).steer
     right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in which])
-    push = Push.RIGHT if right_m[np.abs(right_m).argmax()] > 0 else Push.LEFT
-    drive = _drive(Plan(name, push, 0.0, 0), again, chosen, answers, right_m)
+    side = Side.RIGHT if right_m[np.abs(right_m).argmax()] > 0 else Side.LEFT
+    drive = _drive(Plan(name, side, 0.0, 0), again, chosen, answers, right_m)
     if folder is not None:
         write_drive(drive, folder)
     return drive
@@ -188,7 +188,7 @@ def _clean(simulator: SimulatorT, driver: Controller | Driver[SimulatorT], setti
     harm = [event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= last_s]
     note = f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas" if harm else ""
     return _drive(
-        Plan("clean", settings.trajectories.plans()[0].push, 0.0, 0), episode, chosen, episode.steer, note=note
+        Plan("clean", settings.trajectories.plans()[0].side, 0.0, 0), episode, chosen, episode.steer, note=note
     )
 
 
@@ -229,7 +229,7 @@ def _astray(
     """
     path, answers = CleanPath.of(clean.episode), list[float]()
     first, last = (path.locate(clean.states[k], None)[0] for k in (0, -1))
-    rng = np.random.default_rng((settings.seed, plan.stream, list(Push).index(plan.push)))
+    rng = np.random.default_rng((settings.seed, plan.stream, list(Side).index(plan.side)))
     at_m: float | None = None
     behind_s, test = math.inf, list[float]()
     how = settings.trajectories.perturbation
@@ -237,10 +237,10 @@ def _astray(
     def begin(world: SimulatorT) -> Policy:
         policy = policy_of(driver, world)
         if isinstance(how, SteeringNoise):
-            noise = steering_noise(plan.push, how, clean.episode, int(clean.frame_number[-1]), rng)
+            noise = steering_noise(plan.side, how, clean.episode, int(clean.frame_number[-1]), rng)
             return noisy(policy, clean.episode, share * noise, answers.append)
         length_m = float(path.arclength_m[-1])
-        wanted = offsets(plan.push, share * plan.offset_m, first, last, length_m, rng, weaves=plan.weaves)
+        wanted = offsets(plan.side, share * plan.offset_m, first, last, length_m, rng, weaves=plan.weaves)
         swerve = swerving(policy, path, wanted, answers.append)
 
         def act(seen: Observation) -> Control:
@@ -317,7 +317,7 @@ def _drive(
     steps, frames, _ = chosen
     return Drive(
         name=plan.name,
-        push=plan.push,
+        side=plan.side,
         episode=episode,
         frame_number=steps,
         frames=frames,

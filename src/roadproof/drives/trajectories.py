@@ -7,7 +7,7 @@ from enum import StrEnum
 from itertools import cycle, islice
 
 from roadproof.errors import RecordingError
-from roadproof.recordings import Push
+from roadproof.recordings import Side
 
 COUNTS = (1, 3, 5, 7)
 
@@ -79,14 +79,14 @@ class Plan:
 
     Args:
         name: name of the drive and of its folder.
-        push: side to which the drive is pushed.
+        side: side to which the drive is perturbed.
         offset_m: largest offset of a swerve in metres; 0 for a clean drive and for steering noise.
         stream: number that tells its random draws from those of other drives.
         weaves: whether the drive weaves from side to side.
     """
 
     name: str
-    push: Push
+    side: Side
     offset_m: float
     stream: int
     weaves: bool = False
@@ -98,7 +98,7 @@ class Trajectories:
 
     Args:
         count: the paper's T, 1, 3, 5 or 7: the clean drive and T − 1 perturbed ones.
-        scheme: "group" for pairs, of which one is pushed right and one left; "random" for both sides at random.
+        scheme: "group" for pairs, one to the right and one to the left; "random" for both sides at random.
         perturbation: swerve by metres, or steering noise by degrees as published.
 
     Raises:
@@ -115,16 +115,16 @@ class Trajectories:
 
     def plans(self) -> tuple[Plan, ...]:
         """The plans of all drives, the clean one first."""
-        pushes = (Push.RANDOM,) if self.scheme is Scheme.RANDOM else (Push.RIGHT, Push.LEFT)
+        sides = (Side.RANDOM,) if self.scheme is Scheme.RANDOM else (Side.RIGHT, Side.LEFT)
         how, sizes = self.perturbation, [(0.0, False)]
         if isinstance(how, Swerve):
             sizes = [*((size, False) for size in how.deviations_m), *((size, True) for size in how.weaves_m)]
         perturbed = (
-            Plan(str(push) if k == 1 else f"{push}-{k}", push, size, k, weaves)
+            Plan(str(side) if k == 1 else f"{side}-{k}", side, size, k, weaves)
             for k, (size, weaves) in enumerate(cycle(sizes), 1)
-            for push in pushes
+            for side in sides
         )
-        return (Plan(str(Push.CLEAN), Push.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
+        return (Plan(str(Side.CLEAN), Side.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

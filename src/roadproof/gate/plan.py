@@ -15,12 +15,13 @@ from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, each_once, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
 from roadproof.io.files import AnyPath, as_path, read_toml
+from roadproof.io.tables import build
 from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
 from roadproof.study.plan import StartPlan
-from roadproof.study.reading import build, paint_of, refuse_untrusted
+from roadproof.study.reading import paint_of, refuse_untrusted
 
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
@@ -149,7 +150,7 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
             raise CheckError(f'expected format = "{FORMAT}"')
         if (version := content.pop("version", None)) != FORMAT_VERSION:
             raise CheckError(f"version is {version!r}, expected {FORMAT_VERSION}")
-        plan = _plan(build(_Stated, content, "the check"), path.parent, budget)
+        plan = _plan(build(_Stated, content, "the check", CheckError), path.parent, budget)
         if not trust:
             refuse_untrusted(plan.controller, plan.simulator if plan.budget == "full" else None)
     except RoadproofError as error:
@@ -170,8 +171,8 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
     own = None if listed is None else _beside(folder, listed, "scenario_file")
     known = load_scenarios(own or BUILTIN_FILE)
     scenarios = _chosen(stated.scenarios, known)
-    smoke = None if stated.smoke is None else build(_Smoke, stated.smoke, "smoke")
-    full = build(_Full, stated.full, "full")
+    smoke = None if stated.smoke is None else build(_Smoke, stated.smoke, "smoke", CheckError)
+    full = build(_Full, stated.full, "full", CheckError)
     if full.simulator != "town" and not is_server(full.simulator):
         raise CheckError(f"simulator is {full.simulator!r}, expected {SPECS}")
     if chosen == "smoke" and smoke is None:
@@ -188,7 +189,7 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         budget=chosen,
         weathers=weathers,
         seeds=stated.seeds,
-        starts=build(StartPlan, stated.starts, "starts"),
+        starts=build(StartPlan, stated.starts, "starts", CheckError),
         random=stated.random,
         figures=stated.figures,
         paint=paint,
@@ -230,7 +231,7 @@ def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict
         _one_of(name, "a key of change", tuple(RANGES))
         if isinstance(table, str):
             raise CheckError(f"change.{name} is {table!r}, expected {{ absolute = ..., relative = ... }}")
-        found[name] = build(Change, table, f"change.{name}")
+        found[name] = build(Change, table, f"change.{name}", CheckError)
         _within(found[name].absolute, f"change.{name}.absolute", 0.0, 100.0)
         _within(found[name].relative, f"change.{name}.relative", 0.0, 100.0)
     return found, _beside(folder, reference, "reference")

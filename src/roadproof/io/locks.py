@@ -8,7 +8,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -28,11 +28,12 @@ def working_in(folder: Path) -> Generator[None]:
     The lock is the system's own and ends with its process, however that ends; it holds on one machine, for one user.
 
     Args:
-        folder: the folder to work in; made where it is not there.
+        folder: the folder to work in; made where it is not there, and taken away again where nothing came of it.
 
     Raises:
         OutputError: the folder cannot be written, or another process works in it.
     """
+    new = not folder.exists()
     check_writable(folder)
     place = _place(folder)
     lock = FileLock(place.with_suffix(".lock"), is_singleton=True)
@@ -55,6 +56,9 @@ def working_in(folder: Path) -> Generator[None]:
         if first:
             place.unlink(missing_ok=True)
     finally:
+        if new:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
         lock.release()
 
 

@@ -15,10 +15,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from functools import cache
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar, cast, get_type_hints
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -27,6 +26,7 @@ from jaxtyping import AbstractArray, Float, Int
 from roadproof.errors import RoadproofError
 from roadproof.io.arrays import HEADER, MOST_BYTES, read_record, write_archive
 from roadproof.io.files import AnyPath, as_path, one_line, read_json, write_json
+from roadproof.io.tables import declared_types, unknown_keys
 
 T = TypeVar("T")
 SavedT = TypeVar("SavedT", bound="Saved")
@@ -60,6 +60,7 @@ class RecordFile(Generic[T]):
         remedy: what the user can do where a file is missing or damaged.
         elsewhere: names of fields that are not in this file; `read` takes their values by name.
         forms: the forms of fields that the file has otherwise than the dataclass, by the field's name.
+        renamed: today's names of fields, by the names that older files have for them, at any depth.
         notes: what the file says besides the fields, for people, such as units.
         header: name of an archive's JSON header; None where all its fields are arrays and numbers.
         most_bytes: how many bytes an archive may unpack to.
@@ -72,6 +73,7 @@ class RecordFile(Generic[T]):
     remedy: str
     elsewhere: tuple[str, ...] = ()
     forms: Mapping[str, Form] = field(default_factory=dict[str, Form])
+    renamed: Mapping[str, str] = field(default_factory=dict[str, str])
     notes: Mapping[str, object] = field(default_factory=dict[str, object])
     header: str | None = HEADER
     most_bytes: int = MOST_BYTES
@@ -101,7 +103,7 @@ class RecordFile(Generic[T]):
 
     def stated(self, value: T, members: Sequence[str] = ()) -> dict[str, Any]:
         """A record's fields as JSON has them, but for those that are members of an archive."""
-        names = [name for name in _types(self.kind) if name not in (*self.elsewhere, *members)]
+        names = [name for name in declared_types(self.kind) if name not in (*self.elsewhere, *members)]
         values: dict[str, object] = {name: getattr(value, name) for name in names}
         for name in self.forms.keys() & values.keys():
             values[name] = self.forms[name].stated(values[name])
@@ -127,7 +129,7 @@ class RecordFile(Generic[T]):
             error: the file is missing, damaged, of another format or a newer version.
         """
         if path.suffix == ".json":
-            return read_json(path, self.name, self.version, self.error)
+            return _renamed(read_json(path, self.name, self.version, self.error), self.renamed)
         stated, arrays = read_record(
             path,
             self._members(path),
@@ -137,7 +139,7 @@ class RecordFile(Generic[T]):
             format_version=(self.name, self.version) if self.name else None,
             most_bytes=self.most_bytes,
         )
-        return stated | arrays
+        return _renamed(stated, self.renamed) | arrays
 
     def made(self, path: Path, content: Mapping[str, Any], **elsewhere: object) -> T:
         """The record in what `content` read from a file; `path`, `elsewhere` and the errors are those of `read`."""
@@ -148,7 +150,7 @@ class RecordFile(Generic[T]):
                 if name in elsewhere:
                     continue
                 if name in content:
-                    kind = _types(self.kind)[name] if form is None else form.kind
+                    kind = declared_types(self.kind)[name] if form is None else form.kind
                     typed = _typed(content[name], kind, name)
                     values[name] = typed if form is None else form.meant(typed)
                 elif each.default is MISSING and each.default_factory is MISSING:
@@ -159,7 +161,7 @@ class RecordFile(Generic[T]):
 
     def _members(self, path: Path) -> tuple[str, ...]:
         """Fields that are arrays of the archive."""
-        types = {} if path.suffix == ".json" else _types(self.kind)
+        types = {} if path.suffix == ".json" else declared_types(self.kind)
         named = [name for name, kind in types.items() if self.header is None or _is_array(kind)]
         return tuple(name for name in named if name not in self.elsewhere)
 
@@ -219,10 +221,13 @@ def check_arrays(
             raise error(f"{name} {of} has NaN or infinite values")
 
 
-@cache
-def _types(kind: type) -> dict[str, Any]:
-    hints = get_type_hints(kind)
-    return {each.name: hints[each.name] for each in fields(kind)}
+def _renamed(stored: Any, renamed: Mapping[str, str]) -> Any:  # noqa: ANN401
+    if not renamed or not isinstance(stored, (dict, list)):
+        return stored
+    if isinstance(stored, list):
+        return [_renamed(each, renamed) for each in cast("list[object]", stored)]
+    content = cast("dict[str, Any]", stored)
+    return {renamed.get(name, name): _renamed(each, renamed) for name, each in content.items()}
 
 
 def _is_array(kind: object) -> bool:
@@ -245,7 +250,8 @@ def _typed(stored: Any, kind: Any, name: str) -> object:  # noqa: ANN401
         made: object = msgspec.convert(stored, kind)
     except msgspec.ValidationError as reason:
         raise ValueError(f"{name}: {reason}") from None
-    _refuse_unknown(stored, made, name)
+    for where, key, _ in unknown_keys(kind, stored, name):
+        raise ValueError(f"{where} has an unknown field {key!r:.60}")
     return made
 
 
@@ -259,16 +265,3 @@ def _array(values: np.ndarray, kind: Any, name: str) -> np.ndarray:  # noqa: ANN
     if not isinstance(values, kind):
         raise ValueError(f"{name} is {values.dtype} of shape {values.shape}, expected {kind.__name__}")
     return values
-
-
-def _refuse_unknown(stored: Any, made: Any, name: str) -> None:  # noqa: ANN401
-    """A camera with a field that nobody reads would be another camera."""
-    if isinstance(stored, dict) and is_dataclass(made):
-        known = _types(type(made))
-        for key, value in cast("dict[str, Any]", stored).items():
-            if key not in known:
-                raise ValueError(f"{name} has an unknown field {key!r:.60}")
-            _refuse_unknown(value, getattr(made, key), f"{name}.{key}")
-    elif isinstance(made, (list, tuple)):
-        for one, other in zip(cast("list[object]", stored), cast("list[object]", made), strict=True):
-            _refuse_unknown(one, other, name)

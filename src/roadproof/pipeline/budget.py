@@ -20,10 +20,10 @@ class Budget:
     Args:
         method: search method: by gradient, improved or published, or without gradients.
         objective: what the search makes large: a path deviation in the recorded world, or a steering shift.
-        trajectories: trajectories that are recorded. For a path deviation the default has a pair pushed aside and a
+        trajectories: trajectories that are recorded. For a path deviation the default has a pair to the sides and a
             pair that weaves, so that frames look where an attacked car looks.
         window: which frames of each drive are kept; by default at most 40 that show at least 8 pixels of the canvas.
-        pooled: whether drives pushed right and left are attacked together too, as in the paper's Group-All.
+        pooled: whether drives to the right and left are attacked together too, as in the paper's Group-All.
         calibration: calibration method of the drives.
         select: number of candidates driven over, of which the strongest is kept; 1 verifies the first, 0 drives none.
         weathers: weathers of the evaluation.
@@ -75,8 +75,8 @@ class Budget:
         at_random = self.trajectories.scheme is Scheme.RANDOM
         if self.is_predicted and (self.pooled or at_random):
             raise RoadproofError(
-                "a path deviation is searched for each side apart; attack drives pooled or pushed at random by their "
-                "steering shift: objective=SteeringShift()"
+                "a path deviation is searched for each side apart; attack drives pooled or perturbed at random by "
+                "their steering shift: objective=SteeringShift()"
             )
 
     def _check_published(self) -> None:

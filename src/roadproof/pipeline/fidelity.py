@@ -21,7 +21,7 @@ from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
 from roadproof.photometry import AffineResponse, ColourTransform
-from roadproof.recordings import Push, Recording, RecordingSet
+from roadproof.recordings import Recording, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -109,7 +109,7 @@ def measure_fidelity(
         EpisodeError: no frame shows any of the paint.
         OutputError: the folder cannot be written.
     """
-    recorded = next((each for each in recordings.recordings if each.push is Push.CLEAN), None)
+    recorded = recordings.clean
     if recorded is None:
         return None
     if clean is None:
@@ -133,8 +133,8 @@ def compare_with_rendered(
 ) -> Fidelity:
     """Composite a pattern into a recorded drive and compare with the same frames rendered over the real paint.
 
-    Any drive will do that was recorded and calibrated without paint: the clean one, a pushed one, or the attacked one
-    replayed over the bare road.
+    Any drive will do that was recorded and calibrated without paint: the clean one, a perturbed one, or the attacked
+    one replayed over the bare road.
 
     Args:
         pattern: pattern that was painted; one pattern, not a batch.
@@ -155,7 +155,7 @@ def compare_with_rendered(
             "render the same frames"
         )
     alone = replace(recordings, recordings=(recorded,))
-    shown = show_pattern(pattern, alone, controller, Group((recorded.push,), Direction.EITHER), device=device)[0]
+    shown = show_pattern(pattern, alone, controller, Group((recorded.side,), Direction.EITHER), device=device)[0]
     with torch.no_grad():
         frames = torch.as_tensor(rendered, device=device).permute(0, 3, 1, 2).float() / 255
         speed = torch.as_tensor(recorded.speed_mps, device=device, dtype=torch.float32)

@@ -23,7 +23,7 @@ from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
 from roadproof.recorded.pictures import FrameBank, Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.recordings import Push, RecordingSet
+from roadproof.recordings import RecordingSet
 
 PAST_M = 1.0
 """So far beyond the last recorded frame a picture can still be made."""
@@ -105,7 +105,7 @@ class RecordedWorld:
             raise RecordingError(
                 f"the set has drives in {', '.join(weathers)}, a recorded world has one light; take one of by_weather()"
             )
-        clean = next((drive for drive in recordings.recordings if drive.push is Push.CLEAN), None)
+        clean = recordings.clean
         if clean is None:
             raise RecordingError("the set has no clean drive, which a recorded world begins with; record one")
         self.recordings = recordings

@@ -29,7 +29,7 @@ from roadproof.io.pictures import read_picture
 from roadproof.io.records import Form, RecordFile
 from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps, Response
-from roadproof.recordings.recording import Push, Recording, RecordingSet
+from roadproof.recordings.recording import Recording, RecordingSet, Side
 from roadproof.recordings.track import Track
 
 _UNITS = {
@@ -55,7 +55,7 @@ class _Drive:
     """A drive as recordings.json lists it."""
 
     name: str
-    push: Push
+    side: Side
     frames: int = 0
     weather: str = ""
 
@@ -96,16 +96,27 @@ _MANIFEST = RecordFile(
         "colour": Form(dict[str, Any], ColourTransform.to_dict, ColourTransform.from_dict),
         "canvas": Form(dict[str, float] | None, lambda canvas: canvas, _canvas),
     },
+    renamed={"push": "side"},
     notes={"units": _UNITS},
 )
 _PER_FRAME = RecordFile(
     kind=Recording,
     error=RecordingError,
     remedy=_AGAIN,
-    elsewhere=("name", "push", "frames", "maps", "track", "weather"),
+    elsewhere=("name", "side", "frames", "maps", "track", "weather"),
     header=None,
 )
 _TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
+
+
+def check_free(folder: Path) -> None:
+    """See that recordings can be written to a folder, before they are made.
+
+    Raises:
+        OutputError: the folder is there already, and not empty.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder} exists already; choose a new folder for the recordings")
 
 
 def save_recordings(recordings: RecordingSet, folder: AnyPath, *, compact: bool = False) -> None:
@@ -120,8 +131,7 @@ def save_recordings(recordings: RecordingSet, folder: AnyPath, *, compact: bool 
         OutputError: the folder is there already, or cannot be written.
     """
     folder = as_path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder} exists already; choose a new folder for the recordings")
+    check_free(folder)
 
     def write(part: Path) -> None:
         for recording in recordings.recordings:
@@ -140,7 +150,7 @@ def _manifest(recordings: RecordingSet) -> _Manifest:
         canvas=recordings.canvas,
         marks=recordings.marks,
         drives=tuple(
-            _Drive(name=each.name, push=each.push, frames=len(each.frames), weather=each.weather)
+            _Drive(name=each.name, side=each.side, frames=len(each.frames), weather=each.weather)
             for each in recordings.recordings
         ),
     )
@@ -197,7 +207,7 @@ def _read_drive(root: Path, drive: _Drive, response: Response) -> Recording:
         folder / "drive.npz",
         content,
         name=drive.name,
-        push=drive.push,
+        side=drive.side,
         frames=_read_frames(folder, content["frame_number"]),
         maps=_read_maps(folder / "shading.npz", response),
         track=_read_track(folder / "track.npz", content["frame_number"]),

@@ -21,8 +21,8 @@ PER_FRAME = ("frame_number", "image_from_canvas", "speed_mps", "command", "steer
 """Arrays of a recording with one row a frame, besides its frames."""
 
 
-class Push(StrEnum):
-    """How a drive was perturbed: not at all, to one side only, or at random."""
+class Side(StrEnum):
+    """The side to which a drive was perturbed: none, one only, or both at random."""
 
     CLEAN = "clean"
     LEFT = "left"
@@ -36,7 +36,7 @@ class Recording:
 
     Args:
         name: name of the drive and of its folder.
-        push: how the drive was perturbed.
+        side: side to which the drive was perturbed.
         frames: the controller's input without any paint, RGB, (F, H, W, 3).
         frame_number: number of each frame's step in the drive, rising, (F,).
         image_from_canvas: one homography per frame, canvas px to camera px, (F, 3, 3).
@@ -53,7 +53,7 @@ class Recording:
     """
 
     name: str
-    push: Push
+    side: Side
     frames: UInt8[np.ndarray, "f h w 3"]
     frame_number: Int[np.ndarray, "..."]
     image_from_canvas: Float[np.ndarray, "..."]
@@ -161,9 +161,14 @@ class RecordingSet:
                 )
 
     @property
+    def clean(self) -> Recording | None:
+        """The first drive that was not perturbed; None if there is none."""
+        return next((each for each in self.recordings if each.side is Side.CLEAN), None)
+
+    @property
     def has_both_sides(self) -> bool:
-        """Whether drives were pushed to the left and to the right."""
-        return {Push.LEFT, Push.RIGHT} <= {recording.push for recording in self.recordings}
+        """Whether drives were perturbed to the left and to the right."""
+        return {Side.LEFT, Side.RIGHT} <= {recording.side for recording in self.recordings}
 
     @property
     def is_placed(self) -> bool:

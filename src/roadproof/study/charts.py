@@ -1,6 +1,6 @@
 """Charts of a study: deviation and penalty by K, and how searches come forward.
 
-Every method keeps its colour, line and marker in all charts (Okabe and Ito's colours).
+Every method keeps its colour, line and marker in all charts (Okabe and Ito's colours, and two of Tol's).
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from roadproof.study.kept_jobs import KeptJob
 from roadproof.study.results import Block, Results
 from roadproof.study.statistics import mean_over_scenarios
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000", "#882255", "#7a7f85")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*")
 LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.4)), (0, (6, 2, 1, 2)))
+_ENTRY_IN, _LETTER_IN = 0.7, 0.085
+"""Room that an entry of a legend takes, and each of its letters, inches."""
 INK, MUTED, RULE = "#1c2126", "#575e66", "#dcd9d1"
 
 
@@ -177,7 +179,7 @@ def _label(axes: Axes, x: str, y: str) -> None:
 
 
 def legend(figure: Figure) -> None:
-    """One legend for all axes, above them."""
+    """One legend for all axes, above them, in as many columns as the figure has room for."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
@@ -187,7 +189,7 @@ def legend(figure: Figure) -> None:
         list(entries.values()),
         list(entries),
         loc="outside upper left",
-        ncols=min(len(entries), 6),
+        ncols=max(1, min(len(entries), int(figure.get_figwidth() / (_ENTRY_IN + _LETTER_IN * max(map(len, entries)))))),
         frameon=False,
         fontsize=9.5,
         labelcolor=INK,

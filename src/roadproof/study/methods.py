@@ -17,9 +17,9 @@ from roadproof.calibration import Method as Calibration
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.errors import StudyError
+from roadproof.io.tables import build
 from roadproof.limits import MANY
 from roadproof.pipeline.budget import PUBLISHED, QUICK, Budget
-from roadproof.study.reading import build
 
 # What begins a number is checked by the object that it goes into; a plan may come from anyone, so it also has an end.
 Hundred: TypeAlias = Annotated[int, msgspec.Meta(le=100)]
@@ -122,7 +122,7 @@ def method_plan(values: Mapping[str, Any]) -> MethodPlan:
     if word not in METHODS:
         raise StudyError(f"search is {word!r:.60}, expected one of {', '.join(METHODS)}")
     kinds = {GradOpt.word: GradOptPlan, Published.word: PublishedPlan}
-    return build(kinds.get(word, BlackBoxPlan), values, f"method {values['name']}")
+    return build(kinds.get(word, BlackBoxPlan), values, f"method {values['name']}", StudyError)
 
 
 def budget_of(method: MethodPlan, weather: Weather) -> Budget:

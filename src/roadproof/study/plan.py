@@ -18,12 +18,13 @@ from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
 from roadproof.io.files import AnyPath, as_path, read_toml
+from roadproof.io.tables import build
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
-from roadproof.study.reading import build, paint_of, refuse_untrusted
+from roadproof.study.reading import paint_of, refuse_untrusted
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -258,10 +259,14 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
             f"version is {version!r}, expected {FORMAT_VERSION}; version 1 had other keys, see docs/studies.md"
         )
     tables = {"traffic": TrafficPlan, "starts": StartPlan}
-    built = {name: build(tables[name], content[name], name) for name in tables if isinstance(content.get(name), dict)}
+    built = {
+        name: build(tables[name], content[name], name, StudyError)
+        for name in tables
+        if isinstance(content.get(name), dict)
+    }
     named = {name: content[name] for name in ("paint", "variation") if name in content}
     built |= dict(zip(("paint", "variation"), paint_of(named, "the study"), strict=True))
-    stated = build(_Stated, content | built, "the study")
+    stated = build(_Stated, content | built, "the study", StudyError)
     listed = stated.scenario_file
     own = BUILTIN_FILE if listed is None else folder / listed
     if listed is not None and not own.resolve().is_relative_to(folder.resolve()):

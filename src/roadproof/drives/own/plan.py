@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
 from roadproof.io.files import read_toml
-from roadproof.io.records import RecordFile
-from roadproof.recordings import Push
+from roadproof.io.tables import build
+from roadproof.recordings import Side
 
 PLAN = "drives.toml"
 
@@ -72,13 +72,13 @@ class OwnDrive:
     Args:
         name: name of the drive.
         table: file name of the drive's table, in the folder.
-        push: how the drive was perturbed: clean, right, left or random.
+        side: side to which the drive was perturbed: clean, right, left or random.
         weather: name of the weather; empty if it is not known.
     """
 
     name: str
     table: str
-    push: Push = Push.CLEAN
+    side: Side = Side.CLEAN
     weather: str = ""
 
 
@@ -111,9 +111,6 @@ class OwnDrives:
             raise RecordingError("there is no [[drive]], expected at least a clean one")
 
 
-_FILE = RecordFile(kind=OwnDrives, error=RecordingError, remedy="see docs/recordings.md")
-
-
 def read_plan(folder: Path) -> OwnDrives:
     """Read drives.toml of a folder.
 
@@ -121,9 +118,4 @@ def read_plan(folder: Path) -> OwnDrives:
         RecordingError: the file is missing or damaged, or has an unknown key.
     """
     path = folder / PLAN
-    content = read_toml(path, RecordingError)
-    known = [each.name for each in fields(OwnDrives)]
-    for key in content:
-        if key not in known:
-            raise RecordingError(f"{path} has an unknown key {key!r:.60}, expected {', '.join(known)}")
-    return _FILE.made(path, content)
+    return build(OwnDrives, read_toml(path, RecordingError), str(path), RecordingError)

@@ -117,7 +117,7 @@ def _recording(
         )
     return Recording(
         name=table.drive.name,
-        push=table.drive.push,
+        side=table.drive.side,
         frames=np.stack([_frame(folder, own, table.pictures[int(step)]) for step in kept]),
         frame_number=kept.astype(np.int64),
         image_from_canvas=seen,
