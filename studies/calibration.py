@@ -2,7 +2,7 @@
 
     python studies/calibration.py --json OUT --keep FOLDER [--controller pilotnet:FILE] [--scenarios left-03,right-05]
 
-In each scenario and weather the expert is recorded (clean, pushed right, pushed left), the drives are calibrated in
+In each scenario and weather the expert is recorded (clean, right, left), the drives are calibrated in
 three ways, and composites made with each are compared with replays over the same random patterns, really painted:
   reprojection  distance of the homographies from those the town states, over a 9×9 grid of canvas points in view,
                 corners included; px of the 800×600 camera picture
