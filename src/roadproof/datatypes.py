@@ -87,6 +87,32 @@ class VehicleState:
     speed_mps: float
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Obstacle:
+    """A box on the ground that stops a car, such as a piece of a guard rail, a wall or a post.
+
+    Args:
+        x_m: world x of its middle, metres; y_m likewise.
+        yaw_rad: direction of its length, radians, left positive.
+        half_length_m: half its length, metres, 0 to 1,000.
+        half_width_m: half its width, metres, 0 to 1,000.
+
+    Raises:
+        SimulatorError: a value is out of its range.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    half_length_m: float
+    half_width_m: float
+
+    def __post_init__(self) -> None:
+        placed = all(abs(value) < 1e9 for value in (self.x_m, self.y_m, self.yaw_rad))
+        if not (placed and 0 <= self.half_length_m <= 1e3 and 0 <= self.half_width_m <= 1e3):
+            raise SimulatorError(f"{self} is no obstacle; expected finite numbers, and half sizes of 0 to 1,000 m")
+
+
 class EventKind(StrEnum):
     """What can go wrong on a drive, in the words of the 2019 CARLA challenge."""
 

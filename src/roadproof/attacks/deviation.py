@@ -132,7 +132,8 @@ class DeviationMeasure:
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""
         # The variation is in the fingerprint of the steering shift.
-        more = repr((self._starts, self.every, self._saturation_m, [each.vehicle for each in self.worlds]))
+        worlds = [(each.vehicle, each.recordings.obstacles) for each in self.worlds]
+        more = repr((self._starts, self.every, self._saturation_m, worlds))
         return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
 
     def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:

@@ -24,7 +24,7 @@ from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
 from roadproof.roads.marks import marks_of
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, obstacles_of
 
 WORST_PX = 3.0
 LEAST_SHARE = 0.5
@@ -186,6 +186,7 @@ def calibrate(
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
         canvas=settings.scenario.canvas,
         marks=marks_of(simulator, settings.scenario),
+        obstacles=obstacles_of(simulator, settings.scenario),
     )
     return Calibrated(recordings, report, _parts(drives, method))
 

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
-from torch import Tensor
 
 from roadproof.compositing.raster import composite_raster
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
@@ -130,7 +129,8 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     def identity(self) -> str:
         """A hash of frames, poses, colours and vehicle: other recordings are another world."""
         recordings = self._world.recordings
-        found = hashlib.sha256(repr((asdict(self._world.vehicle), recordings.colour.to_dict())).encode())
+        said = (asdict(self._world.vehicle), recordings.colour.to_dict(), recordings.obstacles)
+        found = hashlib.sha256(repr(said).encode())
         for drive in recordings.recordings:
             track = drive.track
             arrays: list[Any] = [drive.frames, drive.frame_number, drive.image_from_canvas]
@@ -203,8 +203,8 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         return drive
 
     def _advance(self, drive: _Drive, control: Control) -> None:
-        pedals = (self._one(value) for value in (control.steer, control.throttle, control.brake))
-        self._put(drive, self._world.vehicle.step(drive.car, *pedals))
+        controls = torch.tensor([[control.steer, control.throttle, control.brake]], dtype=torch.float64)
+        self._put(drive, self._world.step(drive.car, controls.to(self._world.device)))
 
     def _put(self, drive: _Drive, car: Motion) -> None:
         drive.car, drive.state = car, self._state(car)
@@ -219,9 +219,6 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         if abs(c * dx + s * dy) > SAME_PLACE_M or not RecordedGap(0.0, -right_m, turned).inside:
             return Start()
         return Start(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
-
-    def _one(self, value: float) -> Tensor:
-        return torch.tensor([value], dtype=torch.float64, device=self._world.device)
 
     def _state(self, car: Motion) -> VehicleState:
         canvas = self._world.bank.canvas

@@ -21,6 +21,7 @@ from roadproof.driving.deviation import deviation_m
 from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
+from roadproof.recorded.obstacles import Obstacles
 from roadproof.recorded.pictures import FrameBank, Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recordings import RecordingSet
@@ -114,6 +115,9 @@ class RecordedWorld:
         tracks = [drive.track for drive in recordings.recordings if drive.track is not None]
         self.vehicle = vehicle or Vehicle.identified(tracks)
         self.course = Course(clean.track, self.bank.canvas, int(clean.frame_number[0]), device=device)
+        path = torch.stack(self.course.poses[:2], 1).cpu().numpy()
+        middle = (self.course.canvas.x_m, self.course.canvas.y_m)
+        self.obstacles = Obstacles(recordings.obstacles or (), path, middle, device=device)
         self._shown_m = float(self.course.locate(self.bank.poses).s_m.max()) + PAST_M
         self.device = self.bank.device
 
@@ -180,10 +184,14 @@ class RecordedWorld:
                 controls = torch.cat([steer[:, None], pedals], 1)
             here = (car.x_m, car.y_m, car.yaw_rad, car.speed_mps, place.right_m)
             rows.append((*here, controls[:, 0], gap.ahead_m, gap.left_m, gap.turned_rad))
-            car = self.vehicle.step(car, *controls.unbind(1))
+            car = self.step(car, controls)
         columns = [torch.stack(each, 1) for each in zip(*rows, strict=True)]
         columns[0], columns[1] = columns[0] + course.canvas.x_m, columns[1] + course.canvas.y_m
         return Rolled(*columns)
+
+    def step(self, car: Motion, controls: Float[Tensor, "r 3"]) -> Motion:
+        """Where R cars are a time step later, given steer, throttle and brake; what stands in their way holds them."""
+        return self.obstacles.hold(car, self.vehicle.step(car, *controls.unbind(1)), self.vehicle.dt_s)
 
     def whole_path(self, rolled: Rolled, index: int) -> Float[np.ndarray, "n 2"]:
         """World x, y of one drive at all instants at which the canvas is in view.

@@ -1,7 +1,8 @@
 """Recorded drives on disk: folders that explain themselves, checked when they are read.
 
     SET/recordings.json        what this is: format, version, units, camera, crop and resize, colour transform, the
-                               canvas' place and the lane marks on it (null where they are not known), drives
+                               canvas' place, the lane marks on it and what stands beside it (null where they are
+                               not known), drives
     SET/DRIVE/drive.npz        per frame: frame number, homography, speed, command, steer
     SET/DRIVE/frames/N.png     the controller's input, unpainted; or all of them in SET/DRIVE/frames.npy
     SET/DRIVE/shading.npz      optional: gain, offset and visibility of every pixel (see `photometry.PixelMaps`)
@@ -21,6 +22,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
+from roadproof.datatypes import Obstacle
 from roadproof.errors import ColourError, OutputError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_archive, read_array, write_archive
@@ -40,6 +42,7 @@ _UNITS = {
     "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
     "canvas": "its middle and extents in m, yaw in rad: direction of travel, in a right-handed world with z up",
     "marks": "middle lines in m on the canvas, x from its left edge, y from its far edge; width in m, paint as #rrggbb",
+    "obstacles": "boxes on the ground in that world, m; yaw in rad: the direction of their length, left positive",
     "track": "steps numbered as frames, dt_s apart; x_m, y_m, yaw_rad (left positive) of the vehicle's origin in that "
     "world, speed in m/s; steer, throttle and brake as given at each step and held until the next",
 }
@@ -71,6 +74,7 @@ class _Manifest:
     colour: ColourTransform
     canvas: CanvasPlacement | None = None
     marks: tuple[LaneMark, ...] | None = None
+    obstacles: tuple[Obstacle, ...] | None = None
     drives: tuple[_Drive, ...]
 
     def __post_init__(self) -> None:
@@ -149,6 +153,7 @@ def _manifest(recordings: RecordingSet) -> _Manifest:
         colour=recordings.colour,
         canvas=recordings.canvas,
         marks=recordings.marks,
+        obstacles=recordings.obstacles,
         drives=tuple(
             _Drive(name=each.name, side=each.side, frames=len(each.frames), weather=each.weather)
             for each in recordings.recordings
@@ -195,6 +200,7 @@ def load_recordings(folder: AnyPath) -> RecordingSet:
         origin=manifest.origin,
         canvas=manifest.canvas,
         marks=manifest.marks,
+        obstacles=manifest.obstacles,
     )
 
 

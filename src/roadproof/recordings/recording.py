@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from roadproof.datatypes import Command
+from roadproof.datatypes import Command, Obstacle
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
 from roadproof.io.files import check_name
@@ -133,6 +133,7 @@ class RecordingSet:
         origin: where the drives come from, in words.
         canvas: place of the canvas in the world of the tracks; None if it is not known.
         marks: lane marks on the canvas and near it; None if they are not known.
+        obstacles: what a car could run into near the canvas, in the world of the tracks; None if it is not known.
 
     Raises:
         RecordingError: there is no drive, two have one name, or frames have another size than the controller's input.
@@ -145,6 +146,7 @@ class RecordingSet:
     origin: str = ""
     canvas: CanvasPlacement | None = None
     marks: tuple[LaneMark, ...] | None = None
+    obstacles: tuple[Obstacle, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.recordings:

@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from roadproof.datatypes import Control, Observation, Weather
+from roadproof.datatypes import Control, Observation, Obstacle, Weather
 from roadproof.geometry import CameraModel, CropResize, Homography
 from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
@@ -146,6 +146,29 @@ class OpenWorld(Protocol):
     def pedestrians(self) -> Agents:
         """The people as they are now."""
         ...
+
+
+@runtime_checkable
+class Furnished(Protocol):
+    """A simulator that knows what stands beside its roads."""
+
+    def obstacles(self, scenario: Scenario) -> tuple[Obstacle, ...]:
+        """What a car could run into, within `BESIDE_M` of a scenario's canvas."""
+        ...
+
+
+BESIDE_M = 40.0
+"""Obstacles further from the canvas than this are out of reach while it is in view."""
+
+
+def obstacles_of(simulator: object, scenario: Scenario) -> tuple[Obstacle, ...] | None:
+    """What stands beside a scenario's canvas; None where the simulator does not know.
+
+    Raises:
+        SimulatorError: the simulator does not answer.
+        ScenarioError: the simulator has no such map.
+    """
+    return simulator.obstacles(scenario) if isinstance(simulator, Furnished) else None
 
 
 @runtime_checkable

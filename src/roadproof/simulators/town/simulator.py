@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from roadproof.datatypes import Control, Observation
+from roadproof.datatypes import Control, Observation, Obstacle
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, Homography, homography_from_pose
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
-from roadproof.simulators.protocol import PaintKind
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import BESIDE_M, PaintKind
 from roadproof.simulators.town.engine import make_pipe
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
@@ -74,6 +75,25 @@ class TownSimulator(RouteSimulator[_Drive]):
             ScenarioError: there is no such map, or it cannot be read.
         """
         return load_map(name)
+
+    def obstacles(self, scenario: Scenario) -> tuple[Obstacle, ...]:
+        """What a car could run into near a scenario's canvas; it needs no drive.
+
+        Raises:
+            ScenarioError: there is no such map, or it cannot be read.
+        """
+        canvas = scenario.canvas
+        return tuple(
+            Obstacle(
+                x_m=solid.pose.x_m,
+                y_m=solid.pose.y_m,
+                yaw_rad=solid.pose.yaw_rad,
+                half_length_m=solid.half_m[0],
+                half_width_m=solid.half_m[1],
+            )
+            for solid in build_scenery(load_map(scenario.map_name)).solids
+            if math.hypot(solid.pose.x_m - canvas.x_m, solid.pose.y_m - canvas.y_m) < BESIDE_M
+        )
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px.
