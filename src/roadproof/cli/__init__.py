@@ -26,6 +26,7 @@ from roadproof.cli.convert_cil import convert_cil
 from roadproof.cli.demo import demo
 from roadproof.cli.drive import drive
 from roadproof.cli.evaluate import evaluate
+from roadproof.cli.group import Verbs
 from roadproof.cli.harden import harden
 from roadproof.cli.import_ import import_
 from roadproof.cli.open_ import open_
@@ -40,10 +41,9 @@ from roadproof.errors import RoadproofError
 from roadproof.foreign import LIMIT_S, end_calls_after
 from roadproof.memory import keep_freed_memory
 
-app = typer.Typer(
-    no_args_is_help=True,
+app = Verbs(
+    "Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
     pretty_exceptions_enable=False,
-    help="Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
 )
 VERBS = (
     verb(demo, estimates=True),

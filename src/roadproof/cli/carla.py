@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from roadproof.cli.group import Verbs
 from roadproof.cli.options import number, unset
 
-carla = typer.Typer(no_args_is_help=True, add_completion=False, help="CARLA: serve the town as one, examine a server.")
+carla = Verbs("CARLA: serve the town as one, examine a server.")
 
 Host = Annotated[str, typer.Option(help="Address of the server.")]
 Port = Annotated[int, number("Port of its calls; sensor data goes through the next.", 1, 65534)]

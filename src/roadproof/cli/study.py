@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from roadproof.cli.group import Verbs
 from roadproof.cli.options import number
 from roadproof.cli.verbs import begin, verb
 from roadproof.limits import MAX_PROCESSES
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 _TRUST = typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
 
-study = typer.Typer(no_args_is_help=True, add_completion=False, help="Compare methods over many scenarios.")
+study = Verbs("Compare methods over many scenarios.")
 
 
 def run(

@@ -1,0 +1,41 @@
+"""Verbs and groups of verbs whose help names no type beside what takes no value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+
+def _plain(options: list[Any]) -> list[Any]:
+    for option in options:
+        if getattr(option, "is_flag", False):
+            option.metavar = ""
+    return options
+
+
+class _Verb(TyperCommand):
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401  # typer brings click along, in a place that changes
+        return _plain(super().get_params(ctx))
+
+
+class _Group(TyperGroup):
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401
+        return _plain(super().get_params(ctx))
+
+
+class Verbs(typer.Typer):
+    """A group of verbs, which says its help where no verb is given.
+
+    Args:
+        about: what the verbs are for, for the help.
+        **more: what `typer.Typer` takes besides.
+    """
+
+    def __init__(self, about: str, **more: Any) -> None:
+        super().__init__(cls=_Group, no_args_is_help=True, help=about, **more)
+
+    def command(self, name: str | None = None, **more: Any) -> Any:  # noqa: ANN401
+        """What makes a function a verb of the group, as `typer.Typer.command` does."""
+        return super().command(name, cls=_Verb, **more)
