@@ -61,7 +61,7 @@ def test_mistakes_are_one_clear_line(demo, tmp_path):
         ),
         (["--controller", "resnet"], "no controller called 'resnet'"),
         (["--simulator", "moon"], "moon"),
-        (["--processes", "0"], "--processes is 0, expected 1"),
+        (["--processes", "-1"], "--processes is -1, expected 0"),
         (["--rounds", "-1"], "--rounds is -1, expected 0 to"),
         (["--processes", "2", "--simulator", "carla://localhost:2000"], "would step the one server"),
     ):

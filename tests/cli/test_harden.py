@@ -6,13 +6,13 @@ import pytest
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--scenarios", "left-08", "--judge-on", "right-07"], "left-08 is trained on and right-07 judged on"),
-        (["--scenarios", "left-99"], "did you mean"),
-        (["--scenarios", ","], "there is no scenario to train on"),
-        (["--scenarios", "left-07", "--rounds", "0"], "--rounds is 0, expected 1 to"),
-        (["--scenarios", "left-07", "--budget", "endless"], "--budget is 'endless', expected one of quick, full"),
-        (["--scenarios", "left-07", "--training-step", "nowhere:step"], "cannot import nowhere:step"),
-        (["--scenarios", "left-07", "--simulator", "moon"], "moon"),
+        (["--train-on", "left-08", "--judge-on", "right-07"], "left-08 is trained on and right-07 judged on"),
+        (["--train-on", "left-99"], "did you mean"),
+        (["--train-on", ","], "there is no scenario to train on"),
+        (["--train-on", "left-07", "--rounds", "0"], "--rounds is 0, expected 1 to"),
+        (["--train-on", "left-07", "--budget", "endless"], "--budget is 'endless', expected one of quick, full"),
+        (["--train-on", "left-07", "--training-step", "nowhere:step"], "cannot import nowhere:step"),
+        (["--train-on", "left-07", "--simulator", "moon"], "moon"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
 )
@@ -33,7 +33,7 @@ def test_mistakes_are_one_line_before_anything_is_driven(invoke, tmp_path, words
     ],
 )
 def test_controllers_that_cannot_learn_are_one_line(invoke, tmp_path, controller, message):
-    code, printed = invoke("harden", controller, "--scenarios", "left-07", "--out", tmp_path / "out")
+    code, printed = invoke("harden", controller, "--train-on", "left-07", "--out", tmp_path / "out")
     assert code == 2
     assert message in printed.err
     assert printed.err.count("\n") == 1

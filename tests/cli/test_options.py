@@ -1,8 +1,11 @@
 """Numbers out of range are refused in one line, before any work, with the range in the line and in the help."""
 
 import pytest
+from rich.markup import render
+from typer.main import get_command
 
 from command import roadproof
+from roadproof.cli import app
 
 ATTACK = ("attack", "nowhere", "--controller", "pilotnet")
 EVALUATE = ("evaluate", "nowhere.json", "--controller", "pilotnet")
@@ -15,7 +18,7 @@ REFUSED = [
     ((*ATTACK, "--max-painted-share", "nan"), "--max-painted-share is nan, expected 0.0 to 1.0"),
     ((*EVALUATE, "--random", "-1"), "--random is -1, expected 0 to"),
     ((*EVALUATE, "--runs", "-1"), "--runs is -1, expected 0 to"),
-    ((*EVALUATE, "--processes", "-3"), "--processes is -3, expected 1 to 256"),
+    ((*EVALUATE, "--processes", "-3"), "--processes is -3, expected 0 to 256"),
     (("drive", "--cars", "1000000"), "--cars is 1000000, expected 0 to 500"),
     (("demo", "--rounds", "-1"), "--rounds is -1, expected 0 to"),
     (("record", "left-03", "--frames", "0"), "--frames is 0, expected 1 to"),
@@ -36,10 +39,52 @@ def test_a_number_out_of_range_is_one_line(invoke, words, said):
     assert printed.out == ""
 
 
-def test_the_help_states_the_range(invoke):
-    code, printed = invoke("attack", "--help")
-    assert code == 0
-    assert "[1 to 64]" in printed.out
+def every_verb():
+    """The words and the options of every verb."""
+
+    def verbs(group, words):
+        for name, each in group.commands.items():
+            yield from verbs(each, (*words, name)) if hasattr(each, "commands") else [((*words, name), each.params)]
+
+    return list(verbs(get_command(app), ()))
+
+
+def test_the_help_states_ranges_and_defaults_and_no_type_beside_flags(invoke, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    for words in ((), *(words for words, _ in every_verb())):
+        code, printed = invoke(*words, "--help")
+        assert code == 0
+        assert "<bool>" not in printed.out
+        if words == ("attack",):
+            assert "[1 to 64] [default: 5]" in printed.out
+            assert "[default: (100; 32 for a deviation)]" in printed.out
+
+
+def test_the_help_is_shown_as_it_is_written():
+    """Square brackets around words would be read as markup, and be gone."""
+    for words, options in every_verb():
+        for option in options:
+            assert render(option.help or "").plain == option.help, words
+
+
+SAME = ("scenarios", "simulator", "device", "processes", "seed", "trust")
+WORLDS = "Where it is driven: town, carla://HOST:PORT, or recorded:FOLDER for a prediction in recordings."
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_an_option_means_the_same_in_every_verb(name):
+    found = [option for _, options in every_verb() for option in options if option.name == name]
+    assert len(found) > 1
+    assert {tuple(option.opts) for option in found} == {(f"--{name}",)}
+    assert len({option.help for option in found} - {WORLDS}) == 1
+
+
+@pytest.mark.parametrize(("verb", "words"), [("train", []), ("drive", []), ("record", ["left-03"])])
+def test_a_device_that_is_not_there_is_refused_before_any_work(invoke, tmp_path, verb, words):
+    code, printed = invoke(verb, *words, "--device", "tpu", "--out", tmp_path / "out")
+    assert (code, printed.out) == (2, "")
+    assert printed.err.startswith("roadproof: device 'tpu' is unknown")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

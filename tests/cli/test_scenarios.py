@@ -27,7 +27,7 @@ def test_all_40_are_listed_once(scenarios):
 def test_a_list_of_ones_own_is_listed_and_drawn(scenarios, tmp_path):
     first = builtin_scenarios()[0]
     save_scenarios([dataclasses.replace(first, name="my [first]", time_limit_s=77.0)], tmp_path / "own.toml")
-    code, printed = scenarios("--file", tmp_path / "own.toml", "--out", tmp_path / "map.png")
+    code, printed = scenarios("--scenarios", tmp_path / "own.toml", "--out", tmp_path / "map.png")
     assert code == 0, printed.err
     assert "my [first]" in printed.out
     assert "77" in printed.out
@@ -40,8 +40,8 @@ def test_mistakes_are_one_clear_line(scenarios, tmp_path):
     save_scenarios([dataclasses.replace(first, map_name="city")], tmp_path / "city.toml")
     (tmp_path / "file").write_text("")
     for options, message in (
-        (["--file", tmp_path / "none.toml"], "cannot read"),
-        (["--file", tmp_path / "city.toml"], "has no map 'city'"),
+        (["--scenarios", tmp_path / "none.toml"], "cannot read"),
+        (["--scenarios", tmp_path / "city.toml"], "has no map 'city'"),
         (["--out", tmp_path / "file" / "map.png"], "cannot write"),
         (["--out", tmp_path / "map.mp3"], "cannot be drawn"),
     ):

@@ -64,9 +64,9 @@ GATES = {
     ("calibrate",): ("nowhere",), ("report",): ("nowhere",), ("select",): ("nowhere", "--controller", "nosuch"),
     ("attack",): ("nowhere", "--controller", "nosuch"), ("evaluate",): ("nowhere.json", "--out", NOWHERE),
     ("check",): ("nowhere.toml",), ("check-controller",): ("nosuch",), ("convert-cil",): ("nowhere.npz", NOWHERE),
-    ("harden",): ("nosuch", "--scenarios", "nosuch", "--out", NOWHERE), ("record",): ("left-03", "--out", NOWHERE),
+    ("harden",): ("nosuch", "--train-on", "nosuch", "--out", NOWHERE), ("record",): ("left-03", "--out", NOWHERE),
     ("study", "run"): ("nowhere.toml",), ("study", "tables"): ("nowhere",), ("controllers",): ("nosuch",),
-    ("study", "transfer"): ("nowhere.toml", "--controllers", "nosuch"), ("scenarios",): ("--file", "nowhere.toml"),
+    ("study", "transfer"): ("nowhere.toml", "--controllers", "nosuch"), ("scenarios",): ("--scenarios", "nowhere.toml"),
     ("carla", "scenario"): ("--port", "0", "0", "1"), ("carla", "doctor"): ("--port", "0"),
     ("carla", "serve"): ("--map", "nowhere.xodr"),
 }  # fmt: skip

@@ -122,7 +122,7 @@ def harden(given: Path) -> list[str]:
         for name, begin_m in (("near", 15.0), ("far", 115.0))
     ]
     save_scenarios(streets, given / "scenarios.toml")
-    where = ["--scenarios", "near", "--judge-on", "far", "--scenario-file", f"{given}/scenarios.toml"]
+    where = ["--train-on", "near", "--judge-on", "far", "--scenarios", f"{given}/scenarios.toml"]
     return ["harden", "pilotnet", *where, "--rounds", "1", "--figures", "1", "--device", "cpu"]
 
 

@@ -41,10 +41,7 @@ from roadproof.errors import RoadproofError
 from roadproof.foreign import LIMIT_S, end_calls_after
 from roadproof.memory import keep_freed_memory
 
-app = Verbs(
-    "Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.",
-    pretty_exceptions_enable=False,
-)
+app = Verbs("Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.")
 VERBS = (
     verb(demo, estimates=True),
     import_,

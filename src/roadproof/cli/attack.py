@@ -12,7 +12,7 @@ from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import say
 from roadproof.cli.paint import Paint, with_paint
 from roadproof.cli.verbs import begin
-from roadproof.limits import MANY, MAX_SEED
+from roadproof.limits import MANY
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult
@@ -30,17 +30,17 @@ def attack(
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
     albedo: Annotated[tuple[float, float], number("Darkest and brightest paint.", 0.0, 1.0)] = (0.0, 1.0),
     max_painted_share: Annotated[
-        float | None, number("Largest share of the canvas that may be painted.", 0.0, 1.0, show_default=False)
+        float | None, number("Largest share of the canvas that may be painted.", 0.0, 1.0, default=False)
     ] = None,
     objective: Annotated[
         str | None,
         unset(
-            "deviation: metres aside, driven in the recordings; steering: shift on recorded frames, as published."
-            "  [default: deviation where the set has poses and both sides]"
+            "deviation: metres aside, driven in the recordings; steering: shift on recorded frames, as published.",
+            default="deviation where the set has poses and both sides",
         ),
     ] = None,
     groups: Annotated[
-        str | None, unset("Drives attacked together: clean+right,clean+left, or all.  [default: by method]")
+        str | None, unset("Drives attacked together: clean+right,clean+left, or all.", default="by method")
     ] = None,
     method: Annotated[
         str,
@@ -50,31 +50,23 @@ def attack(
         ),
     ] = "gradopt",
     iterations: Annotated[
-        int | None, number("gradopt: last steps.  [default: 100; 32 for a deviation]", 1, MANY, show_default=False)
+        int | None, number("gradopt: last steps.", 1, MANY, default="100; 32 for a deviation")
     ] = None,
     restarts: Annotated[
-        int | None,
-        number(
-            "gradopt, published: patterns of every group searched to the end.  [default: 4]",
-            1,
-            1000,
-            show_default=False,
-        ),
+        int | None, number("gradopt, published: patterns of every group searched to the end.", 1, 1000, default="4")
     ] = None,
     masks: Annotated[
-        str | None, unset("published: binary, as the code, or antialiased, as the text.  [default: binary]")
+        str | None, unset("published: binary, as the code, or antialiased, as the text.", default="binary")
     ] = None,
-    calls: Annotated[
-        int | None, number("Without gradients: patterns tried.  [default: 1000]", 1, MANY, show_default=False)
-    ] = None,
+    calls: Annotated[int | None, number("Without gradients: patterns tried.", 1, MANY, default="1000")] = None,
     random_patterns: Annotated[
         int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
     ] = 100,
     cheapest: options.CheapestFor = None,
-    seed: Annotated[int, number("Of the random starts.", 0, MAX_SEED)] = 0,
+    seed: options.Seed = 0,
     device: options.Device = "cpu",
     dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/attack"),
+    out: options.Out = Path("out/attack"),
     *,
     paint: Paint,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import argument, check_simulator, choice
+from roadproof.cli.options import SimulatorSpec, argument, choice
 from roadproof.cli.output import say
 
 if TYPE_CHECKING:
@@ -23,9 +23,7 @@ def calibrate(
             "colours, homographies from the poses; published: coloured points and 22 colours."
         ),
     ] = "two-paint",
-    simulator: Annotated[
-        str, typer.Option(help="Where the drives were recorded: town, or carla://HOST:PORT.")
-    ] = "town",
+    simulator: SimulatorSpec = "town",
 ) -> None:
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209
@@ -38,7 +36,6 @@ def calibrate(
     from roadproof.io.locks import hold
     from roadproof.simulators.loading import open_simulator
 
-    check_simulator(simulator)
     how = choice(method, "method", METHODS)
     runs = [folder] if (folder / "record").is_dir() else sorted(path.parent for path in folder.glob("*/record"))
     if not runs:

@@ -72,7 +72,7 @@ def doctor(host: Host = "127.0.0.1", port: Port = 2000) -> None:
 def scenario(
     start: Annotated[int, typer.Argument(help="Number of the spawn point where the drive starts.")],
     goal: Annotated[int, typer.Argument(help="Number of the spawn point it leads to.")],
-    out: Annotated[Path, typer.Option(help="TOML file to write.")] = Path("carla.toml"),
+    out: Annotated[Path, typer.Option(help="TOML file for the scenarios.")] = Path("carla.toml"),
     canvas_at_m: Annotated[float, number("From the start to the middle of the canvas.", 0.0, 10_000.0)] = 25.0,
     name: Annotated[str | None, unset("Of the scenario; else MAP-START-GOAL.")] = None,
     map_name: Annotated[

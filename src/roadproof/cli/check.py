@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import Device, Processes, check_simulator, choice
+from roadproof.cli.options import Device, Out, Processes, Trust, argument, check_simulator, choice, unset
 from roadproof.cli.verbs import begin, is_dry_run
 
 if TYPE_CHECKING:
@@ -19,26 +19,21 @@ if TYPE_CHECKING:
 
 
 def check(
-    plan: Annotated[Path, typer.Argument(help="TOML file that says what is driven, and what passes.")],
+    plan: Annotated[Path, argument("TOML file that says what is driven, and what passes.")],
     budget: Annotated[
         str | None,
-        typer.Option(
-            help="smoke: stored and random patterns in recordings; full: in the simulator, with fresh attacks."
-            "  [default: the plan's]",
-            show_default=False,
+        unset(
+            "smoke: stored and random patterns in recordings; full: in the simulator, with fresh attacks.",
+            default="the plan's",
         ),
     ] = None,
     accept: Annotated[
         bool, typer.Option("--accept", help="Compare with no reference; where all passes, this becomes it.")
     ] = False,
-    trust: Annotated[
-        bool, typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
-    ] = False,
+    trust: Trust = False,
     processes: Processes = 1,
     device: Device = "cpu",
-    out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
-        "out/check"
-    ),
+    out: Out = Path("out/check"),
 ) -> None:
     """Check a controller against stored, random and fresh patterns: exit code 0 passed, 1 not, 2 not run."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from roadproof.cli import options
-from roadproof.cli.options import number
+from roadproof.cli.options import argument
 from roadproof.cli.output import say
-from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
     from roadproof.controllers import ControllerReport
@@ -18,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def check_controller(
-    spec: Annotated[str, typer.Argument(help=f"What is checked: {options.CONTROLLERS}")],
+    spec: Annotated[str, argument(f"What is checked: {options.CONTROLLERS}")],
     scenarios: options.ScenarioFile = None,
     weather: options.WeatherName = "clear-noon",
     cars: options.Cars = 0,
     pedestrians: options.Pedestrians = 0,
-    processes: Annotated[int, number("Simulators that drive at once; 0: one a core.", 0, MAX_PROCESSES)] = 0,
+    processes: options.Processes = 0,
     drive: Annotated[bool, typer.Option(help="Also drive the scenarios.")] = True,
 ) -> None:
     """Check what attacks rely on, then drive every scenario and count those without any event."""
@@ -48,7 +46,7 @@ def check_controller(
     trials = [Trial(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in driven]
     scored: list[tuple[Trial, DrivingScore]] = []
     with progress("Driving", len(trials), "{:.0f} clean") as show:
-        for done in score_drives(trials, spec, processes=processes or os.cpu_count() or 1):
+        for done in score_drives(trials, spec, processes=processes):
             scored.append(done)
             show(len(scored), sum(score.clean for _, score in scored))
     _say_scores(scored)

@@ -15,7 +15,7 @@ def compare(
     folders: Annotated[
         list[Path], argument("Two runs or more, such as before and after a fix; the first is compared with.")
     ],
-    out: Annotated[Path, typer.Option(help="The page.")] = Path("out/compare.html"),
+    out: Annotated[Path, typer.Option(help="File for the page.")] = Path("out/compare.html"),
 ) -> None:
     """Compare runs: one page with their numbers, paths and patterns side by side."""
     from roadproof.report.comparison import write_comparison

@@ -15,7 +15,6 @@ from roadproof.cli.options import number
 from roadproof.cli.output import say
 from roadproof.cli.paint import Paint, with_paint, words
 from roadproof.cli.verbs import begin
-from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.pipeline.stress_test import StressTest
@@ -37,13 +36,11 @@ def demo(
     ] = "clear-noon",
     figures: options.Figures = 5,
     cheapest: options.CheapestFor = None,
-    seed: Annotated[int, number("Of recording, search and traffic.", 0, MAX_SEED)] = 0,
+    seed: options.Seed = 0,
     simulator: options.SimulatorSpec = "town",
     device: options.Device = "cpu",
     processes: options.Processes = 1,
-    out: Annotated[Path, typer.Option(help="Folder for the run; the same folder goes on where it was.")] = Path(
-        "out/demo"
-    ),
+    out: options.Out = Path("out/demo"),
     *,
     paint: Paint,
 ) -> None:

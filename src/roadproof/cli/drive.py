@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from roadproof.cli import options
-from roadproof.cli.options import number, unset
+from roadproof.cli.options import unset
 from roadproof.cli.output import say
 from roadproof.cli.worlds import world_asked
-from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.datatypes import Control, Observation
@@ -25,17 +22,21 @@ def drive(
     driver: options.DriverSpec = "expert",
     weather: Annotated[
         str | None,
-        unset("One of the eight, for instance rainy-noon; clear-noon by default, or that of the recordings."),
+        unset(
+            "One of the eight, for instance rainy-noon.",
+            options.weather_names,
+            default="clear-noon, or that of the recordings",
+        ),
     ] = None,
     pattern: Annotated[
         Path | None, unset("pattern.json of an attack, or a 400×400 picture, painted on the road.")
     ] = None,
     cars: options.Cars = 0,
     pedestrians: options.Pedestrians = 0,
-    seed: Annotated[int, number("Of the other cars and the people.", 0, MAX_SEED)] = 0,
+    seed: options.Seed = 0,
     simulator: options.WorldSpec = "town",
     device: options.Device = "cpu",
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/drive"),
+    out: options.NewOut = Path("out/drive"),
 ) -> None:
     """Drive a scenario and film it."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.

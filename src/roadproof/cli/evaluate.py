@@ -15,7 +15,7 @@ from roadproof.cli.output import say, table
 from roadproof.cli.verbs import begin
 from roadproof.cli.worlds import open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
-from roadproof.limits import MAX_CROWD, MAX_SEED
+from roadproof.limits import MAX_CROWD
 
 if TYPE_CHECKING:
     from roadproof.driving.evaluation import Evaluation
@@ -30,8 +30,9 @@ def evaluate(
     weathers: Annotated[
         str | None,
         unset(
-            "Weathers, with commas between; the paper's four by default, or that of the recordings.",
+            "Weathers, with commas between.",
             options.weather_names,
+            default="the paper's four, or that of the recordings",
         ),
     ] = None,
     starts: Annotated[
@@ -47,10 +48,10 @@ def evaluate(
     runs: Annotated[
         int | None,
         number(
-            "Drives with traffic in each weather, besides those alone; 10 by default, 0 in recordings.",
+            "Drives with traffic in each weather, besides those alone; the seed counts on from one to the next.",
             0,
             10_000,
-            show_default=False,
+            default="10, or 0 in recordings",
         ),
     ] = None,
     cars: Annotated[int, number("Other cars in those.", 0, MAX_CROWD)] = 20,
@@ -60,11 +61,9 @@ def evaluate(
     film: Annotated[bool, typer.Option(help="Film the first weather's drive without and with paint.")] = True,
     processes: options.Processes = 1,
     simulator: options.WorldSpec = "town",
-    seed: Annotated[int, number("Of the first run with traffic; the others count on.", 0, MAX_SEED)] = 0,
+    seed: options.Seed = 0,
     device: options.Device = "cpu",
-    out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
-        "out/evaluation"
-    ),
+    out: options.Out = Path("out/evaluation"),
 ) -> None:
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.

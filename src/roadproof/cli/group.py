@@ -30,11 +30,10 @@ class Verbs(typer.Typer):
 
     Args:
         about: what the verbs are for, for the help.
-        **more: what `typer.Typer` takes besides.
     """
 
-    def __init__(self, about: str, **more: Any) -> None:
-        super().__init__(cls=_Group, no_args_is_help=True, help=about, **more)
+    def __init__(self, about: str) -> None:
+        super().__init__(cls=_Group, no_args_is_help=True, help=about, pretty_exceptions_enable=False)
 
     def command(self, name: str | None = None, **more: Any) -> Any:  # noqa: ANN401
         """What makes a function a verb of the group, as `typer.Typer.command` does."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from roadproof.cli.options import CONTROLLERS, Figures, ScenarioFile, SimulatorSpec, check_simulator, choice, number
+from roadproof.cli import options
+from roadproof.cli.options import argument, choice, number, unset
 from roadproof.cli.paint import Paint, with_paint
 from roadproof.cli.verbs import begin
-from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
@@ -22,36 +22,28 @@ if TYPE_CHECKING:
 
 @with_paint
 def harden(
-    controller: Annotated[str, typer.Argument(help=f"A torch.nn.Module: {CONTROLLERS}", show_default=False)],
-    scenarios: Annotated[str, typer.Option(help="Scenarios to train on, with commas between.", show_default=False)],
-    judge_on: Annotated[
-        str, typer.Option(help="Scenarios on other streets to judge on, with commas between.", show_default=False)
-    ] = "",
+    controller: Annotated[str, argument(f"A torch.nn.Module: {options.CONTROLLERS}")],
+    train_on: Annotated[str, unset("Scenarios to train on, with commas between.")],
+    judge_on: Annotated[str, unset("Scenarios on other streets to judge on, with commas between.")] = "",
     clean_on: Annotated[
-        str,
-        typer.Option(
-            help="Scenarios driven over the bare road before and after: all, or names; those above by default.",
-            show_default=False,
-        ),
+        str, unset("Scenarios driven over the bare road before and after: all, or names.", default="those above")
     ] = "",
-    scenario_file: ScenarioFile = None,
+    scenarios: options.ScenarioFile = None,
     rounds: Annotated[int, number("Rounds of attack, tuning and re-test.", 1, 100)] = 2,
     budget: Annotated[str, typer.Option(help="quick or full.")] = "quick",
     training_step: Annotated[
-        str | None,
-        typer.Option(help="module:function(model, batch) that gives the loss, where the usual does not fit."),
+        str | None, unset("module:function(model, batch) that gives the loss, where the usual does not fit.")
     ] = None,
-    figures: Figures = 5,
-    seed: Annotated[int, number("Of everything; judging has fresh ones.", 0, MAX_SEED)] = 0,
-    simulator: SimulatorSpec = "town",
-    device: Annotated[str, typer.Option(help="cpu, cuda or cuda:N; a GPU where there is one.")] = "auto",
-    out: Annotated[Path, typer.Option(help="Folder; the same folder goes on where it was.")] = Path("out/harden"),
+    figures: options.Figures = 5,
+    seed: options.Seed = 0,
+    simulator: options.SimulatorSpec = "town",
+    device: options.Device = "auto",
+    out: options.Out = Path("out/harden"),
     *,
     paint: Paint,
 ) -> None:
     """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on streets not trained on."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    import torch
     from rich.console import Console
 
     from roadproof.cli.progress import stages
@@ -60,27 +52,25 @@ def harden(
     from roadproof.hardening.harden import harden as run
     from roadproof.hardening.page import write_hardening
     from roadproof.hardening.tuning import training_step as usual_step
-    from roadproof.scenarios import BUILTIN_FILE, find_scenario, load_scenarios
+    from roadproof.scenarios import find_scenario
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
-    known = load_scenarios(scenario_file or BUILTIN_FILE)
+    known = options.scenarios_of(scenarios)
 
     def named(names: str) -> list[Scenario]:
         return [find_scenario(name.strip(), known) for name in names.split(",") if name.strip()]
 
     spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))].varied(paint.variation)
-    training, judging = named(scenarios), named(judge_on)
+    training, judging = named(train_on), named(judge_on)
     step = (
         usual_step
         if training_step is None
         else cast("TrainingStep", imported(training_step, "a function of model and batch that gives the loss"))
     )
-    check_simulator(simulator)
     check_streets(training, judging)
     load_trainable(controller)
-    on = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-    begin(_estimate(spent, load_controller(controller, device=on), rounds, len(training), len(judging)), out)
+    begin(_estimate(spent, load_controller(controller, device=device), rounds, len(training), len(judging)), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,
@@ -94,7 +84,7 @@ def harden(
             space=SearchSpace(figures=figures, limits=paint.limits),
             training_step=step,
             seed=seed,
-            device=on,
+            device=device,
             on_progress=show,
         )
     page = write_hardening(found, out)

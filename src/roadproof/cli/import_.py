@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from roadproof.cli.options import argument
+from roadproof.cli.options import NewOut, argument
 from roadproof.cli.output import say
 
 
 def import_(
     folder: Annotated[Path, argument("Your pictures and tables, with drives.toml; see docs/recordings.md.")],
-    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("out/recordings"),
+    out: NewOut = Path("out/recordings"),
 ) -> None:
     """Make recordings of drives of your own: pictures, and a table of poses and controls."""
     from roadproof.drives.own import import_drives, preview

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 import typer
 
 from roadproof.errors import RoadproofError
-from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES
+from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES, MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
@@ -20,16 +21,25 @@ if TYPE_CHECKING:
     from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
+RECORDED = "recorded:"
 
 
-def number(about: str, least: int | float, most: int | float, *, show_default: bool = True) -> Any:  # noqa: ANN401
+def number(
+    about: str,
+    least: int | float,
+    most: int | float,
+    *,
+    default: bool | str = True,
+    meant: Callable[[Any], Any] = lambda value: value,
+) -> Any:  # noqa: ANN401
     """An option that is a number in a range, which its help states; of several numbers, each is.
 
     Args:
         about: what the number is, for the help.
         least: the smallest value.
         most: the largest value.
-        show_default: whether the help shows the default.
+        default: whether the help shows the default, or what it says of the default instead.
+        meant: gives the verb's argument from the value.
     """
 
     # Typer tells parameters of its own types apart by annotation, and hands over others.
@@ -38,14 +48,14 @@ def number(about: str, least: int | float, most: int | float, *, show_default: b
         for each in cast("list[float]", value if several else [] if value is None else [value]):
             if not least <= each <= most:
                 raise RoadproofError(f"{parameter.opts[0]} is {each}, expected {least:,} to {most:,}")
-        return cast("Any", value)
+        return meant(value)
 
-    return typer.Option(help=f"{about}  [{least:,} to {most:,}]", show_default=show_default, callback=check)
+    return typer.Option(help=f"{about}  [{least:,} to {most:,}]", show_default=default, callback=check)
 
 
-def unset(about: str, complete: Callable[[str], list[str]] | None = None) -> Any:  # noqa: ANN401
-    """An option without a value of its own, so that the help shows no default."""
-    return typer.Option(help=about, show_default=False, autocompletion=complete)
+def unset(about: str, complete: Callable[[str], list[str]] | None = None, *, default: str = "") -> Any:  # noqa: ANN401
+    """An option without a value of its own; `default` is what the help says of that, if anything."""
+    return typer.Option(help=about, show_default=default or False, autocompletion=complete)
 
 
 def scenario_names(begun: str) -> list[str]:
@@ -64,6 +74,43 @@ def weather_names(begun: str) -> list[str]:
 def argument(about: str) -> Any:  # noqa: ANN401
     """An argument that must be given."""
     return typer.Argument(help=about, show_default=False)
+
+
+def _simulator(spec: str) -> str:
+    """What `--simulator` names, once it names a simulator; recordings are looked at by the verbs that drive in them.
+
+    Raises:
+        SimulatorError: no simulator has this name, or it is one that the verb cannot drive in.
+    """
+    if spec != "town":
+        # The road map comes with it; `--help` is spared.
+        from roadproof.simulators.loading import check_spec
+
+        check_spec(spec)
+    return spec
+
+
+def _world(spec: str) -> str:
+    """What `--simulator` names where that may also be recordings."""
+    return spec if spec.startswith(RECORDED) else _simulator(spec)
+
+
+def _device(device: str) -> str:
+    """The torch device that `--device` names.
+
+    Raises:
+        DeviceError: there is no such device.
+    """
+    if device == "cpu":
+        return device
+    # Torch takes seconds to import; most commands never come here.
+    import torch
+
+    from roadproof.controllers.loading import device_of
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return str(device_of(device))
 
 
 CONTROLLERS = (
@@ -87,36 +134,59 @@ ScenarioName: TypeAlias = Annotated[
 ScenarioOrRecorded: TypeAlias = Annotated[
     str | None,
     unset(
-        "One of those that `roadproof scenarios` lists; left-03 by default, or that of the recordings.", scenario_names
+        "One of those that `roadproof scenarios` lists.", scenario_names, default="left-03, or that of the recordings"
     ),
 ]
-ScenarioFile: TypeAlias = Annotated[Path | None, unset("TOML file with scenarios of your own; else the built-in 40.")]
+ScenarioFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option("--scenarios", help="TOML file with scenarios of your own.", show_default="the built-in 40"),
+]
 WeatherName: TypeAlias = Annotated[
     str, typer.Option(help="One of the eight, for instance rainy-noon.", autocompletion=weather_names)
 ]
-SimulatorSpec: TypeAlias = Annotated[str, typer.Option(help="Where it is driven: town, or carla://HOST:PORT.")]
+SimulatorSpec: TypeAlias = Annotated[
+    str, typer.Option("--simulator", help="Where it is driven: town, or carla://HOST:PORT.", callback=_simulator)
+]
 WorldSpec: TypeAlias = Annotated[
     str,
     typer.Option(
         "--simulator",
         help="Where it is driven: town, carla://HOST:PORT, or recorded:FOLDER for a prediction in recordings.",
+        callback=_world,
     ),
 ]
-Device: TypeAlias = Annotated[str, typer.Option(help="What the controller computes on: cpu, cuda or cuda:N.")]
+Device: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        help="What networks compute on: cpu, cuda, cuda:N, or auto for a GPU where there is one.", callback=_device
+    ),
+]
 
 CheapestFor: TypeAlias = Annotated[
     float | None,
-    number(
-        "Also find the fewest square metres of paint for so many metres of deviation.", 0.05, 100.0, show_default=False
-    ),
+    number("Also find the fewest square metres of paint for so many metres of deviation.", 0.05, 100.0, default=False),
 ]
 Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, MAX_FIGURES)]
 Cars: TypeAlias = Annotated[int, number("Other cars on the road.", 0, MAX_CROWD)]
 Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]
-Processes: TypeAlias = Annotated[int, number("Drives of the evaluation made at once.", 1, MAX_PROCESSES)]
+Processes: TypeAlias = Annotated[
+    int,
+    number(
+        "How many simulators drive at once; 0 for one a core.",
+        0,
+        MAX_PROCESSES,
+        meant=lambda count: count or os.cpu_count() or 1,
+    ),
+]
+Seed: TypeAlias = Annotated[int, number("Of everything random.", 0, MAX_SEED)]
+Out: TypeAlias = Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")]
+NewOut: TypeAlias = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+Trust: TypeAlias = Annotated[
+    bool, typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
+]
 
 
-def check_simulator(simulator: str, processes: int = 1) -> None:
+def check_simulator(simulator: str, processes: int) -> None:
     """See that a simulator is named, and that several processes have one each.
 
     Raises:

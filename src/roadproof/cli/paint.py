@@ -41,23 +41,21 @@ def _grouped(option: Any) -> Any:  # noqa: ANN401
 
 
 _OPTIONS: dict[str, Any] = {
-    "max_area": Annotated[
-        float | None, _grouped(number("Largest area of paint, m².", 0.01, 10_000.0, show_default=False))
-    ],
+    "max_area": Annotated[float | None, _grouped(number("Largest area of paint, m².", 0.01, 10_000.0, default=False))],
     "colours": Annotated[str | None, _grouped(unset("The only paints there are, as #dededa, with commas between."))],
     "printable": Annotated[bool, _grouped(typer.Option("--printable", help="Only colours that offset print can mix."))],
     "contrast": Annotated[
         tuple[float, float] | None, _grouped(unset("Least and most contrast to the asphalt; 0 none, 1 black on white."))
     ],
     "keep_out": Annotated[
-        float | None, _grouped(number("Least distance from lane marks, m.", 0.0, 10.0, show_default=False))
+        float | None, _grouped(number("Least distance from lane marks, m.", 0.0, 10.0, default=False))
     ],
     "robust": Annotated[
         bool,
         _grouped(typer.Option("--robust", help="Search the mean over camera noise, light, blur, placement and wear.")),
     ],
     "paint": Annotated[
-        Path | None, _grouped(unset("TOML file with the same as tables, [paint] and [variation]; options come first."))
+        Path | None, _grouped(unset("TOML file with the same in tables named paint and variation; options come first."))
     ],
 }
 

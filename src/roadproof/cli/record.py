@@ -11,7 +11,6 @@ from roadproof.cli import options
 from roadproof.cli.options import argument, number
 from roadproof.cli.output import say
 from roadproof.cli.verbs import begin
-from roadproof.limits import MAX_SEED
 
 if TYPE_CHECKING:
     from roadproof.drives import Drives
@@ -24,39 +23,27 @@ def record(
     weather: options.WeatherName = "clear-noon",
     budget: options.BudgetName = "quick",
     trajectories: Annotated[
-        int | None, number("T, how many drives, an odd number.  [default: the budget's]", 1, 7, show_default=False)
+        int | None, number("T, how many drives, an odd number.", 1, 7, default="the budget's")
     ] = None,
     scheme: Annotated[
         str, typer.Option(help="group: pairs to the right and left; random: each to both sides.")
     ] = "group",
     deviation_m: Annotated[
         list[float] | None,
-        number(
-            "How far drives are perturbed; several are taken in turn.  [default: the budget's]",
-            0.1,
-            5.0,
-            show_default=False,
-        ),
+        number("How far drives are perturbed; several are taken in turn.", 0.1, 5.0, default="the budget's"),
     ] = None,
     noise_deg: Annotated[
         tuple[int, int] | None,
-        number(
-            "Perturb by noise on the steering instead, least and most, as published.",
-            0,
-            57,
-            show_default=False,
-        ),
+        number("Perturb by noise on the steering instead, least and most, as published.", 0, 57, default=False),
     ] = None,
     horizon_m: Annotated[float, number("Keep frames from so far before the canvas.", 1.0, 1000.0)] = 25.0,
-    frames: Annotated[
-        int | None, number("Keep at most so many a drive.  [default: the budget's]", 1, 10_000, show_default=False)
-    ] = None,
-    seed: Annotated[int, number("Of the perturbations.", 0, MAX_SEED)] = 0,
+    frames: Annotated[int | None, number("Keep at most so many a drive.", 1, 10_000, default="the budget's")] = None,
+    seed: options.Seed = 0,
     simulator: options.SimulatorSpec = "town",
     device: options.Device = "cpu",
-    out: Annotated[Path, typer.Option(help="Folder for the runs, one a scenario.")] = Path("out/runs"),
+    out: options.Out = Path("out/runs"),
 ) -> None:
-    """Record drives past the canvas: clean, and perturbed. A second call goes on where the first ended."""
+    """Record drives past the canvas, clean and perturbed: a run for each scenario, in a folder of its name."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from dataclasses import replace
 
@@ -87,7 +74,6 @@ def record(
     kept = usual.window.frames if frames is None else frames
     window = replace(usual.window, horizon_m=horizon_m, frames=kept)
     places = {scenario.name: inside(out, scenario.name, "scenario", ScenarioError) for scenario in chosen}
-    options.check_simulator(simulator)
     who = options.driver_of(driver, device)
     begin(RECORDED_DRIVE.times(wanted.count * len(chosen)), *places.values())
 

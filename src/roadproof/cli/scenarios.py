@@ -11,8 +11,8 @@ from roadproof.cli.output import say, table
 
 
 def scenarios(
-    file: options.ScenarioFile = None,
-    out: Annotated[Path | None, unset("Picture to draw them to on their map.")] = None,
+    scenarios: options.ScenarioFile = None,
+    out: Annotated[Path | None, unset("File for a picture of them on their map.")] = None,
 ) -> None:
     """List the scenarios, and draw them on their map."""
     # Matplotlib takes a second to import; `--help` should not.
@@ -21,7 +21,7 @@ def scenarios(
     from roadproof.errors import ScenarioError
     from roadproof.roads.maps import load_map, scenario_route
 
-    listed = options.scenarios_of(file)
+    listed = options.scenarios_of(scenarios)
     shown = table(("name", "kind", "map"), ("route m", "to canvas m", "canvas m", "limit s"))
     for scenario in listed:
         route, canvas = scenario_route(scenario, load_map(scenario.map_name)), scenario.canvas

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.group import Verbs
-from roadproof.cli.options import number
+from roadproof.cli.options import Out, Trust, argument, number, unset
 from roadproof.cli.verbs import begin, verb
 from roadproof.limits import MAX_PROCESSES
 
@@ -19,24 +19,17 @@ if TYPE_CHECKING:
     from roadproof.study.plan import Job, Study
     from roadproof.study.rows import JobResult
 
-_TRUST = typer.Option("--trust", help="Follow a plan that runs code or calls another machine; read it first.")
-
 study = Verbs("Compare methods over many scenarios.")
 
 
 def run(
-    plan: Annotated[Path, typer.Argument(help="TOML file that says what is compared.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder for the results; the same folder goes on where it was.")] = Path(
-        "out/study"
-    ),
+    plan: Annotated[Path, argument("TOML file that says what is compared.")],
+    out: Out = Path("out/study"),
     workers: Annotated[
         int, number("Jobs at once on this machine, each in a process of its own.", 1, MAX_PROCESSES)
     ] = 1,
-    cluster: Annotated[
-        str | None,
-        typer.Option(help="Address of a Ray cluster, or local for one on this machine.", show_default=False),
-    ] = None,
-    trust: Annotated[bool, _TRUST] = False,
+    cluster: Annotated[str | None, unset("Address of a Ray cluster, or local for one on this machine.")] = None,
+    trust: Trust = False,
 ) -> None:
     """Find and evaluate a pattern for every scenario, number of figures, method and seed of a plan."""
     # Torch takes seconds to import; `--help` should not.
@@ -93,12 +86,12 @@ def _estimate(study: Study, who: Controller, workers: int) -> Estimate:
 
 
 def transfer(
-    plan: Annotated[Path, typer.Argument(help="The study's TOML file.", show_default=False)],
-    controllers: Annotated[str, typer.Option(help="Whom to try, with commas: cil,pilotnet.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder with the study's results.")] = Path("out/study"),
-    trust: Annotated[bool, _TRUST] = False,
+    plan: Annotated[Path, argument("TOML file that says what is compared.")],
+    controllers: Annotated[str, unset("Whom to try, with commas between.")],
+    out: Out = Path("out/study"),
+    trust: Trust = False,
 ) -> None:
-    """Drive other controllers over the patterns a study found."""
+    """Drive other controllers over the patterns that a study found; its results are in the same folder."""
     from rich.console import Console
 
     from roadproof.cli.progress import stages
@@ -117,10 +110,8 @@ def transfer(
 
 
 def tables(
-    folder: Annotated[Path, typer.Argument(help="Of the study, with its rows.parquet.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option(help="Where tables and figures go; else DIR/tables.", show_default=False)
-    ] = None,
+    folder: Annotated[Path, argument("Of the study, with its rows.parquet.")],
+    out: Annotated[Path | None, unset("Folder for the results.", default="FOLDER/tables")] = None,
 ) -> None:
     """Make a study's tables and figures: tables.html, tables.md, a .tex of each table, figures as PNG."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.

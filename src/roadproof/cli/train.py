@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from roadproof.cli.options import number, unset
+from roadproof.cli.options import Device, Out, Processes, Seed, number, unset
 from roadproof.cli.output import say
-from roadproof.limits import MANY, MAX_PROCESSES, MAX_SEED
+from roadproof.limits import MANY
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="Folder of drives, checkpoints and the controller.")] = Path("out/train"),
+    out: Out = Path("out/train"),
     network: Annotated[str, typer.Option(help="cil or pilotnet.")] = "cil",
     width: Annotated[float, number("CIL: factor on channels and units.", 0.01, 16.0)] = 1.0,
-    start: Annotated[str | None, unset("Weights file or shipped controller to go on from; else fresh weights.")] = None,
+    start: Annotated[
+        str | None, unset("Weights file or shipped controller to go on from.", default="fresh weights")
+    ] = None,
     drives: Annotated[int, number("Drives of the expert.", 1, MANY)] = 260,
     painted_drives: Annotated[int, number("Drives of the expert over random paint, besides.", 0, MANY)] = 0,
     pasted: Annotated[float, number("Share of the pictures with rectangles pasted on the road.", 0.0, 1.0)] = 0.0,
@@ -26,9 +27,9 @@ def train(
     rounds: Annotated[int, number("Rounds in which the network drives and the expert answers.", 0, 1000)] = 0,
     round_drives: Annotated[int, number("Drives of each round.", 1, MANY)] = 100,
     round_samples: Annotated[int, number("Frames seen in the training after each round.", 1, 10**9)] = 100_000,
-    seed: Annotated[int, number("Of everything.", 0, MAX_SEED)] = 0,
-    device: Annotated[str, typer.Option(help="What the network learns on: cpu, cuda or cuda:N.")] = "cpu",
-    processes: Annotated[int, number("Simulators that drive at once; 0: one a core.", 0, MAX_PROCESSES)] = 0,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    processes: Processes = 0,
     collect_only: Annotated[bool, typer.Option("--collect-only", help="Stop before learning.")] = False,
 ) -> None:
     """Collect drives, learn from them, let the network drive, learn from that; goes on where it was interrupted."""
@@ -52,11 +53,10 @@ def train(
         round_samples=round_samples,
     )
     hold(out)
-    at_once = processes or os.cpu_count() or 1
     with stages() as on_stage:
         if collect_only:
-            shards = gather(recipe, out, processes=at_once, on_stage=on_stage)
+            shards = gather(recipe, out, processes=processes, on_stage=on_stage)
             say(f"{len(shards)} drives in {out / 'drives'}; give the same command without --collect-only to learn")
             return
-        weights = follow(recipe, out, processes=at_once, device=device, on_stage=on_stage)
+        weights = follow(recipe, out, processes=processes, device=device, on_stage=on_stage)
     say(f"Controller in {weights}; see how it drives with: roadproof check-controller {weights}")

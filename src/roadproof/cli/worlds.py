@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from roadproof.cli.options import scenario_of
+from roadproof.cli.options import RECORDED, scenario_of
 from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from roadproof.recorded import RecordedSimulator
     from roadproof.scenarios import Scenario
     from roadproof.simulators.loading import MappedSimulator
-
-RECORDED = "recorded:"
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,7 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
         A `.pt2` file and `module:factory` run what their authors wrote: load only what you trust. Weights files hold
         numbers alone.
     """
-    place, precision = _device(device), _dtype(dtype)
+    place, precision = device_of(device), _dtype(dtype)
     text = str(spec)
     controller = _found(text, place, precision)
     return call(f"moving the controller to {place} in {dtype}", _placed, controller, place, precision)
@@ -315,7 +315,12 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def _device(device: str) -> torch.device:
+def device_of(device: str) -> torch.device:
+    """The torch device of a name: "cpu", "cuda" or "cuda:N".
+
+    Raises:
+        DeviceError: there is no such device.
+    """
     try:
         place = torch.device(device)
     except RuntimeError as error:
