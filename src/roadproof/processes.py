@@ -54,6 +54,8 @@ def require_picklable(driver: object) -> None:
 def _begin(limit_s: float, begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     foreign.end_calls_after(limit_s)
+    # What a user's code prints is none of the results, for which standard output is.
+    sys.stdout = sys.stderr
     # Last, so that nothing in the folder hides an installed module.
     sys.path.append(str(Path.cwd()))
     if begin is not None:

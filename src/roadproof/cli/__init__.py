@@ -44,22 +44,22 @@ from roadproof.memory import keep_freed_memory
 app = Verbs("Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.")
 VERBS = (
     verb(demo, estimates=True),
-    import_,
+    verb(import_, works=False),
     verb(record, estimates=True),
     verb(calibrate),
     verb(attack, estimates=True),
     verb(select),
     verb(evaluate, estimates=True),
-    report,
-    compare,
+    verb(report, works=False),
+    verb(compare, works=False),
     open_,
     verb(check, estimates=True),
     verb(drive),
-    scenarios,
-    controllers,
+    verb(scenarios, works=False),
+    verb(controllers, works=False),
     verb(check_controller),
     convert_cil,
-    verb(train),
+    verb(train, answers=False),
     verb(harden, estimates=True),
 )
 for each in VERBS:

@@ -9,7 +9,7 @@ import typer
 
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 from roadproof.cli.paint import Paint, with_paint
 from roadproof.cli.verbs import begin
 from roadproof.limits import MANY
@@ -135,6 +135,7 @@ def attack(
     draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, out)
+    found = stored(out / "result.json")
     if cheapest is not None:
         with progress("Looking for less paint", 14) as on_step:
             less = fewest(
@@ -142,7 +143,9 @@ def attack(
             )
         if less is not None:
             less.save(out / "cheapest")
+            found["cheapest"] = stored(out / "cheapest" / "cheapest.json")
         say(in_words(less, cheapest))
+    answer(found)
 
 
 def _summarise(result: AttackResult, out: Path) -> None:

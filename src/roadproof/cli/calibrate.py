@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import SimulatorSpec, argument, choice
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 
 if TYPE_CHECKING:
     from roadproof.calibration import CalibrationReport
@@ -57,6 +57,7 @@ def calibrate(
             )
         result.save(path)
         _summarise(result.report, path)
+    answer({"runs": [{"folder": str(run), **stored(run / "calibration" / "report.json")} for run in runs]})
 
 
 def _summarise(report: CalibrationReport, run: Path) -> None:

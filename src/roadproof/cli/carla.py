@@ -9,6 +9,8 @@ import typer
 
 from roadproof.cli.group import Verbs
 from roadproof.cli.options import number, unset
+from roadproof.cli.output import answer, say
+from roadproof.cli.verbs import verb
 
 carla = Verbs("CARLA: serve the town as one, examine a server.")
 
@@ -55,17 +57,20 @@ def serve(
     typer.echo("Ended; all connections and the town are closed")
 
 
-@carla.command()
 def doctor(host: Host = "127.0.0.1", port: Port = 2000) -> None:
     """Examine a CARLA server: one page of what works on it and what does not."""
     # CARLA's client is an extra.
     from roadproof.simulators.carla.doctor import examine
     from roadproof.simulators.carla.simulator import CarlaSimulator
 
-    typer.echo(f"CARLA server at {host}:{port}")
-
-    if not examine(CarlaSimulator(host, port), lambda check: typer.echo(str(check))).passed:
+    say(f"CARLA server at {host}:{port}")
+    report = examine(CarlaSimulator(host, port), lambda check: say(str(check)))
+    answer({"server": f"{host}:{port}", "passed": report.passed, "checks": report.checks})
+    if not report.passed:
         raise typer.Exit(1)
+
+
+carla.command()(verb(doctor, works=False))
 
 
 @carla.command()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from roadproof.cli.options import Device, Out, Processes, Trust, argument, check_simulator, choice, unset
+from roadproof.cli.output import answer, say, stored, table
 from roadproof.cli.verbs import begin, is_dry_run
 
 if TYPE_CHECKING:
@@ -63,12 +64,14 @@ def check(
     _summarise(result, out)
     if result.status is not Status.PASSED:
         if accept:
-            typer.echo("This does not become the reference, since not all of it passed")
+            say("This does not become the reference, since not all of it passed")
+        answer(stored(out / FILE))
         raise typer.Exit(1)
     if accept and chosen.reference is not None:
         content = (out / FILE).read_bytes()
         write_atomically(chosen.reference, lambda part: part.write_bytes(content))
-        typer.echo(f"From now on the reference is {chosen.reference}; keep it beside the plan")
+        say(f"From now on the reference is {chosen.reference}; keep it beside the plan")
+    answer(stored(out / FILE))
 
 
 def _estimate(plan: CheckPlan, who: Controller, processes: int) -> Estimate:
@@ -88,18 +91,12 @@ def _estimate(plan: CheckPlan, who: Controller, processes: int) -> Estimate:
 
 
 def _summarise(result: CheckResult, out: Path) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
     from roadproof.gate.outputs import COLUMNS, heading, rows_of, why
 
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    table = Table(*COLUMNS, box=box.SIMPLE)
+    shown = table(COLUMNS)
     for row in rows_of(result):
-        table.add_row(*row)
-    console.print(table)
+        shown.add_row(*row)
+    say(shown)
     for case in result.not_passed:
-        console.print(f"{case.status}: {case}", *why(case), f"see it: {case.command}", sep="\n  ")
-    console.print(heading(result))
-    console.print(f"Results in {out}: check.json, junit.xml, summary.md")
+        say("\n  ".join((f"{case.status}: {case}", *why(case), f"see it: {case.command}")))
+    say(heading(result), f"Results in {out}: check.json, junit.xml, summary.md")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from roadproof.cli import options
 from roadproof.cli.options import argument
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say
 
 if TYPE_CHECKING:
     from roadproof.controllers import ControllerReport
@@ -37,7 +38,9 @@ def check_controller(
     acts = any(check.name == DRIVES and check.passed for check in report.checks)
     if drive and not acts:
         typer.echo("not driven: act does not answer as a drive needs it", err=True)
+    found = {"controller": spec, "passed": report.passed, "checks": report.checks, "drives": None}
     if not drive or not acts:
+        answer(found)
         raise typer.Exit(0 if report.passed else 1)
 
     # Panda3D is an extra.
@@ -49,7 +52,11 @@ def check_controller(
         for done in score_drives(trials, spec, processes=processes):
             scored.append(done)
             show(len(scored), sum(score.clean for _, score in scored))
+    scored.sort(key=lambda pair: pair[0].scenario.name)
     _say_scores(scored)
+    told = {"weather": sky, "cars": cars, "pedestrians": pedestrians}
+    drives = [{"scenario": each.scenario.name, **told, "clean": s.clean, **asdict(s)} for each, s in scored]
+    answer(found | {"drives": drives})
     raise typer.Exit(0 if report.passed else 1)
 
 
@@ -68,7 +75,7 @@ def _say_scores(scored: list[tuple[Trial, DrivingScore]]) -> None:
         f"steering changes by {sum(s.steer_change for s in scores) / len(scores):.4f} a step; "
         f"{sum(s.turns_taken for s in scores)} of {turns} junctions left as commanded"
     )
-    for trial, score in sorted(scored, key=lambda pair: pair[0].scenario.name):
+    for trial, score in scored:
         if not score.clean:
             what = ", ".join(f"{e.kind} at {e.time_s:.1f} s" for e in score.events) or "did not arrive"
             x, y = score.failed_at_m or (0.0, 0.0)

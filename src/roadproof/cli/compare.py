@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from roadproof.cli.options import argument
-from roadproof.cli.output import say, table
+from roadproof.cli.output import answer, say, table
+
+if TYPE_CHECKING:
+    from roadproof.report.comparison import Compared
 
 
 def compare(
@@ -32,3 +36,20 @@ def compare(
             each.name, evaluation.controller, evaluation.scenario.name, *metres, mean_in_words(each.change, 2), left
         )
     say(shown, f"The page is {out}")
+    answer({"runs": [_answer(each) for each in runs]})
+
+
+def _answer(run: Compared) -> dict[str, object]:
+    """The verdict of a run, and its drives alone on the road, each weather's and all together, as result.json has
+    them: under another key where they are predicted."""  # noqa: D205, D209
+    evaluation = run.judged.evaluation
+    return {
+        "name": run.name,
+        "controller": evaluation.controller,
+        "scenario": evaluation.scenario.name,
+        "verdict": asdict(run.verdict),
+        "foreseen" if run.predicted else "closed_loop": {
+            "rows": [asdict(row) for row in run.alone.values()],
+            "change_m": run.change and asdict(run.change),
+        },
+    }

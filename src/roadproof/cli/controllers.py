@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
 
 from roadproof.cli.options import argument
-from roadproof.cli.output import table
+from roadproof.cli.output import answer, say, table
+
+if TYPE_CHECKING:
+    from roadproof.controllers.shipped import ModelCard
 
 
 def controllers(
     name: Annotated[str | None, argument("One of them, to read its card.")] = None,
 ) -> None:
     """List the shipped controllers, or show the card of one."""
-    from rich.console import Console
     from rich.text import Text
 
     from roadproof.controllers.shipped import model_card, shipped_names, shipped_weights
 
+    cards = [model_card(each) for each in (shipped_names() if name is None else (name,))]
+    megabytes = [shipped_weights(card.name).stat().st_size / 1e6 for card in cards]
     if name is None:
         shown = table(("name", "network", "size", "what it is"))
-        for each in shipped_names():
-            card = model_card(each)
-            size = f"{shipped_weights(each).stat().st_size / 1e6:.1f} MB"
-            shown.add_row(*map(Text, (each, card.network, size, card.summary)))
-        Console().print(shown)
-        return
-    card = model_card(name)
-    say = Console(highlight=False, markup=False).print
-    say(f"{card.name}: {card.summary}")
+        for card, size in zip(cards, megabytes, strict=True):
+            shown.add_row(*map(Text, (card.name, card.network, f"{size:.1f} MB", card.summary)))
+        say(shown, wrapped=True)
+    else:
+        _show(cards[0])
+    answer({"controllers": [asdict(card) | {"megabytes": size} for card, size in zip(cards, megabytes, strict=True)]})
+
+
+def _show(card: ModelCard) -> None:
+    say(f"{card.name}: {card.summary}", wrapped=True)
     for title in ("network", "data", "training", "can", "cannot"):
         # The card's own line ends would meet those of a narrow terminal.
-        say(f"\n{title.capitalize()}\n{' '.join(getattr(card, title).split())}")
+        say(f"\n{title.capitalize()}\n{' '.join(getattr(card, title).split())}", wrapped=True)

@@ -12,7 +12,7 @@ import typer
 
 from roadproof.cli import options
 from roadproof.cli.options import number
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 from roadproof.cli.paint import Paint, with_paint, words
 from roadproof.cli.verbs import begin
 
@@ -102,6 +102,7 @@ def demo(
         less = result.cheapest
         driven = "" if less is None else f"; driven {less[1].deviation_m:.2f} m"
         say(in_words(less and less[0], cheapest) + driven)
+    answer(stored(out / "result.json"))
 
 
 def _report(result: StressTest, out: Path) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from roadproof.cli import options
 from roadproof.cli.options import unset
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say
 from roadproof.cli.worlds import world_asked
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ def drive(
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Weather
+    from roadproof.driving.episode import Episode
+    from roadproof.driving.evaluation import kind_of
     from roadproof.driving.rollout import rollout
     from roadproof.io.locks import hold
     from roadproof.patterns import read_paint
@@ -80,6 +82,7 @@ def drive(
             )
     episode.save(out / "episode.npz")
     _summarise(episode, out)
+    answer(Episode.FILE.document(episode, kind=kind_of(episode.paint)))
 
 
 def _summarise(episode: Episode, out: Path) -> None:

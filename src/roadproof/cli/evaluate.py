@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +11,7 @@ import typer
 
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
-from roadproof.cli.output import say, table
+from roadproof.cli.output import answer, say, stored, table
 from roadproof.cli.verbs import begin
 from roadproof.cli.worlds import open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
@@ -128,6 +128,8 @@ def evaluate(
         if recorded is not None and figures is not None and isinstance(who, Controller):
             fidelity = measure_fidelity(world, who, driven, figures, recorded, out, weather=skies[0], device=device)
     _summarise(evaluation, fidelity, out, compared=recorded is not None)
+    surrogate = {} if fidelity is None else {"surrogate": {"agreement": asdict(fidelity.agreement)}}
+    answer(stored(out / "evaluation.json") | surrogate)
 
 
 def _check_recorded(runs: int | None, recordings: Path | None) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from roadproof.cli import options
 from roadproof.cli.options import argument, choice, number, unset
+from roadproof.cli.output import answer, say, stored
 from roadproof.cli.paint import Paint, with_paint
 from roadproof.cli.verbs import begin
 
@@ -44,8 +45,6 @@ def harden(
 ) -> None:
     """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on streets not trained on."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from rich.console import Console
-
     from roadproof.cli.progress import stages
     from roadproof.controllers.loading import imported, load_controller, load_trainable
     from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets
@@ -88,13 +87,13 @@ def harden(
             on_progress=show,
         )
     page = write_hardening(found, out)
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
     for each in found.rounds:
         kept = "  <- kept" if each.number == found.best else ""
         say(f"  round {each.number}: {each.mean_m:.2f} m on the streets trained on, attacked afresh{kept}")
     if found.judgement is not None:
         say(found.judgement.verdict().sentence)
     say(f"The hardened controller is {found.hardened}, the page {page}")
+    answer(stored(out / "hardening.json"))
 
 
 def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int) -> Estimate:

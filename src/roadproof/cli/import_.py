@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from roadproof.cli.options import NewOut, argument
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 
 
 def import_(
@@ -31,3 +31,4 @@ def import_(
         say(f"  {drive.name:8} {len(drive.frames)} frames, steps {drive.frame_number[0]} to {drive.frame_number[-1]}")
     say(f"Is the canvas where it should be? {shown}")
     say(f"Recordings in {out}; next: roadproof attack {out} --objective deviation --controller ...")
+    answer(stored(out / "recordings.json"))

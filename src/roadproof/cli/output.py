@@ -1,15 +1,66 @@
-"""What verbs print on standard output."""
+"""What verbs print on standard output: their results, for people or, with --json, for programs."""
 
 from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any, TextIO
 
 from rich import box
 from rich.console import Console, RenderableType
 from rich.table import Table
 
+from roadproof.cli.progress import is_quiet
 
-def say(*lines: RenderableType) -> None:
-    """Print lines or tables as they are: lines are not wrapped, and nothing in them is read as markup."""
-    console = Console(soft_wrap=True, highlight=False, markup=False)
+_answers: TextIO | None = None  # one command a process
+
+
+@contextmanager
+def in_json() -> Generator[None]:
+    """Keep standard output for `answer` in a with-block; all else that is printed in it goes to standard error."""
+    global _answers
+    _answers = sys.stdout
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _answers = None
+
+
+def answer(results: Mapping[str, object]) -> None:
+    """Print a verb's results as one JSON document where --json asks for it; nothing that can fail may follow.
+
+    Args:
+        results: the results by name, in the form of a results file where there is one (`stored`).
+    """
+    if _answers is None:
+        return
+    # A tenth of a second to import; `--help` should not.
+    import msgspec
+
+    # msgspec writes what is no number, NaN, as null; json marks beyond ASCII so that every terminal can show them.
+    numbers = msgspec.json.encode(results, enc_hook=lambda value: value.tolist())
+    _answers.write(json.dumps(msgspec.json.decode(numbers)) + "\n")
+
+
+def stored(path: Path) -> dict[str, Any]:
+    """What a results file in JSON holds."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def say(*lines: RenderableType, wrapped: bool = False) -> None:
+    """Print lines or tables; nothing in them is read as markup. With --json they go to standard error, if anywhere.
+
+    Args:
+        *lines: the lines or tables.
+        wrapped: whether they are wrapped where the terminal ends.
+    """
+    if _answers is not None and is_quiet():
+        return
+    console = Console(soft_wrap=not wrapped, highlight=False, markup=False)
     for line in lines:
         console.print(line)
 

@@ -9,7 +9,7 @@ import typer
 
 from roadproof.cli import options
 from roadproof.cli.options import argument, number
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 from roadproof.cli.verbs import begin
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def record(
     who = options.driver_of(driver, device)
     begin(RECORDED_DRIVE.times(wanted.count * len(chosen)), *places.values())
 
+    made: list[dict[str, object]] = []
     with open_simulator(simulator) as world:
         for scenario in chosen:
             with progress(f"Recording {scenario.name}", wanted.count, "drives") as show:
@@ -93,6 +94,8 @@ def record(
                     on_drive=lambda done, show=show: show(done, 0.0),
                 )
             _summarise(drives, places[scenario.name])
+            made.append(_answer(drives, places[scenario.name]))
+    answer({"runs": made})
 
 
 def _summarise(drives: Drives, run: Path) -> None:
@@ -101,3 +104,20 @@ def _summarise(drives: Drives, run: Path) -> None:
         steps = f"steps {drive.frame_number[0]} to {drive.frame_number[-1]}"
         aside = f"up to {drive.offset_m:+.2f} m to the right" if drive.offset_m else "clean"
         say(f"  {drive.name:8} {len(drive.frames)} frames, {steps}, {aside}{drive.note and '; ' + drive.note}")
+
+
+def _answer(drives: Drives, run: Path) -> dict[str, object]:
+    """What record.json holds, and what came of the drives."""
+    told = [
+        {
+            "name": drive.name,
+            "frames": len(drive.frames),
+            "first_step": drive.frame_number[0],
+            "last_step": drive.frame_number[-1],
+            "offset_right_m": drive.offset_m,
+            "simulator_calls": drive.calls,
+            "note": drive.note,
+        }
+        for drive in drives.drives
+    ]
+    return {"folder": str(run), **stored(run / "record" / "record.json"), "drives": told}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from roadproof.cli.options import argument
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 
 
 def report(
@@ -21,3 +21,4 @@ def report(
     page = write_report(folder)
     say(verdict(read_run(folder)).sentence)
     say(f"The report is {page}, its numbers are in {page.with_name('result.json')}")
+    answer(stored(page.with_name("result.json")))

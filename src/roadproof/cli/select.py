@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from roadproof.cli import options
 from roadproof.cli.options import argument, number
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, say, stored
 from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult
+    from roadproof.attacks import AttackResult, Candidate
     from roadproof.pipeline.selection import Selection
 
 
@@ -64,18 +64,27 @@ def select(
         )
     save_pattern(selection.pattern, run / "pattern.json")
     _summarise(selection, found, run)
+    answer(stored(run / "selection" / "selection.json"))
 
 
 def _summarise(selection: Selection, found: AttackResult, run: Path) -> None:
     driven = "predicted drive" if selection.predicted else "driven"
     for k, each in enumerate(selection.driven):
-        shift = found.candidates[each.rank - 1].surrogate_shift
         points = "points not known" if each.trial.points is None else f"{each.trial.points:g} points"
         say(
-            f"  {each.rank:2} {each.group:12} predicted {shift:+.3f}, {driven}: deviation "
+            f"  {each.rank:2} {each.group:12} {_expected(found.candidates[each.rank - 1])}{driven}: deviation "
             f"{each.trial.deviation_m:.2f} m, {abs(each.trial.lateral_m):.2f} m aside, {points}"
             f"{'  <- kept' if k == selection.chosen else ''}"
         )
     pattern = run / "pattern.json"
     drives = "nothing was driven for real" if selection.predicted else f"{selection.simulator_calls} drives"
     say(f"{drives}; the strongest is {pattern}; next: roadproof evaluate {pattern} ...")
+
+
+def _expected(candidate: Candidate) -> str:
+    """What the search says of a candidate: metres where it drove in recordings, else how steering shifts there."""
+    if candidate.predicted_m is not None:
+        return f"predicted {candidate.predicted_m:.2f} m, "
+    if candidate.surrogate_shift is not None:
+        return f"steering shift {candidate.surrogate_shift:+.3f} a frame, "
+    return ""

@@ -10,6 +10,7 @@ import typer
 
 from roadproof.cli.group import Verbs
 from roadproof.cli.options import Out, Trust, argument, number, unset
+from roadproof.cli.output import answer, say
 from roadproof.cli.verbs import begin, verb
 from roadproof.limits import MAX_PROCESSES
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.pipeline.estimate import Estimate
     from roadproof.study.plan import Job, Study
-    from roadproof.study.rows import JobResult
+    from roadproof.study.rows import Frame, JobResult
 
 study = Verbs("Compare methods over many scenarios.")
 
@@ -33,8 +34,6 @@ def run(
 ) -> None:
     """Find and evaluate a pattern for every scenario, number of figures, method and seed of a plan."""
     # Torch takes seconds to import; `--help` should not.
-    from rich.console import Console
-
     from roadproof.cli.progress import HOURS_S, progress
     from roadproof.controllers import load_controller
     from roadproof.study.folder import is_done
@@ -57,15 +56,14 @@ def run(
             show(done, failed)
 
         rows = run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told)
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
-    for line in summary(rows):
-        say(line)
+    say(*summary(rows))
     say(f"Rows in {out / 'rows.parquet'}; tables and figures: roadproof study tables {out}")
     bad = failures(rows)
-    for line in bad:
-        say(f"FAILED {line}")
+    say(*(f"FAILED {line}" for line in bad))
     if bad:
         say("Give the same command again to try those once more")
+    answer({"rows": _plain(rows)})
+    if bad:
         raise typer.Exit(1)
 
 
@@ -92,8 +90,6 @@ def transfer(
     trust: Trust = False,
 ) -> None:
     """Drive other controllers over the patterns that a study found; its results are in the same folder."""
-    from rich.console import Console
-
     from roadproof.cli.progress import stages
     from roadproof.study.plan import load_study
     from roadproof.study.summary import transfer_summary
@@ -103,10 +99,13 @@ def transfer(
     specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
     with stages() as show:
         rows = run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
-    say = Console(soft_wrap=True, highlight=False, markup=False).print
-    for line in transfer_summary(rows):
-        say(line)
-    say(f"Rows in {out / 'transfer.parquet'}")
+    say(*transfer_summary(rows), f"Rows in {out / 'transfer.parquet'}")
+    answer({"rows": _plain(rows)})
+
+
+def _plain(rows: Frame) -> list[dict[str, object]]:
+    """Rows as objects, with None for what is not there."""
+    return rows.astype(object).where(rows.notna(), None).to_dict("records")
 
 
 def tables(
@@ -115,16 +114,13 @@ def tables(
 ) -> None:
     """Make a study's tables and figures: tables.html, tables.md, a .tex of each table, figures as PNG."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from rich.console import Console
-
     from roadproof.study.folder import read_table
     from roadproof.study.page import write_tables
 
     rows = read_table(folder)
     driven = read_table(folder, "transfer.parquet") if (folder / "transfer.parquet").exists() else None
     page = write_tables(rows, folder, out or folder / "tables", driven)
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    console.print(f"The tables are {page}, as Markdown and LaTeX beside it; figures in {page.parent / 'figures'}")
+    say(f"The tables are {page}, as Markdown and LaTeX beside it; figures in {page.parent / 'figures'}")
 
 
 study.command()(verb(run, estimates=True))

@@ -1,17 +1,19 @@
-"""What every verb that works long can be told besides: how loud it is, and to say only what it would take."""
+"""What verbs can be told besides: how loud they are, to print JSON, and to say only what they would take."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from rich.console import Console
 
-from roadproof.cli.output import say
+from roadproof.cli.output import answer, in_json, say
 from roadproof.cli.progress import Loudness, in_words, is_quiet, speak
 from roadproof.errors import RoadproofError
 from roadproof.io.locks import hold
@@ -27,31 +29,49 @@ _Verbose = Annotated[bool, typer.Option("--verbose", help="A line for every step
 _DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only estimate drives, time and disk; nothing is driven or written.")
 ]
+_Json = Annotated[
+    bool, typer.Option("--json", help="Print the results as one JSON document, all else on standard error.")
+]
 _dry_run = False  # one command a process
 
 
-def verb(function: Callable[..., None], *, estimates: bool = False) -> Callable[..., None]:
-    """A verb with --quiet and --verbose, and --dry-run where it calls `begin`.
+def verb(
+    function: Callable[..., None], *, works: bool = True, estimates: bool = False, answers: bool = True
+) -> Callable[..., None]:
+    """A verb with the options that its kind of work asks for.
 
     Args:
         function: the function that does the verb's work.
+        works: whether the verb works long, and so takes --quiet and --verbose.
         estimates: whether the verb calls `begin`, and so takes --dry-run.
+        answers: whether the verb calls `answer`, and so takes --json.
     """
 
     @functools.wraps(function)
-    def called(*, quiet: bool, verbose: bool, dry_run: bool = False, **given: Any) -> None:  # noqa: ANN401
+    def called(
+        *,
+        quiet: bool = False,
+        verbose: bool = False,
+        dry_run: bool = False,
+        json: bool = False,
+        **given: Any,  # noqa: ANN401
+    ) -> None:
         global _dry_run
         if quiet and verbose:
             raise RoadproofError("both --quiet and --verbose are given; choose one")
+        # What only lists its results has nothing else to say.
+        quiet = quiet or (json and not works)
         speak(Loudness.QUIET if quiet else Loudness.VERBOSE if verbose else Loudness.USUAL)
         _dry_run = dry_run
         try:
-            function(**given)
+            with in_json() if json else nullcontext():
+                function(**given)
         finally:
             _dry_run = False
             speak(Loudness.USUAL)
 
-    more: dict[str, Any] = {"quiet": _Quiet, "verbose": _Verbose} | ({"dry_run": _DryRun} if estimates else {})
+    more: dict[str, Any] = {"quiet": _Quiet, "verbose": _Verbose} if works else {}
+    more |= ({"dry_run": _DryRun} if estimates else {}) | ({"json": _Json} if answers else {})
     hints = get_type_hints(function, include_extras=True) | more
     own = inspect.signature(function)
     parameters = [each.replace(annotation=hints[name]) for name, each in own.parameters.items()]
@@ -83,6 +103,7 @@ def begin(estimate: Estimate, *folders: Path) -> None:
     told = f"{', '.join((*parts, f'about {in_words(estimate.seconds)}', f'{estimate.megabytes:.0f} MB on the disk'))}"
     if _dry_run:
         say(f"{told}; less where the folder holds some of it already ({estimate.basis})")
+        answer(asdict(estimate))
         raise typer.Exit
     for folder in folders:
         hold(folder)

@@ -89,10 +89,8 @@ class RecordFile(Generic[T]):
         Raises:
             OutputError: the file cannot be written.
         """
-        content = {"format": self.name, "version": self.version} if self.name else {}
-        content = cast("dict[str, Any]", plain({**content, **self.notes, **more}))
         members = self._members(path)
-        content |= self.stated(value, members)
+        content = self.document(value, members, **more)
         if path.suffix == ".json":
             write_json(path, content)
             return
@@ -100,6 +98,11 @@ class RecordFile(Generic[T]):
         if self.header is not None:
             arrays[self.header] = np.array(json.dumps(content, ensure_ascii=False))
         write_archive(path, arrays)
+
+    def document(self, value: T, members: Sequence[str] = (), **more: object) -> dict[str, Any]:
+        """All that a JSON file says of a record: format and version, notes, what is said besides, and its fields."""
+        content = {"format": self.name, "version": self.version} if self.name else {}
+        return cast("dict[str, Any]", plain({**content, **self.notes, **more})) | self.stated(value, members)
 
     def stated(self, value: T, members: Sequence[str] = ()) -> dict[str, Any]:
         """A record's fields as JSON has them, but for those that are members of an archive."""

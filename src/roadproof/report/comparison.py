@@ -37,7 +37,8 @@ class Compared:
         verdict: what the run shows.
         alone: the run's drives over the pattern, alone on the road, in each weather, and in all together under None.
         change: mean change of the deviation against the first run over drives alone on the road, metres; None for the
-            first run, and where no drive has weather and start in common with one of the first run's.
+            first run, where no drive has weather and start in common with one of the first run's, and where one run is
+            driven and the other predicted.
     """
 
     name: str
@@ -81,7 +82,8 @@ def compared(folders: Sequence[AnyPath]) -> tuple[Compared, ...]:
         evaluation = run.judged.evaluation
         rows = {row.weather: row for row in evaluation.rows() if row.pattern == ATTACK and not row.traffic}
         first = found[0].judged.evaluation if found else None
-        change = first and _change(first.of(traffic=False), evaluation.of(traffic=False))
+        alike = first is not None and first.predicted == evaluation.predicted
+        change = _change(first.of(traffic=False), evaluation.of(traffic=False)) if first and alike else None
         found.append(Compared(_name(path, paths), run.judged, verdict(run), rows, change))
     return tuple(found)
 
