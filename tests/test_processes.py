@@ -42,6 +42,12 @@ def test_a_process_at_work_ends_when_its_parent_is_killed(blow):
     assert not alive(child)
 
 
+def test_what_one_prints_is_none_of_the_results(capfd):
+    with processes_beside(1) as pool:
+        pool.submit(print, "loud", flush=True).result()
+    assert tuple(capfd.readouterr()) == ("", "loud\n")
+
+
 def test_each_begins_as_told():
     with processes_beside(2, os.putenv, "ROADPROOF_TOLD", "yes") as pool:
         assert pool.submit(subprocess.getoutput, "echo $ROADPROOF_TOLD").result() == "yes"

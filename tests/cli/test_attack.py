@@ -1,7 +1,6 @@
 """`roadproof attack` as its users call it: results, pictures, and one clear line for every mistake."""
 
 import dataclasses
-import json
 import os
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from command import stored
 from roadproof.attacks import AttackResult, Published, methods
 from roadproof.attacks.gradopt import Rung
 from roadproof.cli import app
@@ -77,7 +77,7 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke
     result = AttackResult.load(tmp_path / "out")
     assert result.history.shape == (4, 2, 2)
     assert len(load_pattern(tmp_path / "out" / "pattern.json").shapes) == 2
-    assert json.loads((tmp_path / "out" / "result.json").read_text())["kind"].startswith("surrogate")
+    assert stored(tmp_path / "out" / "result.json")["kind"].startswith("surrogate")
     for picture in (tmp_path / "out").glob("*.png"):
         pixels = np.asarray(Image.open(picture).convert("RGB"))
         assert pixels.std() > 5, picture

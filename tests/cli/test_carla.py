@@ -8,6 +8,7 @@ from PIL import Image
 
 import needs
 from carla_serving import HALF, HALF_INPUT, free_port, serving, straight_map
+from command import answered
 from roadproof.datatypes import VehicleState
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
@@ -103,6 +104,13 @@ def test_record_calibrate_attack_evaluate_drive_and_report(call, tmp_path, impat
 def test_every_verb_that_drives_says_in_one_line_that_nobody_answers(call, impatient, words):
     port = free_port()
     check_nobody(call(*words, "--simulator", f"carla://127.0.0.1:{port}", code=2), port)
+
+
+def test_the_doctor_answers_programs_too(invoke, impatient):
+    code, printed = invoke("carla", "doctor", "--port", free_port(), "--json")
+    assert (code, printed.err) == (1, "")
+    told = answered(printed.out)
+    assert (told["passed"], [check["name"] for check in told["checks"]]) == (False, ["connection"])
 
 
 @pytest.mark.parametrize("verb", ["drive", "demo"])

@@ -5,6 +5,7 @@ import functools
 import pytest
 
 import needs
+from command import answered, stored
 from paint_shy import along_a_street
 from roadproof.attacks import GradOpt, SteeringShift
 from roadproof.datatypes import Weather
@@ -36,13 +37,15 @@ def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch
     monkeypatch.setitem(BUDGETS, "quick", TINY)
     file, out = tmp_path / "scenarios.toml", tmp_path / "run"
     save_scenarios([along_a_street(tmp_path, 2.5)], file)
-    for _ in range(2):  # the second finds all done
-        code, printed = demo(
-            "--scenarios", file, "--scenario", "street", "--figures", 1, "--processes", 2, "--out", out
-        )
-        assert code == 0, printed.err
-        assert "street" in printed.out
-        assert "record" in printed.out
+    words = ["--scenarios", file, "--scenario", "street", "--figures", 1, "--processes", 2, "--out", out]
+    code, printed = demo(*words)
+    assert code == 0, printed.err
+    assert "street" in printed.out
+    assert "record" in printed.out
+    code, printed = demo(*words, "--json")  # finds all done
+    assert code == 0, printed.err
+    assert "record" in printed.err
+    assert answered(printed.out) == stored(out / "result.json")
     page = (out / "report.html").read_text()
     assert "pilotnet" in page
     assert "roadproof demo --scenario street" in page

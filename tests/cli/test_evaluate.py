@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 
 import needs
-from command import roadproof
+from command import answered, roadproof, stored
 from paint_shy import along_a_street, magenta
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
@@ -25,7 +25,7 @@ def workplace(tmp_path_factory):
     return folder
 
 
-def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path):
+def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path, invoke):
     run = tmp_path / "run"
     options = [
         "--scenarios",
@@ -51,13 +51,17 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
 
     said = roadproof("report", run)
     assert said.returncode == 0, said.stderr
+    code, printed = invoke("report", run, "--json")
+    assert (code, printed.err) == (0, "")
+    assert answered(printed.out) == stored(run / "result.json")
     assert "paint_shy:paint_shy" in said.stdout
     page = (run / "report.html").read_text()
     assert "data:video/mp4;base64," in page
     assert f"{abs(trial.lateral_m):.2f} m to the right" in page
 
-    again = roadproof("evaluate", "pattern.json", *options, "--no-film", folder=workplace)
-    assert again.returncode == 0
+    again = roadproof("evaluate", "pattern.json", *options, "--no-film", "--json", folder=workplace)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert answered(again.stdout) == stored(run / "evaluation" / "evaluation.json")
     assert Evaluation.load(run / "evaluation").trials == evaluation.trials
 
 

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
-from command import roadproof
+from command import answered, roadproof, stored
 from own_drives import write_own
 from roadproof.errors import RecordingError
 from roadproof.io.pictures import read_picture
 from roadproof.recordings import load_recordings
 
 
-def test_pictures_and_tables_become_recordings(tmp_path):
+def test_pictures_and_tables_become_recordings(tmp_path, invoke):
     folder, out = write_own(tmp_path / "mine"), tmp_path / "set"
+    code, printed = invoke("import", folder, "--out", tmp_path / "told", "--json")
+    assert (code, printed.err) == (0, "")
+    assert answered(printed.out) == stored(tmp_path / "told" / "recordings.json")
     said = roadproof("import", folder, "--out", out).stdout
     assert "canvas 7.60 m across the road, 9.50 m along it" in said
     assert f"next: roadproof attack {out}" in said

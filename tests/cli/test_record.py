@@ -7,6 +7,7 @@ import textwrap
 import pytest
 
 import needs
+from command import answered, stored
 from roadproof.drives import load_drives
 from roadproof.pipeline.selection import Selection
 from roadproof.recordings import load_recordings
@@ -61,7 +62,7 @@ def run(workplace, call):
 def test_a_recorded_and_calibrated_run_is_attacked_as_it_is(run, call, workplace):
     attack = ["attack", "runs/straight-04/recordings", "--controller", "own_bright:Bright", "--groups", "all"]
     small = ["--figures", "1", "--iterations", "2", "--restarts", "1", "--random-patterns", "0", "--out", "out"]
-    assert "Strongest for all" in call(*attack, *small)
+    assert answered(call(*attack, *small, "--json")) == stored(workplace / "out" / "result.json")
     assert (workplace / "out" / "pattern.json").is_file()
     assert sorted(path.name for path in run.iterdir()) == ["calibration", "record", "recordings"]
     assert len(load_recordings(run / "recordings").recordings[0].frames) == 3
@@ -86,6 +87,8 @@ def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call
     assert (place / "pattern.json").read_text() == chosen.read_text()
     before = {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")}
     assert call(*select) == said
+    assert all("steering shift " in line for line in said.splitlines()[:2])
+    assert answered(call(*select, "--json")) == stored(place / "selection" / "selection.json")
     assert {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")} == before
     assert "holds a choice with candidates 2, now it is 1" in call(*select[:-1], "1", code=2)
 
@@ -94,6 +97,12 @@ def test_a_second_call_goes_on_where_the_first_ended(run, call):
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()}
     assert "1 drives" in call(*RECORD)
     assert "3 simulator calls" in call("calibrate", "runs", "--method", "pose")
+    (recorded,) = answered(call(*RECORD, "--json"))["runs"]
+    drives = recorded.pop("drives")
+    assert recorded == {"folder": "runs/straight-04", **stored(run / "record" / "record.json")}
+    assert [(drive["name"], drive["frames"], drive["offset_right_m"]) for drive in drives] == [("clean", 3, 0.0)]
+    (calibrated,) = answered(call("calibrate", "runs", "--method", "pose", "--json"))["runs"]
+    assert calibrated == {"folder": "runs/straight-04", **stored(run / "calibration" / "report.json")}
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file()} == before
 
 

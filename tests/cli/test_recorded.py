@@ -4,14 +4,17 @@ import dataclasses
 
 import pytest
 
-from command import roadproof
+from command import answered, roadproof
 from paint_shy import magenta
 from recorded_drives import drivable_set
+from roadproof.attacks import AttackResult
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
 from roadproof.recordings import save_recordings
+from runs import write_attack
+from team_folder import write_recorded
 
 BAR = magenta(300.0)
 
@@ -53,6 +56,28 @@ def test_the_command_drives_in_recordings_and_films_it(workplace, tmp_path):
     assert "predicted: nothing was driven for real, and infractions are not known" in done.stdout
     with av.open(str(tmp_path / "drive.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == len(Episode.load(tmp_path / "episode.npz"))
+
+
+def test_a_predicted_drive_says_so_to_programs(workplace, tmp_path, invoke, monkeypatch):
+    monkeypatch.chdir(workplace)
+    where = ["--simulator", "recorded:run", "--controller", "paint_shy:paint_shy", "--out", tmp_path]
+    code, printed = invoke("drive", *where, "--json")
+    assert code == 0, printed.err
+    told, episode = answered(printed.out), Episode.load(tmp_path / "episode.npz")
+    assert (told["kind"], told["paint"], told["ending"]) == ("predicted", "composited", episode.ending)
+    assert told["x_m"] == episode.x_m.tolist()
+
+
+def test_what_a_search_predicted_is_said_in_metres(tmp_path, invoke):
+    write_recorded(tmp_path)
+    write_attack(tmp_path / "attack")
+    found = AttackResult.load(tmp_path / "attack")
+    seen = dataclasses.replace(found.candidates[0], predicted_m=1.25, predicted_range_m=(1.0, 1.5))
+    dataclasses.replace(found, candidates=(seen,)).save(tmp_path / "attack")
+    where = ["--simulator", f"recorded:{tmp_path}", "--controller", "team_folder:magenta_shy"]
+    code, printed = invoke("select", tmp_path, *where)
+    assert code == 0, printed.err
+    assert printed.out.startswith("   1 clean+left   predicted 1.25 m, predicted drive: deviation ")
 
 
 EVALUATE = ["evaluate", "pattern.json", "--controller", "pilotnet", "--simulator", "recorded:run"]

@@ -2,11 +2,13 @@
 
 import dataclasses
 import functools
+import tomllib
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from command import answered
 from roadproof.scenarios import builtin_scenarios, save_scenarios
 
 
@@ -33,6 +35,18 @@ def test_a_list_of_ones_own_is_listed_and_drawn(scenarios, tmp_path):
     assert "77" in printed.out
     assert "left-03" not in printed.out
     assert np.asarray(Image.open(tmp_path / "map.png").convert("RGB")).std() > 10
+
+
+def test_they_are_objects_for_programs(scenarios, tmp_path):
+    listed = builtin_scenarios()[:2]
+    save_scenarios(listed, tmp_path / "own.toml")
+    code, printed = scenarios("--scenarios", tmp_path / "own.toml", "--json")
+    assert (code, printed.err) == (0, "")
+    told = answered(printed.out)["scenario"]
+    kept = tomllib.loads((tmp_path / "own.toml").read_text())["scenario"]
+    for one, file in zip(told, kept, strict=True):
+        assert {key: one[key] for key in file} == file
+        assert 0 < one["to_canvas_m"] < one["route_m"]
 
 
 def test_mistakes_are_one_clear_line(scenarios, tmp_path):

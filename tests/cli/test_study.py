@@ -7,6 +7,7 @@ import functools
 import pytest
 
 import needs
+from command import answered
 from roadproof.study.folder import pandas, read_table
 from street_plan import write_plan
 
@@ -43,10 +44,17 @@ def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_pa
         assert "FAILED" not in printed.out
         assert printed.err == ""
     own = read_table(tmp_path / "out")
+    code, printed = study("run", plan, "--json", "--out", tmp_path / "out")
+    assert code == 0, printed.err
+    (row,) = answered(printed.out)["rows"]
+    assert (row["method"], row["deviation_m"], row["error"]) == ("chance", own["deviation_m"].iloc[0], None)
+    assert set(row) == set(own)
     for _ in range(2):
         code, printed = study("transfer", plan, "--controllers", "pilotnet, cil", "--out", tmp_path / "out")
         assert code == 0, printed.err
         assert "chance, found against pilotnet" in printed.out
+    code, printed = study("transfer", plan, "--controllers", "pilotnet, cil", "--out", tmp_path / "out", "--json")
+    assert [row["controller"] for row in answered(printed.out)["rows"]] == ["pilotnet", "cil"]
     other = pandas().read_parquet(tmp_path / "out" / "transfer.parquet")
     assert list(other["controller"]) == ["pilotnet", "cil"]
     assert set(other["found_on"]) == {"pilotnet"}
@@ -78,6 +86,10 @@ def test_jobs_that_fail_are_a_line_each(study, plan, tmp_path, monkeypatch):
     assert code == 1
     assert "FAILED street, K = 1-b, chance, seed 0: " in printed.out
     assert "sees nothing" in printed.out.split("FAILED")[1]
+    code, printed = study("run", plan, "--trust", "--out", tmp_path / "out", "--json")
+    assert code == 1
+    assert "FAILED street" in printed.err
+    assert "sees nothing" in answered(printed.out)["rows"][0]["error"]
 
 
 def test_mistakes_are_one_clear_line(study, plan, tmp_path):

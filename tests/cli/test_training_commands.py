@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 import needs
+from command import answered
 from roadproof.controllers import CIL, load_controller, model_card, shipped_names
 from roadproof.scenarios import find_scenario, save_scenarios
 
@@ -51,6 +52,12 @@ def test_scenarios_that_are_not_clean_are_named(invoke, short):
     assert code == 0, printed.err
     assert "0 of 2 scenarios clean" in printed.out
     assert "left-11: did not arrive" in printed.out
+    code, printed = invoke("check-controller", "cil", "--scenarios", short, "--processes", 1, "--json")
+    assert code == 0, printed.err
+    told = answered(printed.out)
+    assert told["passed"] is True
+    drives = [(each["scenario"], each["clean"], each["arrived"]) for each in told["drives"]]
+    assert drives == [("left-11", False, False), ("straight-02", False, False)]
 
 
 def test_a_controller_is_trained_from_the_command_line(invoke, tmp_path):

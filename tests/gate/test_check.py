@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import roadproof
+from command import answered, stored
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Control
 from roadproof.driving.drive_store import Episodes
@@ -233,6 +234,10 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     assert "failed: test-road, clear-noon, magenta" in said.out
     assert "see it: roadproof evaluate patterns/test-road/magenta.json --controller team_folder:magenta_shy" in said.out
     assert all(path.exists() for path in left)
+    code, said = invoke(*command, "--json")
+    assert code == 1
+    assert answered(said.out) == stored(tmp_path / "check.json")
+    assert "failed: test-road, clear-noon, magenta" in said.err
     # Nobody takes what a check before left for the result of one that could not be run.
     code, said = invoke(*command[:2], "--out", tmp_path)
     assert (code, said.out) == (2, "")

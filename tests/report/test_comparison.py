@@ -4,11 +4,13 @@ import dataclasses
 
 import pytest
 
-from command import roadproof
+from command import answered, roadproof
 from pages import HOSTILE, Page
 from roadproof.errors import RoadproofError
 from roadproof.patterns import raster
 from roadproof.report.comparison import compared, write_comparison
+from roadproof.report.page import result_of
+from roadproof.report.run import read_run
 from roadproof.scenarios import find_scenario
 from roadproof.simulators.protocol import PaintKind
 from runs import CRASH, PATTERN, write_run
@@ -55,10 +57,13 @@ def test_what_is_not_alike_is_said(runs, tmp_path):
     assert "offsets" not in [each["id"] for _, each in page.tags if "id" in each]
 
 
+def write_predicted(folder):
+    evaluation = dataclasses.replace(write_run(folder), paint=PaintKind.COMPOSITED)
+    evaluation.save(folder / "evaluation", raster(PATTERN))
+
+
 def test_driven_and_predicted_never_share_a_column(runs, tmp_path):
-    evaluation = write_run(tmp_path / "predicted")
-    predicted = dataclasses.replace(evaluation, paint=PaintKind.COMPOSITED)
-    predicted.save(tmp_path / "predicted" / "evaluation", raster(PATTERN))
+    write_predicted(tmp_path / "predicted")
     write_comparison([runs[0], tmp_path / "predicted"], tmp_path / "compare.html")
     page = Page((tmp_path / "compare.html").read_text())
     assert "driven, m" in page.text
@@ -91,3 +96,18 @@ def test_the_command_shows_a_table(runs, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "change m" in done.stdout
     assert (tmp_path / "deep" / "page.html").exists()
+
+
+def test_the_command_answers_programs_with_what_result_json_says(runs, tmp_path, invoke):
+    write_predicted(tmp_path / "predicted")
+    code, printed = invoke("compare", *runs, tmp_path / "predicted", "--out", tmp_path / "page.html", "--json")
+    assert (code, printed.err) == (0, "")
+    told = answered(printed.out)["runs"]
+    for run, one in zip(runs, told, strict=False):
+        kept = result_of(read_run(run))["closed_loop"]
+        rows = [row for row in kept["rows"] if not row["traffic"]]
+        assert [row["median_m"] for row in one["closed_loop"]["rows"]] == [row["median_m"] for row in rows]
+    assert ["foreseen" in each for each in told] == ["closed_loop" not in each for each in told] == [False, False, True]
+    assert told[1]["closed_loop"]["change_m"]["value"] < -0.1
+    # What is driven is not compared with what is predicted.
+    assert told[2]["foreseen"]["change_m"] is None

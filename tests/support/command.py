@@ -1,5 +1,6 @@
 """The installed command in a process of its own, where nothing checks types."""
 
+import json
 import os
 import subprocess
 import sys
@@ -17,3 +18,18 @@ def roadproof(*words, folder=None, before=""):
         text=True,
         timeout=600,
     )
+
+
+def answered(printed):
+    """What --json printed: one document, and no number in it that is none."""
+
+    def refuse(word):
+        raise AssertionError(f"{word} is not JSON")
+
+    assert printed.count("\n") == 1
+    return json.loads(printed, parse_constant=refuse)
+
+
+def stored(path):
+    """What a results file holds."""
+    return json.loads(path.read_text(encoding="utf-8"))
