@@ -115,7 +115,8 @@ def test_a_hardening_is_answered_as_its_file_has_it(invoke, tmp_path, monkeypatc
 
     def hardened(world, controller, training, out, **how):
         (out / "hardening.json").write_text(json.dumps({"format": "roadproof-hardening", "best": how["rounds"]}))
-        return Hardened(controller, f"{out}/hardened", (Round(0, {"left-07": 1.0}, 1.0),), 1, None)
+        done = (Round(0, {"left-07": 1.0}, 1.0),)
+        return Hardened(controller=controller, hardened=f"{out}/hardened", rounds=done, best=1, judgement=None)
 
     for room, name, made_up in (("harden", "harden", hardened), ("page", "write_hardening", lambda _, out: out)):
         monkeypatch.setattr(import_module(f"roadproof.hardening.{room}"), name, made_up)

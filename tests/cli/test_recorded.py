@@ -4,10 +4,11 @@ import dataclasses
 
 import pytest
 
-from command import answered, roadproof
+from command import answered, roadproof, stored
 from paint_shy import magenta
 from recorded_drives import drivable_set
-from roadproof.attacks import AttackResult
+from roadproof.attacks import AttackResult, Cheapest
+from roadproof.attacks.cheapest import Level
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
@@ -66,6 +67,32 @@ def test_a_predicted_drive_says_so_to_programs(workplace, tmp_path, invoke, monk
     told, episode = answered(printed.out), Episode.load(tmp_path / "episode.npz")
     assert (told["kind"], told["paint"], told["ending"]) == ("predicted", "composited", episode.ending)
     assert told["x_m"] == episode.x_m.tolist()
+
+
+def test_the_least_paint_stands_beside_the_strongest(workplace, tmp_path, invoke, monkeypatch):
+    def least(_drives, _attacked, found, wanted_m, **_how):
+        told = {"group": found.group, "wanted_m": wanted_m, "predicted_m": 0.06, "levels": (Level(8.0, 1, 0.06),)}
+        return Cheapest(pattern=found.pattern, conspicuousness=found.conspicuousness, **told)
+
+    monkeypatch.setattr("roadproof.attacks.cheapest", least)
+    quick = [
+        "--objective",
+        "steering",
+        "--method",
+        "random",
+        "--calls",
+        "1",
+        "--random-patterns",
+        "0",
+        "--figures",
+        "1",
+    ]
+    shy = ["--controller", "paint_shy:paint_shy", "--cheapest", "0.05", "--out", tmp_path]
+    code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick, "--json")
+    assert code == 0, printed.err
+    told = answered(printed.out)
+    assert told.pop("cheapest") == stored(tmp_path / "cheapest" / "cheapest.json")
+    assert told == stored(tmp_path / "result.json")
 
 
 def test_what_a_search_predicted_is_said_in_metres(tmp_path, invoke):

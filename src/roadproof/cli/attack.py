@@ -143,7 +143,7 @@ def attack(
             )
         if less is not None:
             less.save(out / "cheapest")
-            found["cheapest"] = stored(out / "cheapest" / "cheapest.json")
+        found["cheapest"] = None if less is None else stored(out / "cheapest" / "cheapest.json")
         say(in_words(less, cheapest))
     answer(found)
 
