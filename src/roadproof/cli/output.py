@@ -38,10 +38,10 @@ def answer(results: Mapping[str, object]) -> None:
     """
     if _answers is None:
         return
-    # A tenth of a second to import; `--help` should not.
+    # Only here, so that `--help` stays quick.
     import msgspec
 
-    # msgspec writes what is no number, NaN, as null; json marks beyond ASCII so that every terminal can show them.
+    # msgspec writes NaN as null; json escapes what is not ASCII, since a pipe may have any encoding.
     numbers = msgspec.json.encode(results, enc_hook=lambda value: value.tolist())
     _answers.write(json.dumps(msgspec.json.decode(numbers)) + "\n")
 
