@@ -62,16 +62,16 @@ def check(
     with stages() as show:
         result = run_check(chosen, who, out, compare=not accept, device=device, processes=processes, on_progress=show)
     _summarise(result, out)
-    if result.status is not Status.PASSED:
-        if accept:
-            say("This does not become the reference, since not all of it passed")
-        answer(stored(out / FILE))
-        raise typer.Exit(1)
-    if accept and chosen.reference is not None:
+    passed = result.status is Status.PASSED
+    if accept and not passed:
+        say("This does not become the reference, since not all of it passed")
+    elif accept and chosen.reference is not None:
         content = (out / FILE).read_bytes()
         write_atomically(chosen.reference, lambda part: part.write_bytes(content))
         say(f"From now on the reference is {chosen.reference}; keep it beside the plan")
     answer(stored(out / FILE))
+    if not passed:
+        raise typer.Exit(1)
 
 
 def _estimate(plan: CheckPlan, who: Controller, processes: int) -> Estimate:

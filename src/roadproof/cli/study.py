@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.pipeline.estimate import Estimate
     from roadproof.study.plan import Job, Study
-    from roadproof.study.rows import Frame, JobResult
+    from roadproof.study.rows import JobResult
 
 study = Verbs("Compare methods over many scenarios.")
 
@@ -62,7 +62,7 @@ def run(
     say(*(f"FAILED {line}" for line in bad))
     if bad:
         say("Give the same command again to try those once more")
-    answer({"rows": _plain(rows)})
+    answer({"rows": rows.to_dict("records")})
     if bad:
         raise typer.Exit(1)
 
@@ -100,12 +100,7 @@ def transfer(
     with stages() as show:
         rows = run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
     say(*transfer_summary(rows), f"Rows in {out / 'transfer.parquet'}")
-    answer({"rows": _plain(rows)})
-
-
-def _plain(rows: Frame) -> list[dict[str, object]]:
-    """Rows as objects, with None for what is not there."""
-    return rows.astype(object).where(rows.notna(), None).to_dict("records")
+    answer({"rows": rows.to_dict("records")})
 
 
 def tables(
