@@ -76,7 +76,7 @@ def test_a_controller_is_trained_from_the_command_line(invoke, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--network", "resnet"], "network is 'resnet', expected one of cil, pilotnet"),
+        (["--network", "resnet"], "network is 'resnet', expected one of cil, pilotnet, waypoint"),
         (["--drives", "0"], "--drives is 0, expected 1 to"),
         (["--samples", "5"], "5 samples are less than one batch of 128"),
         (["--start", "none.safetensors"], "none.safetensors does not exist"),

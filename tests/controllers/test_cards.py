@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from roadproof.controllers import PILOTNET_ON_CARLA, ControllerCard
+from roadproof.controllers import PILOTNET_ON_CARLA, ControllerCard, LinearMPC, PurePursuit
 from roadproof.controllers.cards import read_card
 from roadproof.errors import ControllerError
 
@@ -18,6 +18,8 @@ def card(**stated):
     [
         ControllerCard(),
         ControllerCard(architecture="cil", width=0.5, origin="a checkpoint"),
+        ControllerCard(architecture="waypoint", tracking=PurePursuit(sight_m=3.0)),
+        ControllerCard(tracking=LinearMPC(pieces=6), dt_s=0.25),
         ControllerCard(architecture="pilotnet", activation="relu", target_speed_mps=8.0, preparation=PILOTNET_ON_CARLA),
     ],
 )
@@ -40,6 +42,12 @@ def test_a_card_is_read_as_it_was_written(written):
         (card(preparation={"rows": [1, 2, 3]}), "rows is .* expected a list of 2 numbers"),
         (card(preparation={"rows": [1.5, 2]}), "expected whole numbers"),
         (card(preparation={"colour": "hsv"}), "colour is 'hsv'"),
+        (card(tracking={"law": "stanley"}), "tracking needs a law, one of pure-pursuit, linear-mpc"),
+        (card(tracking={"sight_m": 3}), "tracking needs a law"),
+        (card(tracking={"law": "pure-pursuit", "sigth_m": 3}), "unknown key 'sigth_m'; did you mean 'sight_m'"),
+        (card(tracking={"law": "linear-mpc", "pieces": 2.5}), r"pieces is \[2.5\], expected whole numbers"),
+        (card(tracking={"law": "pure-pursuit", "wheelbase_m": -1}), "wheelbase_m of the tracking law is -1"),
+        (card(dt_s="half"), "dt_s is 'half', expected a number"),
         (card(preparation=4), "where a JSON object is expected"),
     ],
 )

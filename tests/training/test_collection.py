@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
 import needs
-from roadproof.controllers import CIL, save_controller
+from roadproof.controllers import CIL, PurePursuit, save_controller
 from roadproof.errors import TrainingError
 from roadproof.scenarios import builtin_scenarios
 from roadproof.training.collection import CollectionPlan, collect, record_drive
@@ -33,6 +34,17 @@ def test_a_quiet_drive_follows_the_route_and_a_disturbed_one_leaves_it(worker):
     assert quiet.frames.shape[1:] == (88, 200, 3)
     assert quiet.about["weather"] == disturbed.about["weather"]
     assert (quiet.about["disturbed"], disturbed.about["disturbed"]) == (False, True)
+
+
+def test_the_recorded_path_is_the_one_that_the_expert_steers_along(worker):
+    drive = record_drive(worker.town, CollectionPlan(drives=1, seed=3, disturbed=1.0, traffic=0.0), 0, None)
+    path, speed = torch.tensor(drive.path_m), torch.tensor(drive.speed_mps)
+    steer = PurePursuit().steer(path, speed).clamp(-1.0, 1.0).numpy()
+    off = np.abs(steer - drive.expert[:, 0])
+    assert off.mean() < 0.02
+    assert off.mean() < 0.1 * np.abs(drive.expert[:, 0]).max()
+    # Points lie where they say, along the route: never nearer to the car than the way along it is long.
+    assert (np.linalg.norm(np.diff(drive.path_m, axis=1), axis=2) < 2.5 + 1e-4).all()
 
 
 def test_drives_start_at_rest_and_the_expert_wants_to_go(worker):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from roadproof.controllers import CIL, ConditionalPilotNet
+from roadproof.controllers import CIL, ConditionalPilotNet, CruiseControl, Plan, waypoint_controller
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.errors import TrainingError
 from roadproof.training.augmentation import Augmentation
@@ -14,6 +14,7 @@ from roadproof.training.imitation import (
     TrainingPlan,
     imitate,
     imitation_loss,
+    plan_loss,
     scale_dropout,
     steering_error,
 )
@@ -29,7 +30,9 @@ def drives(count=240, seed=0):
         frame[:, x - 8 : x + 8] = 240
     steer = (where - 100) / 160 + np.select([command == 3, command == 4], [-0.3, 0.3], 0.0)
     expert = np.stack([steer, np.full(count, 0.5), np.zeros(count)], 1).astype(np.float32)
-    return Dataset(frames, generator.uniform(0, 8, count).astype(np.float32), command, expert)
+    path = np.stack([np.arange(2.5, 20.1, 2.5) + 0 * steer[:, None], -np.outer(steer, np.arange(1, 9) ** 2 / 8)], 2)
+    speed = generator.uniform(0, 8, count).astype(np.float32)
+    return Dataset(frames, speed, command, expert, path.astype(np.float32))
 
 
 def tiny(seed=0):
@@ -39,7 +42,7 @@ def tiny(seed=0):
 PLAN = TrainingPlan(samples=32 * 60, batch=32, seed=1, learning_rate=4e-3, dropout=0.0, averaging=0.9)
 
 
-@pytest.mark.parametrize(("network", "left"), [(tiny, 0.45), (ConditionalPilotNet, 0.85)])
+@pytest.mark.parametrize(("network", "left"), [(tiny, 0.45), (ConditionalPilotNet, 0.85), (waypoint_controller, 0.95)])
 def test_a_network_learns_to_steer_by_picture_and_command(network, left):
     data, unseen = drives(), drives(80, seed=9)
     untrained = steering_error(network().eval(), unseen)
@@ -94,11 +97,31 @@ def test_training_leaves_the_global_random_state_alone():
 
 def test_the_loss_is_hubers_weighted():
     answer = ConditionalOutput(torch.tensor([[0.05, 0.0, 0.5]]), torch.tensor([0.3]))
-    batch = Batch(torch.zeros(1, 3, 2, 2), torch.tensor([0.1 * SPEED_SCALE_MPS]), torch.tensor([2]), torch.zeros(1, 3))
+    batch = Batch(
+        torch.zeros(1, 3, 2, 2),
+        torch.tensor([0.1 * SPEED_SCALE_MPS]),
+        torch.tensor([2]),
+        torch.zeros(1, 3),
+        torch.zeros(1, 8, 2),
+    )
     weights = LossWeights(steer=2.0, throttle=7.0, brake=3.0, speed=5.0)
     # Below 0.1: x² / 0.2; above: x − 0.05.
     expected = 2.0 * 0.05**2 / 0.2 + 3.0 * (0.5 - 0.05) + 5.0 * (0.2 - 0.05)
     assert float(imitation_loss(answer, batch, weights)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_loss_of_a_plan_is_hubers_of_shares_of_the_distance_and_of_pedals():
+    path = torch.tensor([[[3.0, 4.0], [10.0, 0.0]]])
+    cruise = CruiseControl(gain_per_mps=0.5, hold=0.1)
+    expert = torch.tensor([[0.0, 0.4, 0.0]])
+    batch = Batch(torch.zeros(1, 3, 2, 2), torch.tensor([6.0]), torch.tensor([2]), expert, path)
+    weights = LossWeights(steer=2.0, throttle=0.3, brake=0.1)
+    # One number of four is off by 0.5 m at 5 m; 6.6 m/s gives the expert's throttle, 7 m/s a fifth more.
+    off = torch.tensor([[[0.5, 0.0], [0.0, 0.0]]])
+    expected = 3.0 * 2.0 * (0.1 - 0.015) / 4 + 0.4 * (0.2 - 0.05)
+    loss = plan_loss(Plan(path + off, torch.tensor([7.0])), batch, weights, cruise)
+    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    assert float(plan_loss(Plan(path, torch.tensor([6.6])), batch, weights, cruise)) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_rate_rises_and_falls():
@@ -113,7 +136,7 @@ def test_the_rate_rises_and_falls():
 def test_commands_are_drawn_in_their_shares_whatever_was_recorded():
     data = drives(400)
     command = np.where(np.arange(400) < 300, 2, np.where(np.arange(400) < 380, 3, np.where(np.arange(400) < 395, 4, 5)))
-    data = Dataset(data.frames, data.speed_mps, command.astype(np.int8), data.expert)
+    data = Dataset(data.frames, data.speed_mps, command.astype(np.int8), data.expert, data.path_m)
     weights = data.weights().numpy()
     for asked, share in SHARES.items():
         assert weights[command == int(asked)].sum() == pytest.approx(share)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 import needs
-from roadproof.controllers import CIL, ConditionalPilotNet, load_controller
+from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController, load_controller
 from roadproof.errors import TrainingError
 from roadproof.training.recipe import Recipe, follow, gather
 
@@ -65,6 +65,7 @@ def test_a_recipe_may_start_from_weights(tmp_path):
     assert network.width == 0.05
     assert not network.is_folded
     assert isinstance(Recipe(start="pilotnet").fresh(), ConditionalPilotNet)
+    assert isinstance(Recipe(network="waypoint").fresh(), TrajectoryController)
 
 
 @pytest.mark.parametrize("changes", [{"network": "resnet"}, {"rounds": -1}, {"painted_drives": -2}])

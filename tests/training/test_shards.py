@@ -18,6 +18,7 @@ def drive(count=5, **changes):
         "command": np.full(count, 3, np.int8),
         "expert": generator.uniform(-1, 1, (count, 3)).astype(np.float32),
         "lateral_m": np.zeros(count, np.float32),
+        "path_m": generator.uniform(-9, 9, (count, 8, 2)).astype(np.float32),
         "about": {"weather": "clear-noon"},
     }
     return Shard(**(values | changes))
@@ -27,7 +28,7 @@ def test_a_drive_survives_its_file(tmp_path):
     saved = drive()
     saved.save(tmp_path / "a" / "drive.npz")
     loaded = Shard.load(tmp_path / "a" / "drive.npz")
-    for name in ("frames", "speed_mps", "command", "expert", "lateral_m"):
+    for name in ("frames", "speed_mps", "command", "expert", "lateral_m", "path_m"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name))
         assert getattr(loaded, name).dtype == getattr(saved, name).dtype
     assert loaded.about == saved.about
@@ -67,8 +68,8 @@ def test_missing_damaged_and_foreign_files_are_refused(tmp_path):
         members = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(tmp_path / "newer.npz", "w") as archive:
         for name, content in members.items():
-            archive.writestr(name, content.replace(b"\x31\x00\x00\x00\x2c", b"\x32\x00\x00\x00\x2c"))
+            archive.writestr(name, content.replace(b"\x32\x00\x00\x00\x2c", b"\x33\x00\x00\x00\x2c"))
     with np.load(tmp_path / "newer.npz") as stored:
-        assert json.loads(str(stored["header"]))["version"] == 2
-    with pytest.raises(TrainingError, match="version 2"):
+        assert json.loads(str(stored["header"]))["version"] == 3
+    with pytest.raises(TrainingError, match="version 3"):
         Shard.load(tmp_path / "newer.npz")

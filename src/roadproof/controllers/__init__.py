@@ -21,3 +21,9 @@ from roadproof.controllers.shipped import model_card as model_card
 from roadproof.controllers.shipped import shipped_names as shipped_names
 from roadproof.controllers.steering import CruiseControl as CruiseControl
 from roadproof.controllers.steering import SteeringController as SteeringController
+from roadproof.controllers.tracking import LinearMPC as LinearMPC
+from roadproof.controllers.tracking import PurePursuit as PurePursuit
+from roadproof.controllers.trajectory import Plan as Plan
+from roadproof.controllers.trajectory import TrajectoryController as TrajectoryController
+from roadproof.controllers.waypoint import WaypointNet as WaypointNet
+from roadproof.controllers.waypoint import waypoint_controller as waypoint_controller

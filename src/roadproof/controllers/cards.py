@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, cast
 
 from roadproof.controllers.frames import FramePreparation
+from roadproof.controllers.tracking import LAWS, LinearMPC, PurePursuit, law_name
 from roadproof.errors import ControllerError
 
 CARD_FORMAT = "roadproof-controller"
@@ -34,11 +35,13 @@ class ControllerCard:
     """What a weights file does not say by itself.
 
     Args:
-        architecture: "cil", "pilotnet" or "conditional-pilotnet", or None for an exported network.
+        architecture: "cil", "pilotnet", "conditional-pilotnet" or "waypoint", or None for an exported network.
         width: factor on CIL's channels and units, 1 by default.
         activation: activation of PilotNet, "elu" or "relu".
         target_speed_mps: speed in m/s that is held when a network that only steers drives, 6 by default.
         preparation: how frames become the network's input; None for the architecture's own.
+        tracking: law that steers along the points that the network answers with; None for a network that steers.
+        dt_s: time between those points, seconds; None where they have no times.
         origin: what the weights were made from, in words; None if it is not said.
     """
 
@@ -47,11 +50,15 @@ class ControllerCard:
     activation: str = "elu"
     target_speed_mps: float = 6.0
     preparation: FramePreparation | None = None
+    tracking: PurePursuit | LinearMPC | None = None
+    dt_s: float | None = None
     origin: str | None = None
 
     def to_json(self) -> str:
         """The card as text, with its format version."""
         stated = {name: value for name, value in asdict(self).items() if value is not None}
+        if self.tracking is not None:
+            stated["tracking"] = {"law": law_name(self.tracking), **stated["tracking"]}
         return json.dumps({"format": CARD_FORMAT, "version": CARD_VERSION, **stated}, indent=2)
 
 
@@ -78,10 +85,27 @@ def read_card(text: str, source: str) -> ControllerCard:
     values: dict[str, Any] = {
         name: _text(stated, name, source) for name in ("architecture", "activation", "origin") if name in stated
     }
-    values |= {name: _number(stated[name], name, source) for name in ("width", "target_speed_mps") if name in stated}
+    values |= {
+        name: _number(stated[name], name, source) for name in ("width", "target_speed_mps", "dt_s") if name in stated
+    }
     if "preparation" in stated:
         values["preparation"] = _preparation(_object(stated["preparation"], source), source)
+    if "tracking" in stated:
+        values["tracking"] = _tracking(_object(stated["tracking"], source), source)
     return ControllerCard(**values)
+
+
+def _tracking(stated: dict[str, object], source: str) -> PurePursuit | LinearMPC:
+    law = LAWS.get(str(stated.pop("law", None)))
+    if law is None:
+        raise ControllerError(f"card {source}: tracking needs a law, one of {', '.join(LAWS)}")
+    _known(stated, cast("type", law), source)
+    whole = {field.name for field in fields(law) if isinstance(field.default, int)}
+    numbers = {
+        name: _numbers([value], 1, name, source)[0] if name in whole else _number(value, name, source)
+        for name, value in stated.items()
+    }
+    return law(**cast("dict[str, Any]", numbers))
 
 
 def _preparation(stated: dict[str, object], source: str) -> FramePreparation:

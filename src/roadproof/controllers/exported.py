@@ -26,6 +26,7 @@ from roadproof.controllers.cards import ControllerCard
 from roadproof.controllers.frames import FramePreparation
 from roadproof.controllers.onnx_graph import OnnxGraph
 from roadproof.controllers.steering import CruiseControl, SteeringController
+from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import in_one_line
 
@@ -36,7 +37,7 @@ _YUV_SIGNED = FramePreparation(colour="yuv", mean=(0.5, 0.5, 0.5), std=(0.5, 0.5
 
 def exported_controller(
     path: Path, card: ControllerCard, *, device: torch.device, dtype: torch.dtype
-) -> SteeringController:
+) -> SteeringController | TrajectoryController:
     """A controller around an exported network.
 
     Args:
@@ -56,6 +57,10 @@ def exported_controller(
             raise DeviceError(f"{path} computes in {own.pop()}, not {dtype}; ask for that dtype or export it again")
     names, preparation = _bound(network.inputs, card, path)
     cruise = CruiseControl(target_mps=card.target_speed_mps)
+    if card.tracking is not None:
+        return TrajectoryController(
+            network, preparation=preparation, law=card.tracking, dt_s=card.dt_s, inputs=names, cruise=cruise
+        )
     return SteeringController(network, preparation=preparation, inputs=names, cruise=cruise)
 
 
@@ -113,7 +118,9 @@ class TorchProgram(nn.Module):
             answer = cast("tuple[object, ...]", answer)[0]
         if not isinstance(answer, Tensor):
             kind = type(cast("object", answer)).__name__
-            raise ControllerError(f"{self.path} answers with a {kind}, expected one output: the steering")
+            raise ControllerError(
+                f"{self.path} answers with a {kind}, expected one output: the steering, or points ahead"
+            )
         return answer
 
     def train(self, mode: bool = True) -> TorchProgram:  # noqa: ARG002

@@ -25,11 +25,13 @@ from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet
 from roadproof.controllers.protocol import Controller, missing_members
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.steering import CruiseControl, SteeringController
+from roadproof.controllers.trajectory import TrajectoryController
+from roadproof.controllers.waypoint import WAYPOINT_ON_CARLA, WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
 from roadproof.io.files import write_tensors
 
-ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet")
+ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet", "waypoint")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
     "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, "
@@ -46,15 +48,15 @@ def runs_code(spec: str) -> bool:
     return spec.endswith(".pt2") or (bool(tail) and head not in ARCHITECTURES)
 
 
-def load_network(path: Path) -> CIL | ConditionalPilotNet:
+def load_network(path: Path) -> CIL | ConditionalPilotNet | TrajectoryController:
     """A network ready for training: batch normalisation not merged, gradients on, in float32.
 
     Raises:
         ControllerError: the file is missing, damaged, or holds weights that cannot be trained on here.
     """
     network = _from_weights(path, None)
-    if not isinstance(network, CIL | ConditionalPilotNet):
-        raise ControllerError(f"{path} holds a {type(network).__name__}, expected CIL or a conditional PilotNet")
+    if not isinstance(network, CIL | ConditionalPilotNet | TrajectoryController):
+        raise ControllerError(f"{path} holds a PilotNet, expected CIL, a conditional PilotNet or a waypoint network")
     return network
 
 
@@ -143,13 +145,13 @@ def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | 
 
 
 def save_controller(
-    controller: CIL | ConditionalPilotNet | SteeringController,
+    controller: CIL | ConditionalPilotNet | SteeringController | TrajectoryController,
     path: Path,
     *,
     dtype: str = "float32",
     origin: str | None = None,
 ) -> None:
-    """Write a CIL or PilotNet controller as safetensors, its card in the header.
+    """Write a CIL, PilotNet or waypoint controller as safetensors, its card in the header.
 
     Args:
         controller: the network as it was trained, not folded.
@@ -175,8 +177,12 @@ def save_controller(
             target_speed_mps=controller.cruise.target_mps,
             preparation=controller.preparation,
         )
+    elif isinstance(network, WaypointNet) and isinstance(controller, TrajectoryController):
+        card = ControllerCard(architecture="waypoint", preparation=controller.preparation, tracking=controller.law)
     else:
-        raise ControllerError(f"cannot save a {type(network).__name__}, expected CIL or PilotNet; export it instead")
+        raise ControllerError(
+            f"cannot save a {type(network).__name__}, expected CIL, PilotNet or a waypoint network; export it instead"
+        )
     kept = torch.float16 if dtype == "float16" else torch.float32
     tensors = {name: tensor.detach().cpu().to(kept).contiguous() for name, tensor in network.state_dict().items()}
     write_tensors(path, tensors, {_METADATA_KEY: replace(card, origin=origin).to_json()})
@@ -196,6 +202,10 @@ def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
         network = CIL(width=card.width) if card.architecture == "cil" else _conditional_pilotnet(card)
         _fill(network, state, path)
         return network
+    if card.architecture == "waypoint":
+        planner = waypoint_controller(preparation=card.preparation or WAYPOINT_ON_CARLA, law=card.tracking)
+        _fill(planner.network, state, path)
+        return planner
     controller = pilotnet_controller(
         activation=card.activation,
         preparation=card.preparation or PILOTNET_ON_CARLA,

@@ -42,17 +42,26 @@ class CruiseControl:
         effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
         return Control(steer=steer, throttle=max(effort, 0.0), brake=max(-effort, 0.0)).clipped()
 
-    def controls(self, steer: Float[Tensor, " b"], speed_mps: Float[Tensor, " b"]) -> Float[Tensor, "b 3"]:
-        """Controls of many cars: steer, throttle and brake inside their ranges, differentiable."""
-        effort = self.hold + self.gain_per_mps * (self.target_mps - speed_mps)
+    def controls(
+        self, steer: Float[Tensor, " b"], speed_mps: Float[Tensor, " b"], target_mps: Float[Tensor, " b"] | None = None
+    ) -> Float[Tensor, "b 3"]:
+        """Controls of many cars: steer, throttle and brake inside their ranges, differentiable.
+
+        Args:
+            steer: steering of each car.
+            speed_mps: speed of each car, m/s.
+            target_mps: speed that each shall approach, m/s; None for `target_mps` of the cruise control.
+        """
+        wanted = self.target_mps if target_mps is None else target_mps
+        effort = self.hold + self.gain_per_mps * (wanted - speed_mps)
         return torch.stack([steer.clamp(-1.0, 1.0), effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0)], 1)
 
 
-class SteeringController(nn.Module):
-    """A `Controller` around a network that answers with one steering value a frame.
+class NetworkController(nn.Module):
+    """What controllers around a network share: its frames prepared, its inputs by name, its speed held.
 
     Args:
-        network: network that takes the `inputs`, in order, and answers with shape (B,) or (B, 1).
+        network: network that takes the `inputs`, in order.
         preparation: how the network's frames are made from those of a recording.
         inputs: what the network takes: "frames", and "speed_mps" and "command" if it wants them.
         cruise: cruise control that holds the speed when driving.
@@ -77,13 +86,13 @@ class SteeringController(nn.Module):
         """(height, width) of the frames it takes, or None when it takes any size."""
         return self.preparation.frame_size
 
-    def steer(
+    def answer(
         self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
-        """Steering, positive to the right and not clipped; see `Controller.steer`.
+    ) -> object:
+        """What the network answers, in its own dtype.
 
         Raises:
-            ControllerError: the frames have the wrong size, or the answer is not one value per frame.
+            ControllerError: the frames have the wrong size.
         """
         tensors = chain(self.network.parameters(), self.network.buffers())
         dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), frames.dtype)
@@ -92,7 +101,21 @@ class SteeringController(nn.Module):
             "speed_mps": speed_mps.to(dtype),
             "command": command.to(torch.int64),
         }
-        answer: object = self.network(*(values[name] for name in self.inputs))
+        return self.network(*(values[name] for name in self.inputs))
+
+
+class SteeringController(NetworkController):
+    """A `Controller` around a network that answers with one steering value a frame, of shape (B,) or (B, 1)."""
+
+    def steer(
+        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+    ) -> Float[Tensor, " b"]:
+        """Steering, positive to the right and not clipped; see `Controller.steer`.
+
+        Raises:
+            ControllerError: the frames have the wrong size, or the answer is not one value per frame.
+        """
+        answer = self.answer(frames, speed_mps, command)
         if not isinstance(answer, Tensor):
             raise ControllerError(
                 f"network answers with a {type(answer).__name__}, expected one tensor: a steering value a frame"

@@ -30,7 +30,14 @@ import torch
 from torch import nn
 
 from roadproof.attacks.objective import variation_of
-from roadproof.controllers import CIL, ConditionalPilotNet, Controller, SteeringController, load_controller
+from roadproof.controllers import (
+    CIL,
+    ConditionalPilotNet,
+    Controller,
+    SteeringController,
+    TrajectoryController,
+    load_controller,
+)
 from roadproof.controllers.identity import identity_of
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
 from roadproof.driving.evaluation import ATTACK
@@ -289,7 +296,9 @@ def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> Non
 
 def _save(network: nn.Module, run: _Run, path: Path, number: int) -> None:
     origin = f"{run.spec}, hardened for {number} rounds on {', '.join(each.name for each in run.scenarios)}"
-    if isinstance(network, CIL | ConditionalPilotNet | SteeringController) and not runs_code(run.spec):
+    if isinstance(network, CIL | ConditionalPilotNet | SteeringController | TrajectoryController) and not runs_code(
+        run.spec
+    ):
         save_controller(network, path, origin=origin)
         return
     tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}

@@ -98,6 +98,13 @@ class Route:
             command=Command(int(self.commands[low + k])),
         )
 
+    def ahead(self, arclengths_m: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 2"]:
+        """World x, y at distances from the start, metres; beyond its end the route goes straight on."""
+        beyond = np.maximum(arclengths_m - self.length_m, 0.0)[:, None]
+        end = self.headings_rad[-1]
+        inside = interpolated(arclengths_m, self.arclengths_m, self.points[:, :2])
+        return inside + beyond * np.array([math.cos(end), math.sin(end)])
+
     def at(self, arclength_m: float) -> tuple[float, float, float, float]:
         """(x, y, z, heading) at a distance from the start, held at both ends."""
         x, y, z = interpolated(arclength_m, self.arclengths_m, self.points).tolist()

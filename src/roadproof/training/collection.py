@@ -7,15 +7,19 @@ the drives can be filled up later.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from roadproof.controllers import Controller
-from roadproof.datatypes import Command, Control, Observation, Weather
+from roadproof.controllers.waypoint import PATH_M
+from roadproof.datatypes import Command, Control, Observation, VehicleState, Weather
 from roadproof.driving.rollout import Policy, policy_of, rollout
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
@@ -72,6 +76,15 @@ class CollectionPlan:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
 
 
+class _Row(NamedTuple):
+    """What is kept of one frame."""
+
+    seen: Observation
+    expert: Control
+    lateral_m: float
+    path_m: Float[np.ndarray, "p 2"]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Conditions:
     """What a drive is like; follows from plan and number."""
@@ -126,7 +139,7 @@ def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, control
         controller: the controller that drives; None for the expert.
     """
     given = _conditions(plan, number)
-    rows: list[tuple[Observation, Control, float]] = []
+    rows: list[_Row] = []
 
     def driver(town: TownSimulator) -> Policy:
         expert_of, policy = expert(town), None if controller is None else policy_of(controller, town)
@@ -137,7 +150,7 @@ def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, control
             answer = expert_of(seen)
             still_s = still_s + town.dt_s if seen.state.speed_mps < 0.1 and answer.throttle == 0.0 else 0.0
             if still_s <= STILL_S:
-                rows.append((seen, answer, town.place.lateral_m))
+                rows.append(_Row(seen, answer, town.place.lateral_m, _path_ahead(town, seen.state)))
             control = answer if policy is None else policy(seen)
             return control if given.disturbance is None else given.disturbance.on(control, next(steps))
 
@@ -197,16 +210,22 @@ def _random_paint(generator: np.random.Generator) -> PatternImage:
     return raster(space.pattern(space.random((), draw)))
 
 
-def _shard(
-    rows: list[tuple[Observation, Control, float]], plan: CollectionPlan, number: int, given: _Conditions
-) -> Shard:
-    seen, answers, lateral = zip(*rows, strict=True)
+def _path_ahead(town: TownSimulator, state: VehicleState) -> Float[np.ndarray, "p 2"]:
+    """Points of the route, `PATH_M` ahead of the place beside the car: metres ahead of and left of the car."""
+    apart = town.route.ahead(town.place.arclength_m + np.array(PATH_M)) - (state.x_m, state.y_m)
+    c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+    return apart @ np.array([[c, -s], [s, c]])
+
+
+def _shard(rows: list[_Row], plan: CollectionPlan, number: int, given: _Conditions) -> Shard:
+    seen, answers, lateral, paths = zip(*rows, strict=True)
     return Shard(
         frames=np.stack([one.frame for one in seen]),
         speed_mps=np.array([one.state.speed_mps for one in seen], np.float32),
         command=np.array([int(one.command) for one in seen], np.int8),
         expert=np.array([(a.steer, a.throttle, a.brake) for a in answers], np.float32),
         lateral_m=np.array(lateral, np.float32),
+        path_m=np.array(paths, np.float32),
         about={
             "plan": asdict(plan),
             "number": number,

@@ -28,12 +28,14 @@ class Batch(NamedTuple):
         speed_mps: speed of the car at each frame.
         command: command at each frame, in CARLA's codes.
         expert: steer, throttle and brake that the expert would give at each frame.
+        path_m: points of the route ahead, metres ahead of and left of the car.
     """
 
     frames: Float[Tensor, "b 3 h w"]
     speed_mps: Float[Tensor, " b"]
     command: Int[Tensor, " b"]
     expert: Float[Tensor, "b 3"]
+    path_m: Float[Tensor, "b p 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,12 +47,14 @@ class Dataset:
         speed_mps: speed of the car at each frame.
         command: command at each frame, in CARLA's codes.
         expert: steer, throttle and brake that the expert would give at each frame.
+        path_m: points of the route ahead, metres ahead of and left of the car.
     """
 
     frames: UInt8[np.ndarray, "n h w 3"]
     speed_mps: Float32[np.ndarray, " n"]
     command: Int8[np.ndarray, " n"]
     expert: Float32[np.ndarray, "n 3"]
+    path_m: Float32[np.ndarray, "n p 2"]
 
     @classmethod
     def load(cls, paths: Sequence[Path]) -> Dataset:
@@ -94,4 +98,5 @@ class Dataset:
             torch.from_numpy(self.speed_mps[index]).to(device),
             torch.from_numpy(self.command[index].astype(np.int64)).to(device),
             torch.from_numpy(self.expert[index]).to(device),
+            torch.from_numpy(self.path_m[index]).to(device),
         )

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import Control, Observation, VehicleState
-from roadproof.roads.polylines import interpolated
 from roadproof.roads.routes import Route
 from roadproof.simulators.protocol import OpenWorld
 from roadproof.traffic.agents import (
@@ -97,10 +96,8 @@ class Expert:
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
         rear_x, rear_y = state.x_m - 0.5 * WHEELBASE_M * c, state.y_m - 0.5 * WHEELBASE_M * s
         sight = max(self._manner.sight_m, self._manner.sight_s * state.speed_mps)
-        aim = self._at_m - 0.5 * WHEELBASE_M + sight
-        x, y, _, heading = self._route.at(aim)
-        beyond = max(aim - self._route.length_m, 0.0)
-        dx, dy = x + beyond * math.cos(heading) - rear_x, y + beyond * math.sin(heading) - rear_y
+        x, y = self._route.ahead(np.array([self._at_m - 0.5 * WHEELBASE_M + sight]))[0].tolist()
+        dx, dy = x - rear_x, y - rear_y
         aside, apart = dy * c - dx * s, math.hypot(dx, dy)
         wheel = math.atan(2.0 * WHEELBASE_M * aside / max(apart * apart, 1e-6))
         return min(max(-wheel / MAX_STEER_RAD, -1.0), 1.0)
@@ -110,12 +107,7 @@ class Expert:
         if len(cars) + len(pedestrians) == 0:
             return math.inf
         assert self._at_m is not None
-        at = self._at_m + AHEAD_M
-        route = self._route
-        beyond = np.maximum(at - route.length_m, 0.0)
-        end = float(route.headings_rad[-1])
-        x, y = interpolated(at, route.arclengths_m, route.points[:, :2]).T
-        x, y = x + beyond * math.cos(end), y + beyond * math.sin(end)
+        x, y = self._route.ahead(self._at_m + AHEAD_M).T
         free_m, leader = first_in_way(
             x[None],
             y[None],

@@ -19,9 +19,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from roadproof.controllers import CIL, ConditionalPilotNet
+from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.controllers.precision import multiplies_bfloat16
+from roadproof.controllers.steering import CruiseControl
+from roadproof.controllers.trajectory import Plan
 from roadproof.controllers.weights import seeded
 from roadproof.errors import TrainingError
 from roadproof.io.files import write_atomically
@@ -29,13 +31,20 @@ from roadproof.training.augmentation import Augmentation
 from roadproof.training.dataset import Batch, Dataset
 from roadproof.training.pasting import PastedPaint
 
-Learner = CIL | ConditionalPilotNet
-"""A network that can be trained: frames, speed and command in, `ConditionalOutput` out."""
+Learner = CIL | ConditionalPilotNet | TrajectoryController
+"""A network that can be trained: frames, speed and command in, `ConditionalOutput` or `Plan` out."""
+
+
+PATH_COUNTS = 3.0
+"""A point that is off by a hundredth of its distance changes steering by about three hundredths."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LossWeights:
-    """How much each answer counts. Steering alone keeps a car in its lane, the pedals make it arrive."""
+    """How much each answer counts. Steering alone keeps a car in its lane, the pedals make it arrive.
+
+    A path counts as steering does, by how far its points are off as a share of their distance; a speed as both pedals.
+    """
 
     steer: float = 0.6
     throttle: float = 0.2
@@ -176,13 +185,18 @@ def _step(
     device = batch.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16, enabled=multiplies_bfloat16(device))
     with seeded(plan.seed * 1_000_003 + step), mixed:
-        answer: ConditionalOutput = network(batch.frames, batch.speed_mps, batch.command)
-    loss = imitation_loss(answer, batch, plan.loss)
+        answer: ConditionalOutput | Plan = network(batch.frames, batch.speed_mps, batch.command)
+    if isinstance(network, TrajectoryController):
+        assert isinstance(answer, Plan)
+        loss, steer = plan_loss(answer, batch, plan.loss, network.cruise), network.steer_along(answer, batch.speed_mps)
+    else:
+        assert isinstance(answer, ConditionalOutput)
+        loss, steer = imitation_loss(answer, batch, plan.loss), answer.controls[:, 0]
     optimiser.zero_grad()
     loss.backward()
     nn.utils.clip_grad_norm_(network.parameters(), 5.0)
     optimiser.step()
-    return torch.stack([loss.detach(), (answer.controls[:, 0] - batch.expert[:, 0]).detach().abs().mean()]).cpu()
+    return torch.stack([loss.detach(), (steer - batch.expert[:, 0]).detach().abs().mean()]).cpu()
 
 
 def imitation_loss(answer: ConditionalOutput, batch: Batch, weights: LossWeights) -> Float[Tensor, ""]:
@@ -191,6 +205,20 @@ def imitation_loss(answer: ConditionalOutput, batch: Batch, weights: LossWeights
     speed = functional.smooth_l1_loss(answer.speed.float(), batch.speed_mps / SPEED_SCALE_MPS, beta=0.1)
     parts = weights.steer * each[0] + weights.throttle * each[1] + weights.brake * each[2]
     return parts + weights.speed * speed
+
+
+def plan_loss(answer: Plan, batch: Batch, weights: LossWeights, cruise: CruiseControl) -> Float[Tensor, ""]:
+    """Huber's loss of path and speed, weighted and added up.
+
+    The speed to learn is the one for which `cruise` gives the expert's pedals; its error counts in units of them.
+    """
+    distance = batch.path_m.square().sum(2, keepdim=True).sqrt().clamp_min(1.0)
+    path = functional.smooth_l1_loss(answer.path.float() / distance, batch.path_m / distance, beta=0.03)
+    effort = batch.expert[:, 1] - batch.expert[:, 2] - cruise.hold
+    assert answer.target_mps is not None
+    given = (answer.target_mps.float() - batch.speed_mps) * cruise.gain_per_mps
+    speed = functional.smooth_l1_loss(given, effort, beta=0.1)
+    return PATH_COUNTS * weights.steer * path + (weights.throttle + weights.brake) * speed
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from roadproof.controllers import CIL, ConditionalPilotNet, save_controller
+from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, waypoint_controller
 from roadproof.controllers.loading import load_network
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.errors import TrainingError
@@ -35,7 +35,7 @@ from roadproof.training.imitation import Learner, TrainingPlan, imitate
 
 FORMAT = "roadproof-recipe"
 FORMAT_VERSION = 1
-NETWORKS = ("cil", "pilotnet")
+NETWORKS = ("cil", "pilotnet", "waypoint")
 
 OnStage = Callable[[str, int, int, str], object]
 """Called with a stage's name, how much of it is done, of how much, and a word about it."""
@@ -50,7 +50,7 @@ class Recipe:
     """How a controller is made.
 
     Args:
-        network: "cil", or "pilotnet" for the conditional PilotNet.
+        network: "cil", "pilotnet" for the conditional PilotNet, or "waypoint" for the one that sees a path.
         width: factor on the channels and units of CIL.
         seed: the seed of scenarios, traffic, disturbances, weights and batches.
         start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
@@ -99,7 +99,9 @@ class Recipe:
             return load_network(shipped_weights(self.start) if named else Path(self.start))
         if self.network == "cil":
             return CIL(width=self.width, seed=self.seed)
-        return ConditionalPilotNet(seed=self.seed)
+        return (
+            waypoint_controller(seed=self.seed) if self.network == "waypoint" else ConditionalPilotNet(seed=self.seed)
+        )
 
     def expert_plans(self) -> dict[str, CollectionPlan]:
         """The plans of the expert's drives, by the name of their folder."""

@@ -17,8 +17,8 @@ from roadproof.errors import TrainingError
 from roadproof.io.arrays import read_record, write_archive
 
 FORMAT = "roadproof-shard"
-FORMAT_VERSION = 1
-_ARRAYS = ("frames", "speed_mps", "command", "expert", "lateral_m")
+FORMAT_VERSION = 2
+_ARRAYS = ("frames", "speed_mps", "command", "expert", "lateral_m", "path_m")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -31,6 +31,7 @@ class Shard:
         command: (n,) command at each frame, in CARLA's codes (`datatypes.Command`).
         expert: (n, 3) steer, throttle and brake the expert would give there; never what disturbed the drive.
         lateral_m: (n,) offset of the car from the route, metres, left positive.
+        path_m: (n, p, 2) points of the route ahead, from near to far, metres ahead of and left of the car's middle.
         about: scenario, weather, traffic, seed, who drove: for people and statistics.
 
     Raises:
@@ -42,6 +43,7 @@ class Shard:
     command: Int8[np.ndarray, "..."]
     expert: Float32[np.ndarray, "..."]
     lateral_m: Float32[np.ndarray, "..."]
+    path_m: Float32[np.ndarray, "..."]
     about: Mapping[str, Any]
 
     def __post_init__(self) -> None:
@@ -51,10 +53,12 @@ class Shard:
                 f"frames of shape {self.frames.shape} with answers of shape {self.expert.shape}, "
                 "expected (n, h, w, 3) and (n, 3)"
             )
+        if self.path_m.ndim != 3 or self.path_m.shape[::2] != (count, 2):
+            raise TrainingError(f"path_m has shape {self.path_m.shape}, expected ({count}, p, 2)")
         for name in ("speed_mps", "command", "lateral_m"):
             if getattr(self, name).shape != (count,):
                 raise TrainingError(f"{name} has shape {getattr(self, name).shape}, expected ({count},)")
-        for name in ("speed_mps", "expert", "lateral_m"):
+        for name in ("speed_mps", "expert", "lateral_m", "path_m"):
             if not np.isfinite(getattr(self, name)).all():
                 raise TrainingError(f"{name} of the drive has NaN or infinite values")
 
