@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,6 +12,7 @@ from roadproof.driving.rollout import rollout
 from roadproof.errors import ControllerError
 from roadproof.scenarios import find_scenario
 from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.training.collection import path_ahead
 from roadproof.training.expert import expert
 
 AHEAD = torch.linspace(0.1, 20.0, 400, dtype=torch.float64)
@@ -99,9 +99,7 @@ def test_a_car_in_the_town_that_follows_its_route_stays_on_it(law, most_m):
 
         def drive(seen):
             here = seen.state
-            apart = town.route.ahead(town.place.arclength_m + np.arange(2.5, 20.1, 2.5)) - (here.x_m, here.y_m)
-            c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
-            path = torch.tensor(apart @ np.array([[c, -s], [s, c]]))[None]
+            path = torch.tensor(path_ahead(town, here))[None]
             aside.append(abs(town.place.lateral_m))
             steer = float(law.steer(path, torch.tensor([here.speed_mps], dtype=torch.float64)))
             control = drives(seen)

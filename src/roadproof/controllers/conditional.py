@@ -105,9 +105,16 @@ class ConditionalNetwork(nn.Module):
         self, image: Float[Tensor, "b image"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Float[Tensor, "b 3"]:
         joined = self.joined(image, (speed_mps / SPEED_SCALE_MPS).to(image.dtype)[:, None])
-        # All heads, then the commanded one: they are half a percent of the work, and nothing waits for the device.
-        every = torch.stack([branch(joined) for branch in self.branches], dim=1)
-        return every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, 3))[:, 0]
+        return commanded(self.branches, joined, command)
+
+
+def commanded(
+    heads: nn.ModuleList, joined: Float[Tensor, "b joined"], command: Int[Tensor, " b"]
+) -> Float[Tensor, "b out"]:
+    """What the head of each command answers."""
+    # All heads, then the commanded one: they are half a percent of the work, and nothing waits for the device.
+    every = torch.stack([head(joined) for head in heads], dim=1)
+    return every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, every.shape[2]))[:, 0]
 
 
 def branch_of(command: Int[Tensor, " b"]) -> Int[Tensor, " b"]:

@@ -24,7 +24,7 @@ from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
 from roadproof.controllers.protocol import Controller, missing_members
 from roadproof.controllers.shipped import shipped_weights
-from roadproof.controllers.steering import CruiseControl, SteeringController
+from roadproof.controllers.steering import CruiseControl, NetworkController
 from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.controllers.waypoint import WAYPOINT_ON_CARLA, WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError, DeviceError
@@ -145,7 +145,7 @@ def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | 
 
 
 def save_controller(
-    controller: CIL | ConditionalPilotNet | SteeringController | TrajectoryController,
+    controller: CIL | ConditionalPilotNet | NetworkController,
     path: Path,
     *,
     dtype: str = "float32",

@@ -145,7 +145,7 @@ def point_along(path: Float[Tensor, "b n 2"], distance_m: Float[Tensor, " b"]) -
     """
     points = torch.cat([torch.zeros_like(path[:, :1]), path], 1)
     steps = torch.diff(points, dim=1)
-    lengths = (steps.square().sum(2) + 1e-18).sqrt()
+    lengths = lengths_of(steps)
     ends = lengths.cumsum(1)
     piece = torch.searchsorted(ends.detach(), distance_m[:, None].detach()).clamp_max(steps.shape[1] - 1)
     place = piece[:, :, None].expand(-1, 1, 2)
@@ -154,5 +154,10 @@ def point_along(path: Float[Tensor, "b n 2"], distance_m: Float[Tensor, " b"]) -
     share = (left / length).clamp_max(1.0)
     along = points.gather(1, place)[:, 0] + share[:, None] * steps.gather(1, place)[:, 0]
     end = path[:, -1]
-    direction = end / (end.square().sum(1) + 1e-18).sqrt().clamp_min(LEAST_M)[:, None]
+    direction = end / lengths_of(end).clamp_min(LEAST_M)[:, None]
     return along + (distance_m - ends[:, -1]).clamp_min(0.0)[:, None] * direction
+
+
+def lengths_of(steps: Float[Tensor, "*s 2"]) -> Float[Tensor, "*s"]:
+    """Lengths of steps in metres, with a finite gradient where a step is none."""
+    return (steps.square().sum(-1) + 1e-18).sqrt()

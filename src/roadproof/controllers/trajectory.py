@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from roadproof.controllers.frames import FramePreparation, one_frame_batch
 from roadproof.controllers.steering import CruiseControl, NetworkController
-from roadproof.controllers.tracking import LinearMPC, PurePursuit
+from roadproof.controllers.tracking import LinearMPC, PurePursuit, lengths_of
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 
@@ -87,7 +87,7 @@ class TrajectoryController(NetworkController):
         if self.dt_s is None:
             return Plan(path, None)
         steps = torch.diff(torch.cat([torch.zeros_like(path[:, :1]), path], 1), dim=1)
-        return Plan(path, (steps.square().sum(2) + 1e-18).sqrt().mean(1) / self.dt_s)
+        return Plan(path, lengths_of(steps).mean(1) / self.dt_s)
 
     def steer(
         self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from roadproof.controllers.cil import CentredBatchNorm2d
-from roadproof.controllers.conditional import BRANCHES, SPEED_SCALE_MPS, branch_of
+from roadproof.controllers.conditional import BRANCHES, SPEED_SCALE_MPS, commanded
 from roadproof.controllers.frames import FramePreparation
 from roadproof.controllers.steering import CruiseControl
 from roadproof.controllers.tracking import LinearMPC, PurePursuit
@@ -72,9 +72,7 @@ class WaypointNet(nn.Module):
         """The path and the speed of the commanded head."""
         image = self.image(self.squeeze(self.blocks(functional.silu(self.stem(frames)))))
         joined = torch.cat([image, speed_mps[:, None] / SPEED_SCALE_MPS], 1)
-        every = torch.stack([head(joined) for head in self.heads], 1)
-        size = every.shape[2]
-        answer = every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, size))[:, 0]
+        answer = commanded(self.heads, joined, command)
         # The network says by how much the way differs from straight on, as a share of the distance.
         shares = answer[:, 1:].reshape(len(frames), -1, 2)
         path = self.straight + shares * self.straight[:, :1]

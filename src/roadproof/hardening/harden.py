@@ -30,16 +30,10 @@ import torch
 from torch import nn
 
 from roadproof.attacks.objective import variation_of
-from roadproof.controllers import (
-    CIL,
-    ConditionalPilotNet,
-    Controller,
-    SteeringController,
-    TrajectoryController,
-    load_controller,
-)
+from roadproof.controllers import CIL, ConditionalPilotNet, Controller, load_controller
 from roadproof.controllers.identity import identity_of
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
+from roadproof.controllers.steering import NetworkController
 from roadproof.driving.evaluation import ATTACK
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
@@ -296,9 +290,7 @@ def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> Non
 
 def _save(network: nn.Module, run: _Run, path: Path, number: int) -> None:
     origin = f"{run.spec}, hardened for {number} rounds on {', '.join(each.name for each in run.scenarios)}"
-    if isinstance(network, CIL | ConditionalPilotNet | SteeringController | TrajectoryController) and not runs_code(
-        run.spec
-    ):
+    if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(run.spec):
         save_controller(network, path, origin=origin)
         return
     tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}

@@ -150,7 +150,7 @@ def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, control
             answer = expert_of(seen)
             still_s = still_s + town.dt_s if seen.state.speed_mps < 0.1 and answer.throttle == 0.0 else 0.0
             if still_s <= STILL_S:
-                rows.append(_Row(seen, answer, town.place.lateral_m, _path_ahead(town, seen.state)))
+                rows.append(_Row(seen, answer, town.place.lateral_m, path_ahead(town, seen.state)))
             control = answer if policy is None else policy(seen)
             return control if given.disturbance is None else given.disturbance.on(control, next(steps))
 
@@ -210,7 +210,7 @@ def _random_paint(generator: np.random.Generator) -> PatternImage:
     return raster(space.pattern(space.random((), draw)))
 
 
-def _path_ahead(town: TownSimulator, state: VehicleState) -> Float[np.ndarray, "p 2"]:
+def path_ahead(town: TownSimulator, state: VehicleState) -> Float[np.ndarray, "p 2"]:
     """Points of the route, `PATH_M` ahead of the place beside the car: metres ahead of and left of the car."""
     apart = town.route.ahead(town.place.arclength_m + np.array(PATH_M)) - (state.x_m, state.y_m)
     c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)

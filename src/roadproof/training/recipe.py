@@ -99,9 +99,8 @@ class Recipe:
             return load_network(shipped_weights(self.start) if named else Path(self.start))
         if self.network == "cil":
             return CIL(width=self.width, seed=self.seed)
-        return (
-            waypoint_controller(seed=self.seed) if self.network == "waypoint" else ConditionalPilotNet(seed=self.seed)
-        )
+        fresh = waypoint_controller if self.network == "waypoint" else ConditionalPilotNet
+        return fresh(seed=self.seed)
 
     def expert_plans(self) -> dict[str, CollectionPlan]:
         """The plans of the expert's drives, by the name of their folder."""
