@@ -167,6 +167,24 @@ def test_a_camera_sends_the_picture_of_every_tick_from_where_it_is(world):
     assert picture[:15, :, :3].mean() > picture[100:, 60:100, :3].mean() + 30
 
 
+def test_boxes_of_what_stands_there_come_by_their_labels_and_those_of_cars_with_them(world):
+    labels = carla.CityObjectLabel
+    ego = car(world, yaw=30.0)
+    world.tick()
+    boxes = {name: world.get_level_bbs(label) for name, label in labels.names.items()}
+    # Nothing bends on this street, so it has no guard rails.
+    assert {"Buildings", "Fences", "Poles", "Vegetation", "Car"} == {name for name in boxes if boxes[name]} - {"Any"}
+    assert len(boxes["Any"]) == sum(map(len, boxes.values())) - len(boxes["Any"])
+    (own,) = (each for each in boxes["Car"] if each.location.distance(ego.get_location()) < 1.0)
+    assert {box.actor_id for box in boxes["Any"]} == {0, ego.id} == {0, own.actor_id}
+    assert (own.extent.x, own.extent.y, own.rotation.yaw) == pytest.approx((2.25, 0.95, 30.0), abs=1e-3)
+    for each in boxes["Vegetation"] + boxes["Buildings"]:
+        assert each.location.z == pytest.approx(each.extent.z)
+        assert each.extent.z > 1.5
+        # Beside the road, which is 3.5 m wide on each side of y = 0, with 2.5 m of pavement.
+        assert abs(each.location.y) > 5.0 or not 0.0 < each.location.x < 160.0
+
+
 def test_the_weather_changes_the_picture_and_comes_back_as_it_was_set(world):
     ego = car(world)
     place = carla.Transform(carla.Location(x=2.0, z=1.4))

@@ -103,6 +103,12 @@ class Actor:
         middle, half = {"vehicle": CAR_BOX, "walker": WALKER_BOX}.get(self.kind, ((0.0,) * 3, (0.0,) * 3))
         return [list(middle), list(half)]
 
+    @property
+    def world_box(self) -> Value:
+        """The box of an upright actor in the world: middle, half extents, rotation, metres and degrees, and its id."""
+        (x, y, z, _, yaw, _), (middle, half) = self.pose, self.box
+        return [[x, y, z + middle[2]], half, [0.0, yaw, 0.0], self.id]
+
 
 def turned(pose: Pose6) -> Float[np.ndarray, "3 3"]:
     """CARLA's world axes (x, y, z) from an actor's own (ahead, right, up)."""

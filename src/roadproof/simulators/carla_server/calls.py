@@ -13,7 +13,7 @@ from msgspec.msgpack import Decoder
 
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.simulators.carla_server import blueprints, wire
-from roadproof.simulators.carla_server.actors import Actor
+from roadproof.simulators.carla_server.actors import LABELS, Actor
 from roadproof.simulators.carla_server.arguments import (
     Byte,
     Commands,
@@ -36,7 +36,7 @@ from roadproof.simulators.carla_server.arguments import (
     WirePose,
     read,
 )
-from roadproof.simulators.carla_server.pieces import spawn_points
+from roadproof.simulators.carla_server.pieces import ANY_LABEL, level_boxes, spawn_points
 from roadproof.simulators.carla_server.requests import Request
 from roadproof.simulators.carla_server.sensors import check_camera
 from roadproof.simulators.carla_server.wire import DONE, ORIGIN, WORLD_STREAM, Value, granted, refused
@@ -58,7 +58,6 @@ DIFFUSE = 2
 
 NOT_THERE: dict[str, tuple[Signature, Value]] = {
     "freeze_all_traffic_lights": (Signature.taking(frozen=bool), DONE),
-    "get_all_level_BBs": (Signature.taking(label=Byte), granted([])),
     "get_environment_objects": (Signature.taking(label=Byte), granted([])),
     "get_navigation_mesh": (Signature.taking(), granted(b"")),
     "get_required_files": (Signature.taking(folder=Text), granted([])),
@@ -177,6 +176,12 @@ class Calls:
     def call_get_actors_by_id(self, ids: Ids) -> Value:
         actors = self._world.actors
         return granted([actors[i].wire(self._port + 1) for i in ids if i in actors])
+
+    def call_get_all_level_BBs(self, label: Byte) -> Value:  # noqa: N802
+        assert self._world.town is not None
+        actors = [actor for actor in self._world.actors.values() if actor.kind in LABELS]
+        boxes = [actor.world_box for actor in actors if label in (LABELS[actor.kind], ANY_LABEL)]
+        return granted(level_boxes(self._world.town.scenery, label) + boxes)
 
     def call_get_names_of_all_objects(self) -> Value:
         assert self._world.town is not None

@@ -1,8 +1,9 @@
-"""What a map has for clients: spawn points, and pieces of road that can be painted, by the names of their objects.
+"""What a map has for clients: spawn points, boxes of what stands there, and pieces of road that can be painted.
 
 Convention:
-    A piece's picture covers it once. How it lies there differs from piece to piece, as it does in CARLA's own towns, so
-    clients have to find out: turned by quarters, and mirrored on every second piece.
+    Pieces are known by the names of their objects. A piece's picture covers it once. How it lies there differs from
+    piece to piece, as it does in CARLA's own towns, so clients have to find out: turned by quarters, and mirrored on
+    every second piece.
 """
 
 from __future__ import annotations
@@ -16,12 +17,16 @@ from PIL import Image
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.roads.roadmap import RoadMap
-from roadproof.simulators.carla_server.wire import Pose6
+from roadproof.simulators.carla_server.wire import Pose6, Value
+from roadproof.simulators.town.scenery import Scenery
 
 SPAWN_EVERY_M, SPAWN_UP_M = 15.0, 0.3
 PIECE_M = 20.0
 STRAIGHT_RAD = 0.02
 TURNS = 4
+ANY_LABEL, TREE_LABEL = 255, 9
+LABELS = {"building": 3, "hedge": 5, "lamp post": 6, "parked car": 14, "guard rail": 28}
+"""CARLA's labels of the town's solids. A hedge stops cars, so it is a fence here; its trees have boxes of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,3 +97,21 @@ def spawn_points(roads: RoadMap) -> list[Pose6]:
             x, y, z, heading = lane.at((k + 0.5) * SPAWN_EVERY_M)
             places.append((x, -y, z + SPAWN_UP_M, 0.0, -math.degrees(heading), 0.0))
     return places
+
+
+def level_boxes(scenery: Scenery, label: int) -> list[Value]:
+    """Boxes of what stands there with one of CARLA's labels: middles, half extents and rotations, metres and degrees.
+
+    As CARLA's, those of trees hold the whole crown. Without a fourth value, the id of an actor, they are of the map.
+    """
+    trees = [(tree.x_m, tree.y_m, 0.0, tree.height_m / 2, tree.height_m / 2, tree.height_m) for tree in scenery.trees]
+    solids = [
+        (LABELS[each.name], (each.pose.x_m, each.pose.y_m, each.pose.yaw_rad, *each.half_m, each.height_m))
+        for each in scenery.solids
+        if each.name in LABELS
+    ]
+    return [
+        [[x, -y, height / 2], [length, width, height / 2], [0.0, -math.degrees(yaw), 0.0]]
+        for own, (x, y, yaw, length, width, height) in [*solids, *((TREE_LABEL, tree) for tree in trees)]
+        if label in (own, ANY_LABEL)
+    ]
