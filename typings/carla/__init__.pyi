@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum
+from typing import ClassVar
 
 from carla import command as command
 
@@ -49,6 +50,7 @@ class MaterialParameter(IntEnum):
 class CityObjectLabel(IntEnum):
     Roads = ...
     RoadLines = ...
+    names: ClassVar[dict[str, CityObjectLabel]]
 
 class WeatherParameters:
     def __init__(
@@ -90,6 +92,7 @@ class BoundingBox:
     location: Location
     extent: Vector3D
     rotation: Rotation
+    def get_world_vertices(self, transform: Transform) -> list[Location]: ...
 
 class Actor:
     id: int
@@ -147,6 +150,7 @@ class World:
     def set_weather(self, weather: WeatherParameters) -> None: ...
     def get_blueprint_library(self) -> BlueprintLibrary: ...
     def get_actors(self, actor_ids: Sequence[int] = ...) -> Iterator[Actor]: ...
+    def get_level_bbs(self, bb_type: int = ...) -> list[BoundingBox]: ...
     def reset_all_traffic_lights(self) -> None: ...
     def get_names_of_all_objects(self) -> list[str]: ...
     def apply_color_texture_to_objects(

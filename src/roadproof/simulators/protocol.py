@@ -152,8 +152,8 @@ class OpenWorld(Protocol):
 class Furnished(Protocol):
     """A simulator that knows what stands beside its roads."""
 
-    def obstacles(self, scenario: Scenario) -> tuple[Obstacle, ...]:
-        """What a car could run into, within `BESIDE_M` of a scenario's canvas."""
+    def obstacles(self, scenario: Scenario) -> tuple[Obstacle, ...] | None:
+        """What a car could run into, within `BESIDE_M` of a scenario's canvas; None if that cannot be found out."""
         ...
 
 

@@ -153,6 +153,15 @@ def test_recordings_are_calibrated_as_well_as_in_the_town(sides):
 
 
 @pytest.mark.slow
+def test_recordings_know_what_stands_beside_the_road_as_in_the_town(sides):
+    direct, served = (load_recordings(side.folder / "recordings").obstacles for side in sides)
+    # The adapter counts from the nearest parts of things, the town from their middles.
+    places = [{(round(each.x_m, 1), round(each.y_m, 1)) for each in beside} for beside in (direct, served)]
+    assert len(places[0]) > 20
+    assert places[0] <= places[1]
+
+
+@pytest.mark.slow
 def test_composites_stand_for_what_is_seen_as_well_as_in_the_town(sides):
     # 0.9 and 0.5 of 255 levels in the paint; shifts of +0.088 and +0.085 a frame, each predicted within 0.0006.
     shifts = []

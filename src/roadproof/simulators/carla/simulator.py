@@ -6,12 +6,13 @@ map, so that the same scenario means the same on both. The server gives the car'
 
 from __future__ import annotations
 
-from roadproof.datatypes import Control, Observation
+from roadproof.datatypes import Control, Observation, Obstacle
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, Homography
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.actors import Collisions, Crowd, place_driven, spawn_driven, vehicle_state
+from roadproof.simulators.carla.beside import stand_beside
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.inject import Paint, Scene
 from roadproof.simulators.carla.native import Ground, SeveralPiecesError, find_ground, lay
@@ -126,6 +127,21 @@ class CarlaSimulator(RouteSimulator[_Drive]):
             ScenarioError: the server has no such map.
         """
         return self.session.road_map(name)
+
+    def obstacles(self, scenario: Scenario) -> tuple[Obstacle, ...] | None:
+        """What a car could run into near a scenario's canvas; None if the server refuses to say. It needs no drive.
+
+        Raises:
+            SimulatorError: the server does not answer.
+            ScenarioError: the server has no such map.
+        """
+        roads = self.road_map(scenario.map_name)
+        try:
+            return stand_beside(self.session, roads, scenario.canvas)
+        except SimulatorError:
+            if self.session.lost:
+                raise
+            return None
 
     def paint_by(self, paint: PaintKind) -> None:
         """Change how patterns are put on the road, from the next reset on.
