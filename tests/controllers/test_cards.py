@@ -48,6 +48,9 @@ def test_a_card_is_read_as_it_was_written(written):
         (card(tracking={"law": "linear-mpc", "pieces": 2.5}), r"pieces is \[2.5\], expected whole numbers"),
         (card(tracking={"law": "pure-pursuit", "wheelbase_m": -1}), "wheelbase_m of the tracking law is -1"),
         (card(dt_s="half"), "dt_s is 'half', expected a number"),
+        (card(dt_s=0.5), "dt_s is 0.5, but only exported networks with a tracking law"),
+        (card(architecture="waypoint", tracking={"law": "pure-pursuit"}, dt_s=0.5), "only exported networks"),
+        (card(architecture="cil", tracking={"law": "pure-pursuit"}), "cil steers; drop it"),
         (card(preparation=4), "where a JSON object is expected"),
     ],
 )

@@ -43,6 +43,9 @@ class ControllerCard:
         tracking: law that steers along the points that the network answers with; None for a network that steers.
         dt_s: time between those points, seconds; None where they have no times.
         origin: what the weights were made from, in words; None if it is not said.
+
+    Raises:
+        ControllerError: a law for a network that steers, or a time between points that has nothing to act on.
     """
 
     architecture: str | None = None
@@ -53,6 +56,18 @@ class ControllerCard:
     tracking: PurePursuit | LinearMPC | None = None
     dt_s: float | None = None
     origin: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what would change nothing."""
+        if self.tracking is not None and self.architecture not in (None, "waypoint"):
+            raise ControllerError(
+                f"tracking is for networks that answer with points, {self.architecture} steers; drop it"
+            )
+        if self.dt_s is not None and (self.tracking is None or self.architecture is not None):
+            raise ControllerError(
+                f"dt_s is {self.dt_s}, but only exported networks with a tracking law have points whose times it could "
+                "be; give tracking or drop dt_s"
+            )
 
     def to_json(self) -> str:
         """The card as text, with its format version."""
