@@ -109,10 +109,10 @@ def test_film_and_strip_show_the_frames_enlarged(predicted):
     run, _ = predicted
     with np.load(run / "evaluation" / "strip.npz") as strip:
         shown = strip["painted"]
-    assert shown.shape == (6, 300, 400, 3)
+    assert shown.shape == (25, 300, 400, 3)
     assert int(shown[:, :50].max()) < 12, "black where nothing was recorded"
     magenta = (shown[..., 0].astype(int) - shown[..., 1] > 120).sum((1, 2))
-    assert (magenta > 50).sum() >= 4
+    assert (magenta > 50).sum() >= 16
 
 
 def test_a_selection_in_recordings_is_called_predicted(recordings, tmp_path):

@@ -1,6 +1,7 @@
 """Charts take their colours from the page, and are drawn where things are."""
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -53,6 +54,31 @@ def test_the_view_from_above_numbers_the_infractions(drives):
     assert "2 numbered events" in chart.caption
     words = re.findall(r"<text[^>]*>([^<]*)</text>", chart.svg)
     assert {"1", "2", "5 m"} <= set(words)
+
+
+def test_marks_lie_on_the_lines_that_they_move_along(drives):
+    steps = np.arange(len(drives[1]) // 3, len(drives[1]) // 2, 5)
+    for chart, name in (
+        (charts.offsets([("clear-noon", *drives)], SCENARIO.canvas, steps), "painted"),
+        (charts.steering(*drives, None, SCENARIO.canvas, steps), "painted"),
+        (top_view(SCENARIO, raster(PATTERN), *drives, steps=steps), "clean"),
+    ):
+        marks = re.findall(rf'<circle class="at m(\d+) {name}" r="5" cx="([\d.]+)" cy="([\d.]+)"/>', chart.svg)
+        assert [int(k) for k, _, _ in marks] == list(range(len(steps)))
+        drawn = re.findall(r' d="M ([^"z]*)"', chart.svg)
+        lines = [np.array(re.findall(r"(-?[\d.]+) (-?[\d.]+)", each), float) for each in drawn]
+        # A straight stretch has few vertices.
+        on_lines = [np.linspace(*ends, 300) for line in lines for ends in pairwise(line)]
+        for _, x, y in marks:
+            off = min(np.hypot(*(points - (float(x), float(y))).T).min() for points in on_lines)
+            assert off < 2.0
+
+
+def test_marks_beyond_the_axes_are_left_out(drives):
+    steps = np.array([len(drives[1]) // 2, len(drives[1]) - 1])
+    assert charts.metres_past(drives[1], SCENARIO.canvas)[-1] > SCENARIO.canvas.length_m + charts.BEHIND_M
+    chart = charts.steering(*drives, None, SCENARIO.canvas, steps)
+    assert set(re.findall(r'class="at (m\d)', chart.svg)) == {"m0"}
 
 
 def test_the_same_drives_give_the_same_chart(drives):

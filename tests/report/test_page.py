@@ -16,7 +16,7 @@ from roadproof.report.page import write_report
 from roadproof.simulators.protocol import PaintKind
 from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run, write_selection
 
-SECTIONS = ("film", "above", "pattern", "strip", "conditions", "search", "calibration", "cost", "again")
+SECTIONS = ("film", "above", "pattern", "conditions", "search", "calibration", "cost", "again")
 
 
 def report_of(folder):
@@ -280,6 +280,30 @@ def test_a_browser_shows_everything_and_has_nothing_to_complain_about(tmp_path):
             "(v => [v.error, v.videoWidth, v.duration, v.currentTime])(document.querySelector('video'))"
         )
         assert film == [None, 1280, pytest.approx(1.2, abs=0.1), pytest.approx(0.8)]
+        assert complaints == []
+
+
+@pytest.mark.slow
+def test_one_moment_of_the_passage_is_shown_at_a_time_and_keys_and_pointer_move_through_them(tmp_path):
+    write_run(tmp_path)
+    shown = "[...document.querySelectorAll('.at')].filter(e => getComputedStyle(e).display != 'none')"
+    moments = f"[...new Set({shown}.map(e => e.classList[1]))]"
+    with opened(write_report(tmp_path)) as (page, complaints):
+        assert page.evaluate(moments) == ["m3"], "pictures and the marks in every chart"
+        assert page.evaluate(f"{shown}.length") == 1 + 2 + 1 + 2, "pictures, from above, offset, steering"
+        page.focus("#moment-3")
+        for key, expected in (("ArrowRight", "m4"), ("ArrowRight", "m5"), ("ArrowLeft", "m4")):
+            page.keyboard.press(key)
+            assert page.evaluate(moments) == [expected]
+        before = page.locator("circle.at.m4.painted").first.bounding_box()
+        page.hover(".dial .t1")
+        assert page.evaluate(moments) == ["m1"], "where the pointer is, without pressing"
+        assert page.locator("circle.at.m1.painted").first.bounding_box() != before
+        page.mouse.move(0, 0)
+        assert page.evaluate(moments) == ["m4"]
+        page.emulate_media(media="print")
+        assert page.evaluate(moments) == [f"m{k}" for k in range(6)], "paper shows some of them, here all"
+        assert page.evaluate(f"{shown}.every(e => e.tagName == 'LI')")
         assert complaints == []
 
 

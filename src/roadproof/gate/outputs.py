@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from roadproof.drives.record import evenly
 from roadproof.errors import EpisodeError
 from roadproof.gate.result import Case, CheckResult
 from roadproof.gate.verdict import Status
@@ -18,6 +19,7 @@ from roadproof.report.formatting import MISSING, in_words
 
 WORST = "worst.jpg"
 SHOWN_PX, BLACK = 1500, 12
+WORST_COLUMNS = 6
 COLUMNS = ("scenario", "paint", "drives", "deviation m", "went wrong", "verdict")
 
 LEGEND = "Deviation is a median, and went wrong the share of drives that left their lane, with 95 % intervals."
@@ -132,7 +134,8 @@ def write_worst(strip: Path, path: Path) -> None:
         OutputError: the picture cannot be written.
     """
     found = read_archive(strip, ("clean", "painted"), EpisodeError, "check again")
-    rows = [np.concatenate(list(found[name]), 1) for name in ("clean", "painted")]
+    shown = evenly(len(found["painted"]), WORST_COLUMNS)
+    rows = [np.concatenate(list(found[name][shown]), 1) for name in ("clean", "painted")]
     whole = np.concatenate(rows)
     # Around what was recorded, pictures of the recorded world are black.
     picture = Image.fromarray(whole[whole.max((1, 2)) > BLACK])

@@ -32,7 +32,9 @@ QUALITIES = (26, 30, 34, 38)
 
 VIEW = (640, 480)
 CAPTION_PX = 96
-STRIP_COLUMNS = 6
+MOMENTS = 25
+"""Pictures of a passage: enough to move through it, a picture every third step or so."""
+
 STRIP_SIZE = (400, 300)
 STRIP_HORIZON_M = 14.0
 EVENT_SHOWN_S = 3.0
@@ -111,7 +113,7 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     last = min(len(clean), len(painted)) - 1
     seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
     first, end = min(seen.start, last), min(seen.stop - 1, last)
-    steps: list[int] = sorted({round(first + (end - first) * k / (STRIP_COLUMNS - 1)) for k in range(STRIP_COLUMNS)})
+    steps: list[int] = sorted({round(first + (end - first) * k / (MOMENTS - 1)) for k in range(MOMENTS)})
     bare, driven = (
         np.stack([np.asarray(side.picture(k).resize(STRIP_SIZE, Image.Resampling.LANCZOS)) for k in steps])
         for side in sides

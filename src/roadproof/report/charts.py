@@ -8,12 +8,12 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -48,6 +48,9 @@ SERIES = (PAINTED, PREDICTED, VARIABLES["third"], VARIABLES["fourth"])
 WIDTH_IN, HEIGHT_IN = 5.2, 3.0
 BEHIND_M = 20.0
 
+NO_MOMENTS = np.zeros(0, np.int64)
+"""The steps of a passage without pictures."""
+
 
 @dataclass(frozen=True, slots=True)
 class Chart:
@@ -62,13 +65,27 @@ class Chart:
     caption: str
 
 
-def svg_of(figure: Figure, name: str, description: str) -> Markup:
+@dataclass(frozen=True, slots=True, eq=False)
+class Mark:
+    """Where something is in a chart at each pictured moment of the passage; the page shows one moment at a time.
+
+    Args:
+        kind: "clean" or "painted", the drive, which gives the colour.
+        at: x and y of each moment on the chart's axes, (n, 2).
+    """
+
+    kind: str
+    at: Float[np.ndarray, "n 2"]
+
+
+def svg_of(figure: Figure, name: str, description: str, marks: Iterable[Mark] = ()) -> Markup:
     """A figure as an SVG element for a page.
 
     Args:
         figure: the figure, drawn in stand-in colours (`VARIABLES`).
         name: a word that makes its inner names differ from those of the page's other charts.
         description: what is read out instead of the picture.
+        marks: what is shown at one moment of the passage only, on the figure's one pair of axes.
     """
     out = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "text.parse_math": False}):
@@ -83,7 +100,22 @@ def svg_of(figure: Figure, name: str, description: str) -> Markup:
     text = re.sub(r"(font: [0-9.]+px|font-family:) '[^;\"]*", r"\1 var(--sans)", text)
     for variable, colour in VARIABLES.items():
         text = text.replace(colour, f"var(--{variable})")
+    # Drawn once, the figure knows where its axes are.
+    text = text.replace("</svg>", f"{''.join(_dots(figure, mark) for mark in marks)}</svg>")
     return Markup(text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1))  # noqa: S704
+
+
+def _dots(figure: Figure, mark: Mark) -> str:
+    """A mark as one circle a moment; those beyond the axes are left out."""
+    axes = figure.axes[0]
+    places = axes.transData.transform(mark.at)
+    inside = axes.bbox.padded(1.0)
+    scale, height = 72 / figure.dpi, 72 * figure.get_figheight()
+    return "".join(
+        f'<circle class="at m{k} {mark.kind}" r="5" cx="{x * scale:.1f}" cy="{height - y * scale:.1f}"/>'
+        for k, (x, y) in enumerate(places.tolist())
+        if inside.contains(x, y)
+    )
 
 
 def metres_past(episode: Episode, canvas: CanvasPlacement) -> Float[np.ndarray, " n"]:
@@ -94,43 +126,74 @@ def metres_past(episode: Episode, canvas: CanvasPlacement) -> Float[np.ndarray, 
     return driven - driven[at] + canvas.length_m / 2
 
 
-def steering(clean: Episode, painted: Episode, fidelity: Fidelity | None, canvas: CanvasPlacement) -> Chart:
-    """Steering of the clean drive, what the surrogate predicts, and what the car did over the paint."""
+def steering(
+    clean: Episode,
+    painted: Episode,
+    fidelity: Fidelity | None,
+    canvas: CanvasPlacement,
+    steps: Int[np.ndarray, " n"] = NO_MOMENTS,
+) -> Chart:
+    """Steering of the clean drive, what the surrogate predicts, and what the car did over the paint.
+
+    Args:
+        clean: the drive without paint.
+        painted: the drive over the paint.
+        fidelity: composites beside renders; None where they were not compared.
+        canvas: where the canvas lies.
+        steps: the steps of both drives at which there are pictures of the passage.
+    """
     figure, axes = _past_canvas("steering (right > 0)", canvas)
-    at, predicted = metres_past(clean, canvas), painted.paint.predicted
+    marks: list[Mark] = []
+    predicted = painted.paint.predicted
     for episode, colour, label in (
         (clean, CLEAN, "bare road"),
         (painted, PAINTED, "over the paint, predicted" if predicted else "driven over the paint"),
     ):
-        axes.plot(metres_past(episode, canvas)[:-1], episode.steer, color=colour, linewidth=1.8, label=label)
+        where = metres_past(episode, canvas)[:-1]
+        axes.plot(where, episode.steer, color=colour, linewidth=1.8, label=label)
+        at = np.minimum(steps, len(where) - 1)
+        marks.append(Mark("painted" if episode is painted else "clean", np.stack([where[at], episode.steer[at]], 1)))
     words = "Steering without paint and over it"
     if fidelity is not None:
-        steps = fidelity.frame_number
-        kept = steps < len(at)
+        along, frames = metres_past(clean, canvas), fidelity.frame_number
+        kept = frames < len(along)
         for values, style, label in (
             (fidelity.composited_steer, "o", "predicted on composites"),
             (fidelity.rendered_steer, "x", "same places, rendered"),
         ):
-            axes.plot(at[steps[kept]], values[kept], style, color=PREDICTED, markersize=3.6, label=label)
+            axes.plot(along[frames[kept]], values[kept], style, color=PREDICTED, markersize=3.6, label=label)
         words += ", and what the surrogate predicts along the clean path"
-    return _finished(figure, axes, "steering", words, until_m=canvas.length_m + BEHIND_M)
+    return _finished(figure, axes, "steering", words, until_m=canvas.length_m + BEHIND_M, marks=marks)
 
 
-def offsets(drives: Sequence[tuple[str, Episode, Episode]], canvas: CanvasPlacement) -> Chart:
-    """How far beside the clean path the car was over the paint: a colour a weather, a line a start."""
+def offsets(
+    drives: Sequence[tuple[str, Episode, Episode]],
+    canvas: CanvasPlacement,
+    steps: Int[np.ndarray, " n"] = NO_MOMENTS,
+) -> Chart:
+    """How far beside the clean path the car was over the paint: a colour a weather, a line a start.
+
+    Args:
+        drives: weather, drive without paint and drive over it.
+        canvas: where the canvas lies.
+        steps: the steps of the first pair of drives at which there are pictures of the passage.
+    """
     figure, axes = _past_canvas("metres right of the clean path", canvas)
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     names = list(dict.fromkeys(name for name, _, _ in drives))
     width = 1.8 if len(drives) == len(names) else 1.1
     labels = {name: in_words(name) for name in names}
+    marks: list[Mark] = []
     for name, clean, painted in drives:
         beside = -lateral_m(path_of(clean), path_of(painted))
         k, label = names.index(name), labels.pop(name, None)
         where, colour = metres_past(painted, canvas), SERIES[k % len(SERIES)]
         axes.plot(where, beside, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=width, label=label)
+        if not marks:
+            marks = [Mark("painted", np.stack([where[steps], beside[steps]], 1))]
     predicted = any(painted.paint.predicted for _, _, painted in drives)
     words = f"Distance from the clean path along the drive, alone on the road{', predicted' if predicted else ''}"
-    return _finished(figure, axes, "offsets", words)
+    return _finished(figure, axes, "offsets", words, marks=marks)
 
 
 def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
@@ -183,11 +246,18 @@ def _past_canvas(y: str, canvas: CanvasPlacement) -> tuple[Figure, Axes]:
 
 
 def _finished(
-    figure: Figure, axes: Axes, name: str, words: str, *, until_m: float | None = None, columns: int = 2
+    figure: Figure,
+    axes: Axes,
+    name: str,
+    words: str,
+    *,
+    until_m: float | None = None,
+    columns: int = 2,
+    marks: Iterable[Mark] = (),
 ) -> Chart:
     axes.set_xlim(-HORIZON_M - 2, until_m)
     _legend(axes, columns=columns)
-    return Chart(svg_of(figure, name, words), words + ". The shaded stretch is the canvas.")
+    return Chart(svg_of(figure, name, words, marks), words + ". The shaded stretch is the canvas.")
 
 
 def _legend(axes: Axes, *, columns: int) -> None:

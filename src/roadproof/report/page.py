@@ -34,6 +34,7 @@ from roadproof.simulators.protocol import PaintKind
 FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
 SHOWN_COMPOSITES = 3
+PRINTED_MOMENTS = 6
 FORETOLD = ("predicted_m", "least_m", "most_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad")
 
 PAINTED = {
@@ -86,6 +87,7 @@ def render(run: Run) -> str:
             judged=run.judged,
             counted=counted,
             charts=_charts(run),
+            passage=_passage(run),
             pattern=_pattern(run),
             attack=run.attack,
             fidelity=fidelity,
@@ -133,15 +135,40 @@ def _charts(run: Run) -> dict[str, charts.Chart | None]:
     drawn: dict[str, charts.Chart | None] = {}
     if run.judged is not None:
         judged, scenario = run.judged, run.judged.evaluation.scenario
-        drawn["above"] = top_view(scenario, judged.paint, judged.clean, judged.painted)
-        drawn["steering"] = charts.steering(judged.clean, judged.painted, judged.fidelity, scenario.canvas)
-        drawn["offsets"] = charts.offsets(judged.by_weather, scenario.canvas)
+        clean, painted, steps = judged.clean, judged.painted, judged.steps
+        drawn["above"] = top_view(scenario, judged.paint, clean, painted, steps=steps)
+        drawn["steering"] = charts.steering(clean, painted, judged.fidelity, scenario.canvas, steps)
+        drawn["offsets"] = charts.offsets(judged.by_weather, scenario.canvas, steps)
     if run.attack is not None:
         drawn["search"] = charts.search(run.attack.history, tuple(run.attack.by_group), run.attack.objective)
     if run.prediction is not None:
         canvas = run.recordings and run.recordings.canvas
         drawn["foretold"] = None if canvas is None else charts.foretold(run.prediction, canvas)
     return drawn
+
+
+def _passage(run: Run) -> list[Fields]:
+    """The pictured moments of the passage; on paper a few of them stand for all."""
+    if run.judged is None or run.judged.strip is None:
+        return []
+    strip, steps = run.judged.strip, run.judged.steps
+    printed = set(evenly(len(steps), PRINTED_MOMENTS).tolist())
+    furthest = float(np.abs(strip.lateral_m).max()) or 1.0
+    return [
+        {
+            "time_s": float(strip.time_s[k]),
+            "lateral_m": float(strip.lateral_m[k]),
+            "share": abs(float(strip.lateral_m[k])) / furthest,
+            "steer": tuple(
+                float(each.steer[min(step, len(each.steer) - 1)]) for each in (run.judged.clean, run.judged.painted)
+            ),
+            "clean": strip.clean[k],
+            "painted": strip.painted[k],
+            "printed": k in printed,
+            "first": k == len(steps) // 2,
+        }
+        for k, step in enumerate(cast("list[int]", steps.tolist()))
+    ]
 
 
 def _pattern(run: Run) -> Fields | None:

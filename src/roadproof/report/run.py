@@ -20,6 +20,9 @@ from itertools import chain, count, takewhile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Int
+
 from roadproof.attacks import AttackResult, Cheapest
 from roadproof.calibration.report import CalibrationReport
 from roadproof.datatypes import Weather
@@ -68,6 +71,12 @@ class Judged:
     film: bytes | None
     poster: bytes | None
     strip: Strip | None
+
+    @property
+    def steps(self) -> Int[np.ndarray, " n"]:
+        """The steps of the shown drives that the strip has pictures of."""
+        moments = np.zeros(0) if self.strip is None else self.strip.time_s
+        return np.abs(self.painted.time_s - moments[:, None]).argmin(1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

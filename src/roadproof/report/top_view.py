@@ -6,6 +6,7 @@ Drawn in metres around the canvas, ahead of it upwards, so the paint lies straig
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Int
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
@@ -13,7 +14,7 @@ from roadproof.driving.deviation import passage, path_of
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted
 from roadproof.errors import ScenarioError
-from roadproof.report.charts import CLEAN, INK, PAINTED, VARIABLES, WIDTH_IN, Chart, svg_of
+from roadproof.report.charts import CLEAN, INK, NO_MOMENTS, PAINTED, VARIABLES, WIDTH_IN, Chart, Mark, svg_of
 from roadproof.report.road_view import Ground, Plan, around_canvas, draw_canvas, draw_road, plan_of
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
@@ -26,7 +27,14 @@ SCALE_M = 5.0
 GROUND = Ground(VARIABLES["kerb"], VARIABLES["asphalt"], VARIABLES["marking"])
 
 
-def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: Episode, name: str = "above") -> Chart:
+def top_view(
+    scenario: Scenario,
+    paint: PatternImage,
+    clean: Episode,
+    painted: Episode,
+    name: str = "above",
+    steps: Int[np.ndarray, " n"] = NO_MOMENTS,
+) -> Chart:
     """Both drives past the canvas, from above.
 
     Args:
@@ -35,6 +43,7 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
         clean: the drive without paint.
         painted: the drive over the pattern.
         name: a word that tells this chart from the page's others.
+        steps: the steps of both drives at which there are pictures of the passage.
     """
     around = around_canvas(scenario.canvas)
     bare, driven = around(path_of(clean)), around(path_of(painted))
@@ -65,7 +74,10 @@ def top_view(scenario: Scenario, paint: PatternImage, clean: Episode, painted: E
         "From above: the bare-road drive (blue) and the drive over the paint (red) past the canvas"
         f"{f', with {count} numbered event' + ('s' if count != 1 else '') if count else ''}"
     )
-    return Chart(svg_of(figure, name, words), words + ". Up is the direction of travel at the canvas.")
+    marks = (
+        Mark(kind, path[np.minimum(steps, len(path) - 1)]) for kind, path in (("clean", bare), ("painted", driven))
+    )
+    return Chart(svg_of(figure, name, words, marks), words + ". Up is the direction of travel at the canvas.")
 
 
 def _road(scenario: Scenario) -> RoadMap | None:
