@@ -20,6 +20,7 @@ from roadproof.controllers import (
     load_controller,
 )
 from roadproof.controllers.exported import TorchProgram, _pickles_refused
+from roadproof.controllers.loading import PICKLES
 from roadproof.errors import ControllerError, DeviceError
 
 CARD = ControllerCard(
@@ -207,6 +208,17 @@ def test_the_environment_is_as_before_after_loading(program, monkeypatch):
     monkeypatch.setenv("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "0")
     load_controller(program)
     assert os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] == "0"
+
+
+def test_torchscript_and_pickled_networks_are_refused_with_what_to_do(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.script(torch.nn.Linear(2, 1)).save(tmp_path / "net.pt2")
+    with pytest.raises(ControllerError, match=r"net\.pt2 is TorchScript, not a torch\.export file; export the Python"):
+        load_controller(str(tmp_path / "net.pt2"))
+    for suffix in PICKLES:
+        with pytest.raises(ControllerError, match=r"may run code when it is opened; .* torch\.export\.save"):
+            load_controller(str(tmp_path / f"net{suffix}"))
 
 
 def test_pickles_in_an_archive_are_not_run(tmp_path):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+import zipfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -92,6 +93,11 @@ class TorchProgram(nn.Module):
                         self.inputs[node.name] = tuple(size if isinstance(size, int) else None for size in shape)
                 self.program = program.module()
         except Exception as error:  # whatever the archive's contents make the reader raise
+            if _is_torchscript(path):
+                raise ControllerError(
+                    f"{path} is TorchScript, not a torch.export file; export the Python network it came from again: "
+                    "torch.export.save(torch.export.export(network, ...), 'FILE.pt2')"
+                ) from error
             raise ControllerError(
                 f"{path} is not a torch.export file that this torch, {torch.__version__}, reads: "
                 f"{_first_sentence(error)}"
@@ -151,6 +157,14 @@ def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple
         frame_size = preparation.frame_size or (fixed if whole else None)
         preparation = replace(preparation, network_size=fixed, frame_size=frame_size)
     return tuple("frames" if name in pictures else name for name in names), preparation
+
+
+def _is_torchscript(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith("/constants.pkl") for name in archive.namelist())
+    except (OSError, zipfile.BadZipFile, NotImplementedError):
+        return False
 
 
 def _first_sentence(error: Exception) -> str:

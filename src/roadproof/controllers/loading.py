@@ -141,7 +141,17 @@ def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | 
         from roadproof.controllers.exported import exported_controller
 
         return exported_controller(path, _card_beside(path) or ControllerCard(), device=device, dtype=dtype)
+    if text.endswith(PICKLES):
+        raise ControllerError(
+            f"{text} is a file of torch.save or TorchScript, which may run code when it is opened; in Python, export "
+            "its network with torch.export.save(torch.export.export(network, ...), 'FILE.pt2') or torch.onnx.export, "
+            "or name a function of yours that returns it: module:factory"
+        )
     raise ControllerError(f"unknown controller {text!r}, expected {SPECS}")
+
+
+PICKLES = (".pt", ".pth", ".ckpt", ".pkl", ".ts", ".torchscript", ".jit")
+"""What files of torch.save and TorchScript are called."""
 
 
 def save_controller(

@@ -1,7 +1,8 @@
 """An ONNX graph as a torch module: evaluated node by node, so that gradients flow to the frames.
 
-Why not a converter from elsewhere: those alive need torchvision or are a single first release; a steering network
-needs some sixty operators, each a line or a few.
+Why not a converter from elsewhere: those alive need torchvision, or are a single first release that fails where a
+network takes the last of a row (`x[:, -1]`) and cannot be sent to other processes; a steering network needs some ninety
+operators, each a line or a few.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from roadproof.controllers.onnx_operators import OPERATORS
+from roadproof.controllers.onnx_operators import OPERATORS, SEVERAL_OUTPUTS
 from roadproof.errors import ControllerError
 from roadproof.foreign import in_one_line
 
@@ -24,7 +25,7 @@ class _Node(NamedTuple):
     operator: str
     attributes: dict[str, Any]
     inputs: tuple[str, ...]
-    output: str
+    outputs: tuple[str, ...]
     spent: tuple[str, ...]
     """Values that no later node needs."""
 
@@ -73,7 +74,7 @@ class OnnxGraph(nn.Module):
             if value.name not in self._buffer_of
         }
         """Shape of each input; None where it is not fixed."""
-        nodes: list[tuple[str, dict[str, Any], tuple[str, ...], str]] = []
+        nodes: list[tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]] = []
         for node in graph.node:
             attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}
             if isinstance(attributes.get("value"), _tensor_type()):
@@ -81,13 +82,14 @@ class OnnxGraph(nn.Module):
             if node.op_type == "Constant":
                 self._keep(node.output[0], torch.as_tensor(next(iter(attributes.values()))))
                 continue
-            if node.op_type not in OPERATORS or node.domain not in ("", "ai.onnx") or any(node.output[1:]):
+            several = any(node.output[1:]) and node.op_type not in SEVERAL_OUTPUTS
+            if node.op_type not in OPERATORS or node.domain not in ("", "ai.onnx") or several:
                 raise ControllerError(
-                    f"{path} uses the ONNX operator {node.domain or 'ai.onnx'}.{node.op_type} in a way roadproof does "
-                    f"not know; known with one output: {', '.join(OPERATORS)}. Export it as .pt2, or wrap the network "
-                    "yourself as module:factory"
+                    f"{path} uses the ONNX operator {node.domain or 'ai.onnx'}.{node.op_type}"
+                    f"{' with several outputs' if several else ''}, which roadproof does not know; known are "
+                    f"{', '.join(OPERATORS)}. Export the network as .pt2, or wrap it yourself as module:factory"
                 )
-            nodes.append((node.op_type, attributes, tuple(node.input), node.output[0]))
+            nodes.append((node.op_type, attributes, tuple(node.input), tuple(node.output)))
         self._nodes = _with_spent_values(nodes, keep=self.output)
 
     def _keep(self, name: str, constant: Tensor) -> None:
@@ -105,11 +107,13 @@ class OnnxGraph(nn.Module):
         for node in self._nodes:
             arguments = [values[name] for name in node.inputs]
             try:
-                values[node.output] = OPERATORS[node.operator](node.attributes, arguments)
+                answer = OPERATORS[node.operator](node.attributes, arguments)
+                answers = answer if isinstance(answer, tuple) else (answer,)
+                values |= {name: answers[k] for k, name in enumerate(node.outputs) if name}
             except (RuntimeError, ValueError, IndexError, KeyError, TypeError) as error:
                 shapes = ", ".join("none" if x is None else str(tuple(x.shape)) for x in arguments)
                 raise ControllerError(
-                    f"{self.path}: ONNX node {node.operator} → {node.output} cannot take shapes {shapes}: {error}"
+                    f"{self.path}: ONNX node {node.operator} → {node.outputs[0]} cannot take shapes {shapes}: {error}"
                 ) from error
             for name in node.spent:
                 del values[name]
@@ -118,14 +122,16 @@ class OnnxGraph(nn.Module):
         return output
 
 
-def _with_spent_values(nodes: list[tuple[str, dict[str, Any], tuple[str, ...], str]], keep: str) -> tuple[_Node, ...]:
+def _with_spent_values(
+    nodes: list[tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]], keep: str
+) -> tuple[_Node, ...]:
     """The nodes, each with the values that it is the last to use; without this every map would stay in memory."""
-    made = {output for *_, output in nodes}
+    made = {output for *_, outputs in nodes for output in outputs}
     seen, result = {keep}, list[_Node]()
-    for operator, attributes, inputs, output in reversed(nodes):
+    for operator, attributes, inputs, outputs in reversed(nodes):
         spent = tuple({name for name in inputs if name in made and name not in seen})
         seen.update(inputs)
-        result.append(_Node(operator, attributes, inputs, output, spent))
+        result.append(_Node(operator, attributes, inputs, outputs, spent))
     return tuple(reversed(result))
 
 

@@ -1,7 +1,8 @@
 """The ONNX operators that steering networks are made of, in torch: differentiable, on any device.
 
 Each entry of `OPERATORS` takes the node's attributes and its inputs (None where an optional one is left out) and
-gives its only output. Meanings are those of operator set 13 and newer (https://onnx.ai/onnx/operators/).
+gives its output, or a tuple where it may have several. Meanings are those of operator set 13 and newer
+(https://onnx.ai/onnx/operators/). What an operator asks for that is not done here is a ValueError.
 """
 
 from __future__ import annotations
@@ -15,15 +16,31 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from roadproof.controllers.onnx_recurrent import gru, lstm
+
 Attributes = dict[str, Any]
 Inputs = Sequence[Any]
-Operator = Callable[[Attributes, Inputs], Tensor]
+Operator = Callable[[Attributes, Inputs], Tensor | tuple[Tensor, ...]]
 
 # ONNX' codes of element types (TensorProto.DataType).
 _DTYPES = {
     1: torch.float32, 2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32, 7: torch.int64,
     9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16,
 }  # fmt: skip
+
+
+# How torch says what Resize asks for: mode, where the pixels of the result lie, and how the nearest is rounded.
+_RESIZED: dict[tuple[bytes, bytes, bytes | None], tuple[str, bool | None]] = {
+    (b"linear", b"half_pixel", None): ("linear", False),
+    (b"linear", b"pytorch_half_pixel", None): ("linear", False),
+    (b"linear", b"align_corners", None): ("linear", True),
+    (b"cubic", b"half_pixel", None): ("bicubic", False),
+    (b"cubic", b"pytorch_half_pixel", None): ("bicubic", False),
+    (b"cubic", b"align_corners", None): ("bicubic", True),
+    (b"nearest", b"asymmetric", b"floor"): ("nearest", None),
+    (b"nearest", b"half_pixel", b"round_prefer_floor"): ("nearest-exact", None),
+    (b"nearest", b"half_pixel", b"round_prefer_ceil"): ("nearest-exact", None),
+}
 
 
 def _integers(x: Tensor | None) -> list[int] | None:
@@ -73,6 +90,49 @@ def _conv(a: Attributes, x: Inputs) -> Tensor:
     )
 
 
+def _transposed_conv(a: Attributes, x: Inputs) -> Tensor:
+    count = x[1].ndim - 2
+    pads = a.get("pads", [0] * 2 * count)
+    if pads[:count] != pads[count:] or "output_shape" in a or a.get("auto_pad", b"NOTSET") != b"NOTSET":
+        raise ValueError("pads that differ at the two ends, output_shape or auto_pad")
+    convolve = {1: functional.conv_transpose1d, 2: functional.conv_transpose2d, 3: functional.conv_transpose3d}[count]
+    return convolve(
+        x[0],
+        x[1],
+        _get(x, 2),
+        stride=a.get("strides", 1),
+        padding=pads[:count],
+        output_padding=a.get("output_padding", 0),
+        groups=a.get("group", 1),
+        dilation=a.get("dilations", 1),
+    )
+
+
+def _resize(a: Attributes, x: Inputs) -> Tensor:
+    if a.get("antialias") or a.get("exclude_outside") or "axes" in a:
+        raise ValueError("antialias, exclude_outside or axes")
+    mode, places = a.get("mode", b"nearest"), a.get("coordinate_transformation_mode", b"half_pixel")
+    rounding = a.get("nearest_mode", b"round_prefer_floor") if mode == b"nearest" else None
+    if (mode, places, rounding) not in _RESIZED:
+        raise ValueError(f"{mode.decode()} at {places.decode()}{f', {rounding.decode()}' if rounding else ''}")
+    kind, corners = _RESIZED[mode, places, rounding]
+    picture: Tensor = x[0]
+    if kind.endswith("linear"):
+        kind = ("linear", "bilinear", "trilinear")[picture.ndim - 3]
+    sizes, scales = _integers(_get(x, 3)), _get(x, 2)
+    size = sizes[2:] if sizes else None
+    factor = None if sizes or scales is None else [float(each) for each in scales[2:]]
+    return functional.interpolate(picture, size=size, scale_factor=factor, mode=kind, align_corners=corners)
+
+
+def _depth_to_space(a: Attributes, x: Inputs) -> Tensor:
+    size, (batch, channels, height, width) = a["blocksize"], x[0].shape
+    if a.get("mode", b"DCR") == b"CRD":
+        return functional.pixel_shuffle(x[0], size)
+    apart = x[0].reshape(batch, size, size, channels // size**2, height, width).permute(0, 3, 4, 1, 5, 2)
+    return apart.reshape(batch, channels // size**2, height * size, width * size)
+
+
 def _max_pool(a: Attributes, x: Inputs) -> Tensor:
     padded = _padded(a, x[0], -math.inf)
     return functional.max_pool2d(
@@ -102,6 +162,22 @@ def _gemm(a: Attributes, x: Inputs) -> Tensor:
 
 def _batch_normalization(a: Attributes, x: Inputs) -> Tensor:
     return functional.batch_norm(x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5))
+
+
+def _layer_normalization(a: Attributes, x: Inputs) -> Tensor:
+    shape = x[0].shape[a.get("axis", -1) :]
+    return functional.layer_norm(x[0], shape, x[1], _get(x, 2), a.get("epsilon", 1e-5))
+
+
+def _group_normalization(a: Attributes, x: Inputs) -> Tensor:
+    return functional.group_norm(x[0], a["num_groups"], x[1], x[2], a.get("epsilon", 1e-5))
+
+
+def _split(a: Attributes, x: Inputs) -> tuple[Tensor, ...]:
+    axis = a.get("axis", 0)
+    count, parts = a.get("num_outputs"), _integers(_get(x, 1))
+    size = -(-x[0].shape[axis] // count) if count else 0
+    return x[0].split(parts or size, axis)
 
 
 def _reshape(a: Attributes, x: Inputs) -> Tensor:
@@ -152,6 +228,14 @@ def _gather_elements(a: Attributes, x: Inputs) -> Tensor:
     return x[0].gather(axis, x[1] % x[0].shape[axis])
 
 
+def _gather_nd(a: Attributes, x: Inputs) -> Tensor:
+    batch = x[1].shape[: a.get("batch_dims", 0)]
+    data, index = (part.reshape(-1, *part.shape[len(batch) :]) if batch else part[None] for part in x)
+    row = torch.arange(len(index), device=index.device).view(-1, *[1] * (index.ndim - 2))
+    found = data[(row, *index.unbind(-1))]
+    return found.reshape(*batch, *found.shape[1:])
+
+
 def _pad(a: Attributes, x: Inputs) -> Tensor:
     pads, count = _integers(x[1]) or [], x[0].ndim
     axes = [axis % count for axis in _integers(_get(x, 3)) or range(count)]
@@ -188,6 +272,10 @@ def _shape(a: Attributes, x: Inputs) -> Tensor:
     return torch.tensor(x[0].shape[a.get("start", 0) : a.get("end")], dtype=torch.int64, device=x[0].device)
 
 
+def _range(_: Attributes, x: Inputs) -> Tensor:
+    return torch.arange(*(part.item() for part in x), dtype=x[0].dtype, device=x[0].device)
+
+
 def _reduced(kind: Callable[..., Tensor]) -> Operator:
     def apply(a: Attributes, x: Inputs) -> Tensor:
         axes = _axes(a, x)
@@ -197,6 +285,10 @@ def _reduced(kind: Callable[..., Tensor]) -> Operator:
         return kind(x[0], dim=every, keepdim=bool(a.get("keepdims", 1)))
 
     return apply
+
+
+def _length(x: Tensor, *, dim: tuple[int, ...], keepdim: bool) -> Tensor:
+    return x.square().sum(dim, keepdim=keepdim).sqrt()
 
 
 def _elementwise(kind: Callable[..., Tensor]) -> Operator:
@@ -210,33 +302,55 @@ OPERATORS: dict[str, Operator] = {
     "AveragePool": _average_pool,
     "BatchNormalization": _batch_normalization,
     "Cast": lambda a, x: x[0].to(_DTYPES[a["to"]]),
+    "Ceil": _elementwise(torch.ceil),
+    "Celu": lambda a, x: functional.celu(x[0], a.get("alpha", 1.0)),
     "Clip": _clip,
     "Concat": lambda a, x: torch.cat(list(x), dim=a["axis"]),
     "ConstantOfShape": _constant_of_shape,
     "Conv": _conv,
+    "ConvTranspose": _transposed_conv,
+    "Cos": _elementwise(torch.cos),
+    "DepthToSpace": _depth_to_space,
     "Div": _divide,
     "Dropout": lambda _, x: x[0],
+    "Einsum": lambda a, x: torch.einsum(a["equation"].decode(), *x),
     "Elu": lambda a, x: functional.elu(x[0], a.get("alpha", 1.0)),
     "Equal": _elementwise(torch.eq),
     "Erf": _elementwise(torch.erf),
     "Exp": _elementwise(torch.exp),
     "Expand": _expand,
     "Flatten": _flatten,
+    "Floor": _elementwise(torch.floor),
+    "GRU": gru,
     "Gather": _gather,
     "GatherElements": _gather_elements,
+    "GatherND": _gather_nd,
     "Gelu": lambda a, x: functional.gelu(x[0], approximate=a.get("approximate", b"none").decode()),
     "Gemm": _gemm,
     "GlobalAveragePool": lambda _, x: x[0].mean(dim=tuple(range(2, x[0].ndim)), keepdim=True),
+    "GlobalMaxPool": lambda _, x: x[0].amax(dim=tuple(range(2, x[0].ndim)), keepdim=True),
     "Greater": _elementwise(torch.gt),
+    "GreaterOrEqual": _elementwise(torch.ge),
+    "GroupNormalization": _group_normalization,
     "HardSigmoid": lambda a, x: (x[0] * a.get("alpha", 0.2) + a.get("beta", 0.5)).clamp(0.0, 1.0),
     "HardSwish": lambda _, x: functional.hardswish(x[0]),
     "Identity": lambda _, x: x[0],
+    "InstanceNormalization": lambda a, x: functional.instance_norm(
+        x[0], weight=x[1], bias=x[2], eps=a.get("epsilon", 1e-5)
+    ),
+    "LSTM": lstm,
+    "LayerNormalization": _layer_normalization,
     "LeakyRelu": lambda a, x: functional.leaky_relu(x[0], a.get("alpha", 0.01)),
     "Less": _elementwise(torch.lt),
+    "LessOrEqual": _elementwise(torch.le),
+    "Log": _elementwise(torch.log),
+    "LogSoftmax": lambda a, x: x[0].log_softmax(dim=a.get("axis", -1)),
     "MatMul": _elementwise(torch.matmul),
     "Max": lambda _, x: reduce(torch.maximum, x),
     "MaxPool": _max_pool,
     "Min": lambda _, x: reduce(torch.minimum, x),
+    "Mish": lambda _, x: functional.mish(x[0]),
+    "Mod": lambda a, x: (torch.fmod if a.get("fmod") else torch.remainder)(x[0], x[1]),
     "Mul": _elementwise(torch.mul),
     "Neg": _elementwise(torch.neg),
     "Not": _elementwise(torch.logical_not),
@@ -244,22 +358,37 @@ OPERATORS: dict[str, Operator] = {
     "PRelu": lambda _, x: torch.where(x[0] < 0, x[0] * x[1], x[0]),
     "Pad": _pad,
     "Pow": _elementwise(torch.pow),
+    "Range": _range,
+    "Reciprocal": _elementwise(torch.reciprocal),
+    "ReduceL2": _reduced(_length),
     "ReduceMax": _reduced(torch.amax),
     "ReduceMean": _reduced(torch.mean),
+    "ReduceMin": _reduced(torch.amin),
     "ReduceSum": _reduced(torch.sum),
     "Relu": _elementwise(torch.relu),
     "Reshape": _reshape,
+    "Resize": _resize,
+    "Round": _elementwise(torch.round),
     "Selu": lambda _, x: functional.selu(x[0]),
     "Shape": _shape,
     "Sigmoid": _elementwise(torch.sigmoid),
+    "Sign": _elementwise(torch.sign),
+    "Sin": _elementwise(torch.sin),
     "Slice": _slice,
     "Softmax": lambda a, x: x[0].softmax(dim=a.get("axis", -1)),
     "Softplus": lambda _, x: functional.softplus(x[0]),
+    "Softsign": lambda _, x: functional.softsign(x[0]),
+    "Split": _split,
     "Sqrt": _elementwise(torch.sqrt),
     "Squeeze": _squeeze,
     "Sub": _elementwise(torch.sub),
+    "Sum": lambda _, x: reduce(torch.add, x),
     "Tanh": _elementwise(torch.tanh),
+    "Tile": lambda _, x: x[0].repeat(_integers(x[1]) or []),
     "Transpose": lambda a, x: x[0].permute(a.get("perm", list(reversed(range(x[0].ndim))))),
     "Unsqueeze": _unsqueeze,
     "Where": _elementwise(torch.where),
 }
+
+SEVERAL_OUTPUTS = ("GRU", "LSTM", "Split")
+"""Operators of which more than the first output may be used."""
