@@ -45,7 +45,7 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
-STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "evaluate")
+STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "evaluate", "film")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -201,7 +201,11 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
     with ledger.stage("evaluate"):
         evaluation = run.evaluate(pattern)
         ledger.calls("evaluate", evaluation.simulator_calls)
-    fidelity = run.film(evaluation, pattern, drives[0], calibrated[0]) if film else None
+    fidelity = None
+    if film:
+        with ledger.stage("film"):
+            fidelity = run.film(evaluation, pattern, drives[0], calibrated[0])
+            ledger.calls("film", 2 if fidelity is None else 3)
     return StressTest(
         attack=found,
         selection=selection,
