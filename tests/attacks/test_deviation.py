@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from painted_ground import RampFollower, recorded_road
-from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack
-from roadproof.attacks.gradopt import Rung, gradopt
+from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack, methods
+from roadproof.attacks.gradopt import BEHIND, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
@@ -162,6 +162,62 @@ def test_a_search_can_begin_with_the_steering_shift(road, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         once(on_step=interrupt)
     assert torch.equal(once().best_unit, found.best_unit)
+
+
+class OneSided(RampFollower):
+    """Gives way to the left only: paint cannot steer it to the right."""
+
+    def steer(self, frames, speed_mps, command):
+        return -torch.relu(-super().steer(frames, speed_mps, command))
+
+
+def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
+    rungs = (Rung(9, 0, open_loop=True), Rung(4, 2, every=4), Rung(2, 3, groups_compete=True), Rung(2, 2, 0.01))
+    groups = (RIGHT_GROUP, LEFT_GROUP)
+    measure = PathDeviation().measure(road, OneSided(), groups, device="cpu")
+    found = gradopt(measure, SPACE, rungs, seed=0)
+    assert list(found.gave_way) == [0]
+    assert found.best.shape == (1, 4), "the places of both sides, all to the left"
+    assert found.history.shape == (5, 1, 4)
+    assert found.gave_way[0] < BEHIND * float(found.best.max())
+    left = measure.of_groups([1])
+    assert left.groups == (LEFT_GROUP,)
+    assert torch.allclose(left.values(SPACE, found.best_unit), found.best)
+    # Where nobody is far behind, nothing changes hands.
+    equal = PathDeviation().measure(road, RampFollower(), groups, device="cpu")
+    assert gradopt(equal, SPACE, rungs, seed=0).gave_way == {}
+    stopped = tmp_path / "search.safetensors"
+
+    def interrupt(step, _):
+        if step == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        gradopt(measure, SPACE, rungs, seed=0, checkpoint=stopped, on_step=interrupt)
+    gone_on = gradopt(measure, SPACE, rungs, seed=0, checkpoint=stopped)
+    assert torch.equal(gone_on.best_unit, found.best_unit)
+    assert gone_on.gave_way == found.gave_way
+
+
+def test_a_result_says_which_side_gave_way(road, monkeypatch):
+    monkeypatch.setattr(methods, "PATH_RUNGS", (Rung(9, 0, open_loop=True), Rung(4, 2, every=4)))
+    method = GradOpt(iterations=2, restarts=2)
+    result = attack(road, OneSided(), SPACE, objective=PathDeviation(), method=method)
+    assert list(result.by_group) == [str(LEFT_GROUP)]
+    assert {each.group for each in result.candidates} == {str(LEFT_GROUP)}
+    assert len(result.candidates) == 4
+    (said,) = (check for check in result.checks if check.name == "places given to the better side")
+    assert "clean+right reached" in said.finding
+
+
+def test_starts_are_the_best_of_many_that_are_only_valued(road):
+    measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    seen: list[int] = []
+    found = gradopt(measure, SPACE, (Rung(20, 0), Rung(3, 1)), seed=4, on_step=lambda step, _: seen.append(step))
+    drawn = SPACE.random((2, 20), torch.Generator().manual_seed(4))
+    best = measure.values(SPACE, drawn).topk(3, 1).values
+    assert torch.allclose(found.history[0], best, atol=1e-5), "the first step values where it begins"
+    assert seen == [0, 1]
 
 
 def test_a_search_without_gradients_drives_in_the_recorded_world_too(road, tmp_path):

@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.checks import Check, check_bounds, check_gradients, check_search, check_world
+from roadproof.attacks.checks import Check, check_bounds, check_gradients, check_groups, check_search, check_world
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SteeringShift, variation_of
+from roadproof.attacks.objective import Grouped, Measure, Objective, RecordedMeasure, SteeringShift, variation_of
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
@@ -101,13 +101,18 @@ def attack(
         checkpoint=checkpoint,
         on_step=on_step,
     )
+    frames = measure.frames_evaluated
+    if search.gave_way and isinstance(measure, Grouped):
+        measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
+    told, groups = groups, measure.groups
     candidates = _candidates(measure, search, space, groups)
     cost = Cost(
-        controller_frames=measure.frames_evaluated,
+        controller_frames=frames,
         seconds=time.perf_counter() - start,
         simulator_calls=measure.calls if isinstance(measure, DrivenMeasure) else 0,
     )
     checks = _checks(measure, method, space, search, candidates[0], random_patterns, seed)
+    checks += check_groups(told, search)
     first = candidates[0]
     return AttackResult(
         pattern=first.pattern,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.gradopt import Search, random_search
+from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import Measure, RecordedMeasure
 from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
@@ -138,6 +140,16 @@ def check_bounds(space: SearchSpace, search: Search) -> Check:
         f"{stuck:.0%} of the winner's shape parameters lie on a bound",
         "" if passed else "the bounds hold the pattern back: widen them, use the free family, or add figures",
     )
+
+
+def check_groups(groups: Sequence[Group], search: Search) -> tuple[Check, ...]:
+    """Say which groups gave their places to the others; nothing where none did."""
+    if not search.gave_way:
+        return ()
+    behind = ", ".join(f"{groups[k]} reached {value:.2f}" for k, value in search.gave_way.items())
+    ahead = ", ".join(str(group) for k, group in enumerate(groups) if k not in search.gave_way)
+    finding = f"{behind} before the last steps, far behind {ahead}, which was given its places"
+    return (Check("places given to the better side", True, finding),)
 
 
 def _check_against_random(measure: Measure, space: SearchSpace, search: Search, patterns: int, seed: int) -> Check:

@@ -80,6 +80,13 @@ class DeviationMeasure:
         thin.every, thin.frames_evaluated = every, 0
         return thin
 
+    def of_groups(self, kept: Sequence[int]) -> DeviationMeasure:
+        """The same measure for some of its sides alone."""
+        part = copy.copy(self)
+        part.groups, part.frames_evaluated = tuple(self.groups[k] for k in kept), 0
+        vars(part)["_open_loop"] = self._open_loop.of_groups(kept)
+        return part
+
     def redraw(self, seed: int) -> None:
         """Take the mean over the looks of another seed from now on; does nothing without a variation."""
         if self.variation is not None:

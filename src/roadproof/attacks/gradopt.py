@@ -6,13 +6,14 @@ A search is a ladder of rungs. Where a start ends depends on where it began far 
 after some 20 steps on every fourth frame their order is much that of the end. So many starts climb the first rungs on
 few frames, and the best of them alone go on (successive halving). The last rungs have the starts and frames of the
 whole search, and smaller and smaller steps; each begins at the best points so far with a fresh optimiser, as in the
-paper.
+paper. A group that is far behind by then gives its places to the others: some controllers give way to one side only.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Required, TypedDict, Unpack, cast
 
@@ -21,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
-from roadproof.attacks.objective import Measure, RecordedMeasure, Varied
+from roadproof.attacks.objective import Grouped, Measure, RecordedMeasure, Varied
 from roadproof.attacks.surrogate import FIXED
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
@@ -33,13 +34,15 @@ class Rung:
 
     Args:
         starts: number of starts of every group: the best of the rung before, and random points if those are fewer.
-        iterations: number of steps of each start.
+        iterations: number of steps of each start; 0 only values the starts, without gradients.
         learning_rate: Adam's learning rate, as a share of each parameter's range.
         every: use every n-th frame of each drive; in the recorded world, a picture every n-th step. 1 uses all.
         open_loop: whether to climb the steering shift on recorded frames, whatever the objective of the search.
+        groups_compete: whether a group whose best is below `BEHIND` of the best of all gives its starts to the others
+            before this rung, if the measure can be had of some groups alone (`Grouped`).
 
     Raises:
-        RoadproofError: `starts`, `iterations`, `learning_rate` or `every` is not positive.
+        RoadproofError: `starts`, `learning_rate` or `every` is not positive, or `iterations` is negative.
     """
 
     starts: int
@@ -47,9 +50,10 @@ class Rung:
     learning_rate: float = 0.1
     every: int = 1
     open_loop: bool = False
+    groups_compete: bool = False
 
     def __post_init__(self) -> None:
-        if min(self.starts, self.iterations, self.every) < 1 or not self.learning_rate > 0:
+        if min(self.starts, self.iterations + 1, self.every) < 1 or not self.learning_rate > 0:
             raise RoadproofError(f"{self} has a number that is too small; expected 1 or more, and a rate above 0")
 
     def view(self, measure: RecordedMeasure) -> RecordedMeasure:
@@ -64,15 +68,26 @@ class Rung:
 
 Ladder = tuple[Rung, ...]
 
+BEHIND = 1 / 3
+"""Where groups compete, one that has reached less than this share of the best group's value gives its places away."""
+
 
 def dropping(
-    starts: int, iterations: int, learning_rate: float, *, after: tuple[float, float], factor: float
+    starts: int,
+    iterations: int,
+    learning_rate: float,
+    *,
+    after: tuple[float, float],
+    factor: float,
+    groups_compete: bool = False,
 ) -> Ladder:
     """Rungs whose learning rate falls by a factor twice, after the given shares of the iterations."""
-    first, second = (max(1, int(iterations * share + 1e-9)) for share in after)
-    parts = (first, second - first, iterations - second)
+    once, twice = (max(1, int(iterations * share + 1e-9)) for share in after)
+    parts = (once, twice - once, iterations - twice)
     rates = (learning_rate * factor**k for k in range(3))
-    return tuple(Rung(starts, each, rate) for each, rate in zip(parts, rates, strict=True) if each > 0)
+    every = (Rung(starts, each, rate) for each, rate in zip(parts, rates, strict=True) if each > 0)
+    first, *others = every
+    return replace(first, groups_compete=groups_compete), *others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,11 +99,14 @@ class Search:
         best: value at each best point, (G, R).
         history: value at every iteration of the last rungs, those with all frames and the final number of starts, (i,
             g, c); without gradients the best value so far, (calls, 1, 1).
+        gave_way: best value of each group that gave its places to the others, by its number; the G groups above are
+            the rest, in their order.
     """
 
     best_unit: Float[Tensor, "g r k n"]
     best: Float[Tensor, "g r"]
     history: Float[Tensor, "i g c"]
+    gave_way: dict[int, float] = field(default_factory=dict[int, float])
 
 
 class Running(TypedDict, total=False):
@@ -130,34 +148,42 @@ def gradopt(
     given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
     state = load_checkpoint(checkpoint, identity, measure.device) if checkpoint else None
-    at = 0
+    at, behind = 0, torch.full((len(measure.groups),), torch.nan)
     if state is None:
         state = _state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
-        at = int(state.pop("rung"))
+        at, behind = int(state.pop("rung")), state.pop("behind").cpu()
         measure.frames_evaluated += int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung = rungs[number]
         if number > at:
-            state = _next_rung(state, space, rungs[number - 1], rung, derived_seed(seed, number))
-        climbed, done = rung.view(measure), sum(before.iterations for before in rungs[:number])
-        while int(state["done"]) < rung.iterations:
+            if rung.groups_compete and isinstance(measure, Grouped):
+                state, behind = _without_those_behind(state, behind)
+            places = rung.starts * len(measure.groups) // len(state["best"])
+            state = _next_rung(state, space, rungs[number - 1], rung, places, derived_seed(seed, number))
+        climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
+        while int(state["done"]) < max(rung.iterations, 1):
             if isinstance(climbed, Varied):
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
-            state = _step(climbed, space, rung.learning_rate, momentum, state)
-            on_step(done + int(state["done"]), float(state["best"].max()))
+            if rung.iterations:
+                state = _step(climbed, space, rung.learning_rate, momentum, state)
+                on_step(done + int(state["done"]), float(state["best"].max()))
+            else:
+                state |= {"best": climbed.values(space, state["unit"]), "done": torch.tensor(1)}
+                on_step(done, float(state["best"].max()))
             if checkpoint:
                 frames = measure.frames_evaluated + (0 if climbed is measure else climbed.frames_evaluated)
-                whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames)}
+                whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames), "behind": behind}
                 save_checkpoint(checkpoint, identity, whole)
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
-    best = state["best"]
-    if isinstance(measure, Varied) and measure.variation is not None:
+    best, last = state["best"], _of_groups(measure, behind)
+    if isinstance(last, Varied) and last.variation is not None:
         # Every step had looks of its own; results are compared in the same ones.
-        measure.redraw(FIXED)
-        best = measure.values(space, state["best_unit"])
-    return Search(state["best_unit"], best, state["history"].cpu())
+        last.redraw(FIXED)
+        best = last.values(space, state["best_unit"])
+    gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
+    return Search(state["best_unit"], best, state["history"].cpu(), gave_way)
 
 
 def _starts(
@@ -180,14 +206,35 @@ def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:
     return {"unit": unit, "best_unit": unit.clone(), "best": best, "history": history, "done": torch.tensor(0)}
 
 
-def _next_rung(state: dict[str, Tensor], space: SearchSpace, before: Rung, rung: Rung, seed: int) -> dict[str, Tensor]:
-    """State of the next rung, begun at the best points of every group; random points fill the remaining starts."""
+def _of_groups(measure: RecordedMeasure, behind: Float[Tensor, " g"]) -> RecordedMeasure:
+    """The measure of the groups that have not given way."""
+    kept = cast("list[int]", behind.isnan().nonzero()[:, 0].tolist())
+    return measure.of_groups(kept) if len(kept) < len(behind) and isinstance(measure, Grouped) else measure
+
+
+def _without_those_behind(
+    state: dict[str, Tensor], behind: Float[Tensor, " g"]
+) -> tuple[dict[str, Tensor], Float[Tensor, " g"]]:
+    """The state without groups that are far behind, and the best value of each group that has given way, else NaN."""
+    best = state["best"].amax(1)
+    ahead = best >= BEHIND * best.max()
+    if bool(ahead.any()) and not bool(ahead.all()):
+        behind = behind.clone()
+        behind[behind.isnan()] = torch.where(ahead, torch.nan, best).cpu()
+        state = state | {name: state[name][ahead] for name in ("unit", "best_unit", "best")}
+    return state, behind
+
+
+def _next_rung(
+    state: dict[str, Tensor], space: SearchSpace, before: Rung, rung: Rung, places: int, seed: int
+) -> dict[str, Tensor]:
+    """State of the next rung, begun at the best points of every group; random points fill the remaining places."""
     if rung.goes_on(before):
         kept = ("best_unit", "best", "history")
         return {name: state[name] for name in kept} | {"unit": state["best_unit"], "done": torch.tensor(0)}
-    best = state["best"].topk(min(rung.starts, before.starts), 1).indices
+    best = state["best"].topk(min(places, state["best"].shape[1]), 1).indices
     unit = state["best_unit"][torch.arange(len(best), device=best.device)[:, None], best]
-    drawn = space.random((len(unit), rung.starts - unit.shape[1]), torch.Generator().manual_seed(seed))
+    drawn = space.random((len(unit), places - unit.shape[1]), torch.Generator().manual_seed(seed))
     return _state_at(torch.cat([unit, drawn.to(unit)], 1))
 
 

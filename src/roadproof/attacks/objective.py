@@ -86,6 +86,15 @@ class Varied(Protocol):
 
 
 @runtime_checkable
+class Grouped(Protocol):
+    """A measure that can be had of some of its groups alone."""
+
+    def of_groups(self, kept: Sequence[int]) -> RecordedMeasure:
+        """The same measure of the groups with these numbers; its frames are counted from nought."""
+        ...
+
+
+@runtime_checkable
 class Objective(Protocol):
     """What a search makes large, such as a steering shift or a path deviation."""
 

@@ -5,6 +5,7 @@ Its numbers are predictions for drives near the recorded ones; what a car really
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -94,6 +95,14 @@ class Surrogate:
         """The surrogate on every n-th frame of each drive."""
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
         return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
+
+    def of_groups(self, kept: Sequence[int]) -> Surrogate:
+        """The surrogate of some of its groups alone."""
+        part = copy.copy(self)
+        of_each = ("lengths", "views", "_speed", "_command", "clean_steer", "_clean_looked")
+        vars(part).update({name: [vars(self)[name][k] for k in kept] for name in of_each}, _kept=None)
+        part.groups, part.frames_evaluated = tuple(self.groups[k] for k in kept), 0
+        return part
 
     def redraw(self, seed: int) -> None:
         """Take the mean over the looks of another seed from now on; does nothing without a variation."""

@@ -115,8 +115,10 @@ def of_search(
         rungs = method.ladder
     else:
         rungs = (Rung(1, method.steps(objective), 1.0),)
+    # Starts that are only valued take a third of a step.
     count = sum(
-        rung.starts * rung.iterations * math.ceil((frames if rung.open_loop else steps) / rung.every) for rung in rungs
+        rung.starts * max(rung.iterations, 1 / 3) * math.ceil((frames if rung.open_loop else steps) / rung.every)
+        for rung in rungs
     )
     seconds = groups * count * frame_seconds(controller, gradients=method.by_gradient)
     return Estimate(seconds=seconds, megabytes=1.0, basis=_MEASURED)
