@@ -1,5 +1,6 @@
 """Geometry against closed forms, hand-made cameras and the real CARLA homographies."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -152,11 +153,26 @@ def test_homographies_of_wrong_sign_or_rank_are_refused():
 
 
 @pytest.mark.parametrize(
-    "kwargs", [{"width_px": 0}, {"fov_deg": 180.0}, {"fov_deg": float("nan")}], ids=lambda kwargs: next(iter(kwargs))
+    "kwargs",
+    [
+        {"width_px": 0},
+        {"width_px": 10**6},
+        {"fov_deg": 180.0},
+        {"fov_deg": float("nan")},
+        {"up_m": 0.0},
+        {"pitch_deg": 1e300},
+        {"left_m": float("inf")},
+    ],
+    ids=lambda kwargs: next(iter(kwargs)),
 )
 def test_impossible_cameras_are_refused(kwargs):
-    with pytest.raises(GeometryError):
+    with pytest.raises(GeometryError, match=f"camera ({next(iter(kwargs))}|picture)"):
         CameraModel(**({"width_px": 800, "height_px": 600, "fov_deg": 100.0} | kwargs))
+
+
+def test_an_input_that_fills_the_memory_is_refused():
+    with pytest.raises(GeometryError, match="at most 40,000,000 in all"):
+        dataclasses.replace(CIL_INPUT, width_px=10**9)
 
 
 def test_a_picture_smaller_than_the_crop_is_refused():

@@ -140,6 +140,8 @@ def valid_file():
         (lambda c: c.update(figures=c["figures"] * 65), "has 65 figures, expected at least one and 64 at most"),
         (lambda c: c.update(version=True), "version True, expected a whole number from 1"),
         (lambda c: c.update(version=-1), "version -1"),
+        (lambda c: c.update(canvas_px=401), "canvas_px is 401, expected 400"),
+        (lambda c: c.update(figures=c["figures"] * 5000), "it is larger than 262,144 bytes"),
     ],
 )
 def test_a_damaged_pattern_file_is_refused_in_one_line(tmp_path, change, message):

@@ -94,7 +94,9 @@ def call(what: str, function: Callable[Arguments, Answer], *args: Arguments.args
                 f"{what} has not answered for {_limit_s:g} s and was ended; look for what it waits for"
             ) from None
         raise
-    except (Exception, SystemExit) as error:
+    except GeneratorExit:
+        raise
+    except BaseException as error:  # whatever its author made up
         raise ControllerError(f"{what} raised {in_one_line(error, place_of(error))}") from error
     finally:
         del _calls[id(this)]

@@ -23,6 +23,9 @@ from roadproof.errors import GeometryError
 CANVAS_SIZE_PX = 400
 _MOST_SCALE = 1e9
 
+MOST_PIXELS = 40_000_000
+"""A picture, or a controller's input, has no more pixels."""
+
 Points = Float[np.ndarray, "*n 2"]
 Homography = Float[np.ndarray, "3 3"]
 
@@ -41,7 +44,8 @@ class CameraModel:
         pitch_deg: pitch in degrees, positive looking up; CARLA's imitation agent looks down by −15.
 
     Raises:
-        GeometryError: a size is not positive or the field of view is outside (0, 180).
+        GeometryError: a size is not positive, the field of view is outside (0, 180), the camera is not above the ground
+            or further than 100 m from the vehicle's origin, or does not look ahead.
     """
 
     width_px: int
@@ -57,6 +61,17 @@ class CameraModel:
             raise GeometryError(f"camera picture is {self.width_px}×{self.height_px}, expected at least 1×1 pixels")
         if not 0.0 < self.fov_deg < 180.0:
             raise GeometryError(f"camera fov_deg is {self.fov_deg}, expected a value between 0 and 180")
+        if self.width_px * self.height_px > MOST_PIXELS:
+            raise GeometryError(f"camera picture is {self.width_px}×{self.height_px}, expected {MOST_PIXELS:,} at most")
+        for name, low, high in (
+            ("forward_m", -100, 100),
+            ("left_m", -100, 100),
+            ("up_m", 0.01, 100),
+            ("pitch_deg", -89, 89),
+        ):
+            value: float = getattr(self, name)
+            if not low <= value <= high:
+                raise GeometryError(f"camera {name} is {value:g}, expected {low:g} to {high:g}")
 
     @property
     def focal_px(self) -> float:
@@ -104,7 +119,7 @@ class CropResize:
             wide as one).
 
     Raises:
-        GeometryError: the box or the input has no pixels.
+        GeometryError: the box or the input has no pixels, or the input has more than `MOST_PIXELS`.
     """
 
     left_px: int
@@ -119,8 +134,11 @@ class CropResize:
         if not (0 <= self.left_px < self.right_px and 0 <= self.top_px < self.bottom_px):
             box = (self.left_px, self.top_px, self.right_px, self.bottom_px)
             raise GeometryError(f"crop box (left, top, right, bottom) is {box}, expected a box that is not empty")
-        if self.width_px < 1 or self.height_px < 1:
-            raise GeometryError(f"controller input is {self.width_px}×{self.height_px}, expected at least 1×1 pixels")
+        if self.width_px < 1 or self.height_px < 1 or self.width_px * self.height_px > MOST_PIXELS:
+            raise GeometryError(
+                f"controller input is {self.width_px}×{self.height_px}, expected at least 1×1 pixels and at most "
+                f"{MOST_PIXELS:,} in all"
+            )
 
     @property
     def input_from_camera(self) -> Homography:

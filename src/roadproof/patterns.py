@@ -209,11 +209,15 @@ class _Figures:
     canvas_px: int = CANVAS_SIZE_PX
 
     def __post_init__(self) -> None:
+        if self.canvas_px != CANVAS_SIZE_PX:
+            raise PatternError(f"canvas_px is {self.canvas_px}, expected {CANVAS_SIZE_PX}: figures are in these pixels")
         if not 1 <= len(self.figures) <= MAX_FIGURES:
             raise PatternError(f"it has {len(self.figures)} figures, expected at least one and {MAX_FIGURES} at most")
 
 
-_FILE = RecordFile(kind=_Figures, name="roadproof-pattern", error=PatternError, remedy="make it again")
+_FILE = RecordFile(
+    kind=_Figures, name="roadproof-pattern", error=PatternError, remedy="make it again", most_bytes=2**18
+)
 
 
 def save_pattern(pattern: Pattern, path: AnyPath) -> None:

@@ -20,7 +20,7 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml
+from roadproof.io.files import AnyPath, as_path, check_name, first_twice, inside, read_toml
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -132,10 +132,8 @@ def load_scenarios(path: AnyPath) -> tuple[Scenario, ...]:
             scenarios.append(_scenario(entry, path.parent))
         except (ScenarioError, GeometryError) as error:
             raise ScenarioError(f"scenarios {path}, entry {k + 1}: {error}") from error
-    names = [scenario.name for scenario in scenarios]
-    for name in names:
-        if names.count(name) > 1:
-            raise ScenarioError(f"scenarios {path}: the name {name!r} is used twice; names must differ")
+    if (name := first_twice(scenario.name for scenario in scenarios)) is not None:
+        raise ScenarioError(f"scenarios {path}: the name {name!r} is used twice; names must differ")
     return tuple(scenarios)
 
 

@@ -110,6 +110,7 @@ EVERYTHING_BAD = {
     **{f"steers {name}": make for name, make in bad_drivers.STEERS.items()},
     **{f"acts {name}": make for name, make in bad_drivers.ACTS.items()},
     "in place": bad_drivers.InPlace,
+    "writes into frames": bad_drivers.WritesIntoFrames,
 }
 
 

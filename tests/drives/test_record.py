@@ -10,7 +10,7 @@ from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
 from roadproof.drives.folder import write_settings
-from roadproof.errors import OutputError, RecordingError
+from roadproof.errors import OutputError, RecordingError, ScenarioError
 from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
 from roadproof.recordings import Side
 from roadproof.scenarios import find_scenario
@@ -163,3 +163,10 @@ def test_it_is_cut_where_the_drive_came_to_harm(drives, town):
     along = record_along(town, PaintShy(), drives, hit, name="round-1")
     assert along.episode.time_s[-1] == pytest.approx(harm_s)
     assert along.frame_number[-1] < left.frame_number[2]
+
+
+def test_a_scenario_that_the_simulator_refuses_leaves_the_folder_to_the_mended_one(town, tmp_path):
+    nowhere = dataclasses.replace(LEFT, map_name="nope")
+    with pytest.raises(ScenarioError, match="nope"):
+        record(town, expert, nowhere, folder=tmp_path / "record", **ASKED)
+    assert not (tmp_path / "record" / "record.json").exists()

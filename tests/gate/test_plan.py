@@ -57,6 +57,7 @@ CHANGE = '\n[change]\nreference = "reference"\n'
 MISTAKES = {
     "no header": (('format = "roadproof-check"', ""), 'expected format = "roadproof-check"'),
     "version": (("version = 1", "version = 3"), "version is 3, expected 1"),
+    "version that is no number": (("version = 1", "version = true"), "version is True, expected 1"),
     "not TOML": (("version = 1", "version ="), "not valid TOML"),
     "unknown key": (("random = 0", "randon = 0"), "unknown key 'randon'; did you mean 'random'"),
     "unknown start": (("right_m = 0.05", "right = 0.05"), "unknown key 'right'; did you mean 'right_m'"),

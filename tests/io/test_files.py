@@ -1,14 +1,26 @@
 """Names from files: what may name a folder, and that nothing gets out of the folder it is in."""
 
 import dataclasses
+import os
 
 import pytest
 import torch
 
 import roadproof
 from roadproof.coverage import Shape
-from roadproof.errors import RecordingError, RoadproofError, ScenarioError
-from roadproof.io.files import as_path, inside, is_plain_name
+from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
+from roadproof.io.files import (
+    as_path,
+    check_closed,
+    first_twice,
+    inside,
+    is_plain_name,
+    read_json,
+    read_toml,
+    write_atomically,
+    write_folder_atomically,
+)
+from roadproof.io.locks import working_in
 from roadproof.patterns import Pattern
 from roadproof.scenarios import builtin_scenarios, load_scenarios, save_scenarios
 from scenes import recording_set
@@ -85,3 +97,74 @@ def test_public_functions_take_paths_as_text(tmp_path):
 def test_what_is_no_path_is_one_line(given):
     with pytest.raises(RoadproofError, match=f"^{given!r} is no path, expected a text or a pathlib.Path$"):
         as_path(given)
+
+
+def test_links_that_lead_out_of_a_folder_are_named_before_anything_is_read(tmp_path):
+    inner, other = tmp_path / "run" / "attack", tmp_path / "other"
+    inner.mkdir(parents=True)
+    other.mkdir()
+    (tmp_path / "run" / "own").symlink_to(inner)
+    check_closed(tmp_path / "run", RoadproofError)
+    for link, target in ((inner / "pattern.json", other / "x"), (tmp_path / "run" / "record", other)):
+        link.symlink_to(target)
+        with pytest.raises(RoadproofError, match=f"{link.name} is a link that leads out of"):
+            check_closed(tmp_path / "run", RoadproofError)
+        link.unlink()
+
+
+def test_recordings_with_a_link_in_them_are_not_read(tmp_path):
+    roadproof.save_recordings(recording_set(frames=2), tmp_path / "set")
+    (tmp_path / "set" / "clean" / "drive.npz").rename(tmp_path / "drive.npz")
+    (tmp_path / "set" / "clean" / "drive.npz").symlink_to(tmp_path / "drive.npz")
+    with pytest.raises(RecordingError, match=r"drive\.npz is a link that leads out of"):
+        roadproof.load_recordings(tmp_path / "set")
+
+
+def test_what_is_written_to_a_folder_that_is_worked_in_stays_there(tmp_path):
+    run, other = tmp_path / "run", tmp_path / "other"
+    run.mkdir()
+    other.mkdir()
+    (run / "record").symlink_to(other)
+    (run / "own").mkdir()
+    with working_in(run):
+        for path in (run / "record" / "record.json", run / "record" / "deep" / "x"):
+            with pytest.raises(OutputError, match="reached by a link that leads out of"):
+                write_atomically(path, lambda part: part.write_text("x"))
+            with pytest.raises(OutputError, match="reached by a link that leads out of"):
+                write_folder_atomically(path, lambda part: None)
+        write_atomically(run / "own" / "x", lambda part: part.write_text("x"))
+        write_atomically(tmp_path / "beside", lambda part: part.write_text("x"))
+    assert not list(other.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
+    for name in ("x.json", "x.toml"):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(RoadproofError, match="it is a pipe or a device, expected a file"):
+        read_json(tmp_path / "x.json", "x", 1, RoadproofError)
+    with pytest.raises(RoadproofError, match="it is a pipe or a device, expected a file"):
+        read_toml(tmp_path / "x.toml", RoadproofError)
+
+
+@pytest.mark.parametrize("text", [".".join("a" * 5000) + " = 1", f"[{'.'.join('a' * 5000)}]"])
+def test_toml_that_is_too_deep_is_one_line(tmp_path, text):
+    (tmp_path / "x.toml").write_text(text)
+    with pytest.raises(RoadproofError, match=r"x\.toml is not valid TOML \(.*recursion") as refusal:
+        read_toml(tmp_path / "x.toml", RoadproofError)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_text_file_that_is_too_large_is_not_read(tmp_path):
+    (tmp_path / "x.json").write_text("{" + " " * 2000 + "}")
+    with pytest.raises(RoadproofError, match="it is larger than 1,000 bytes"):
+        read_json(tmp_path / "x.json", "x", 1, RoadproofError, most_bytes=1000)
+    with (tmp_path / "x.toml").open("wb") as file:
+        file.truncate(2**33)
+    with pytest.raises(RoadproofError, match="it is larger than 33,554,432 bytes"):
+        read_toml(tmp_path / "x.toml", RoadproofError)
+
+
+def test_the_first_value_that_is_there_twice_is_found_at_once():
+    assert first_twice(range(300_000)) is None
+    assert first_twice(["a", "b", "c", "b", "a"]) == "b"

@@ -84,3 +84,11 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"), working_in(tmp_path / "file" / "run"):
         pass
+
+
+def test_another_temporary_folder_is_no_way_round(child, tmp_path, monkeypatch):
+    _, place = child
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    with pytest.raises(OutputError, match="works in"), working_in(place):
+        pass

@@ -58,3 +58,33 @@ def test_a_missing_picture_is_said(tmp_path: Path) -> None:
     """With its path."""
     with pytest.raises(RoadproofError, match="is missing"):
         read_picture(tmp_path / "a.png", RoadproofError, "again")
+
+
+@pytest.mark.parametrize(
+    ("picture", "reason"),
+    [
+        (Image.fromarray(np.full((4, 4), 30_000, np.uint16)), "more than 8 bits"),
+        (Image.fromarray(np.full((4, 4, 4), 100, np.uint8)), "transparent"),
+    ],
+    ids=["16 bits", "transparent"],
+)
+def test_pictures_that_would_silently_become_others_are_refused(
+    tmp_path: Path, picture: Image.Image, reason: str
+) -> None:
+    picture.save(tmp_path / "x.png")
+    with pytest.raises(RoadproofError, match=reason):
+        read_picture(tmp_path / "x.png", RoadproofError, "make it again")
+
+
+def test_a_picture_with_alpha_that_hides_nothing_is_read(tmp_path: Path) -> None:
+    opaque = np.full((4, 5, 4), 255, np.uint8)
+    opaque[..., 0] = 3
+    Image.fromarray(opaque).save(tmp_path / "x.png")
+    assert (read_picture(tmp_path / "x.png", RoadproofError, "make it again") == opaque[..., :3]).all()
+
+
+def test_an_animation_is_no_picture(tmp_path: Path) -> None:
+    frames = [Image.fromarray(np.full((4, 4, 3), k, np.uint8)) for k in (0, 200)]
+    frames[0].save(tmp_path / "x.png", save_all=True, append_images=frames[1:])
+    with pytest.raises(RoadproofError, match="an animation of 2 pictures"):
+        read_picture(tmp_path / "x.png", RoadproofError, "make it again")

@@ -116,6 +116,7 @@ def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, mon
     ("before", "after", "message"),
     [
         ("version = 2", "version = 1", "version is 1, expected 2; version 1 had other keys"),
+        ("version = 2", "version = 2.0", "version is 2.0, expected 2"),
         ("roadproof-study", "other", "expected format"),
         ('controller = "cil"', 'controller = "cil"\nsimulator = "twon"', "simulator is 'twon'"),
         ("seeds =", "seed =", "did you mean 'seeds'"),

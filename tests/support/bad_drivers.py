@@ -24,6 +24,10 @@ class Honest:
         return Control(0.0, throttle=0.3)
 
 
+class OfItsOwnBase(BaseException):
+    """Passes what catches exceptions."""
+
+
 class OfItsOwnError(Exception):
     """Its message cannot be had, and it has several lines."""
 
@@ -64,6 +68,7 @@ def unchecked(steer):
 
 # Exceptions, by the name they are told with.
 RAISED = {
+    "OfItsOwnBase": OfItsOwnBase("out"),
     "ZeroDivisionError": ZeroDivisionError("division by zero"),
     "ValueError": ValueError("two\nlines " + 1000 * "and more "),
     "KeyError": KeyError("road"),
@@ -123,6 +128,16 @@ class InPlace(Honest):
         return answer
 
 
+class WritesIntoFrames(Honest):
+    """Answers well, and leaves other frames behind."""
+
+    def steer(self, frames, speed_mps, command):
+        answer = super().steer(frames, speed_mps, command)
+        with torch.no_grad():
+            frames.data.mul_(0.5)
+        return answer
+
+
 class Pedals(Honest):
     def controls(self, frames, speed_mps, command):
         return self.steer(frames, speed_mps, command)[:, None]
@@ -133,6 +148,7 @@ def sized(size):
 
 
 SIZES = {
+    "huge": controller(input_size=(10**9, 10**9)),
     "text": sized("88x200"),
     "list": sized([88, 200]),
     "one": sized((88,)),

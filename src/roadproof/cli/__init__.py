@@ -5,6 +5,7 @@ A `RoadproofError` is one line on standard error and exit code 2, a traceback on
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import sys
@@ -98,8 +99,13 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 def main() -> None:
     """Entry point of the `roadproof` command."""
     keep_freed_memory()
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal or pipe of another encoding gets ä as \xe4 instead of an error.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         code = app(prog_name="roadproof", standalone_mode=False)
+        sys.stdout.flush()
     except _UsageError as error:
         # Where no words were given, the help was shown instead, and there is nothing to say.
         if said := error.format_message().rstrip("."):
@@ -109,7 +115,11 @@ def main() -> None:
         _fail(str(error))
     except OSError as error:
         # The system's own words: of a path that no file can have, or a disk that fails.
-        _fail(f"{str(error.filename)[:200]!r}: {error.strerror}; check the path" if error.strerror else str(error))
+        if error.filename is None:
+            # What is still to be printed would fail again when the process ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        where = "the output" if error.filename is None else repr(str(error.filename)[:200])
+        _fail(f"{where}: {error.strerror}; check the path" if error.strerror else str(error))
     except typer.Abort:
         code = _INTERRUPTED
     if code == _INTERRUPTED:
@@ -131,4 +141,4 @@ def _fail(message: str) -> NoReturn:
 def _complain(message: str) -> None:
     """One line on standard error; what a message quotes may be long, or hold line ends and a terminal's commands."""
     plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in message)
-    Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"roadproof: {plain:.1000}")
+    Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(f"roadproof: {plain:.1000}")

@@ -93,6 +93,9 @@ def scenario(
     from roadproof.simulators.carla.places import scenario_between, spawn_places
     from roadproof.simulators.carla.simulator import CarlaSimulator
 
+    for place in (start, goal):
+        if place < 0:
+            raise ScenarioError(f"spawn point {place} has a number below 0, expected one that the server has")
     with CarlaSimulator(host, port) as simulator:
         where = map_name or simulator.session.map_name()
         roads = simulator.road_map(where)

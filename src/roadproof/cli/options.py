@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 import typer
 
 from roadproof.errors import RoadproofError
+from roadproof.io.files import first_twice
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES, MAX_SEED
 
 if TYPE_CHECKING:
@@ -256,9 +257,8 @@ def weathers_of(names: str, option: str) -> tuple[Weather, ...]:
         RoadproofError: a name is no weather's, where the message names the nearest, or is there twice.
     """
     found = tuple(weather_of(name.strip(), option) for name in names.split(","))
-    for weather in found:
-        if found.count(weather) > 1:
-            raise RoadproofError(f"--{option} has {weather} twice, expected each once")
+    if (twice := first_twice(found)) is not None:
+        raise RoadproofError(f"--{option} has {twice} twice, expected each once")
     return found
 
 

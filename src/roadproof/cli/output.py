@@ -60,7 +60,7 @@ def say(*lines: RenderableType, wrapped: bool = False) -> None:
     """
     if _answers is not None and is_quiet():
         return
-    console = Console(soft_wrap=not wrapped, highlight=False, markup=False)
+    console = Console(soft_wrap=not wrapped, highlight=False, markup=False, emoji=False)
     for line in lines:
         console.print(line)
 

@@ -123,7 +123,7 @@ def _paint(
     limits, variation = (None, None) if paint is None else paint_of(read_toml(paint, PatternError), str(paint))
     said: dict[str, Any] = {
         "max_area_m2": max_area,
-        "colours": tuple(each.strip() for each in colours.split(",")) if colours else None,
+        "colours": None if colours is None else tuple(each.strip() for each in colours.split(",")),
         "printable": printable or None,
         "contrast": contrast,
         "keep_out_m": keep_out,

@@ -148,7 +148,7 @@ class _Lines:
             said += f", {in_words(seconds)}"
             if self._first < done < total:
                 said += f", about {in_words(seconds * (total - done) / (done - self._first))} left"
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(said)
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(said)
 
 
 def in_words(seconds: float) -> str:

@@ -108,6 +108,6 @@ def begin(estimate: Estimate, *folders: Path) -> None:
     for folder in folders:
         hold(folder)
     if estimate.seconds > SHORT_S and not is_quiet():
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(
+        Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(
             f"This takes {told}; when it is interrupted, the same command goes on"
         )

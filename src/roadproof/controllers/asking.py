@@ -6,6 +6,7 @@ compiled and told from others as it is.
 
 from __future__ import annotations
 
+import math
 from typing import cast
 
 import numpy as np
@@ -17,6 +18,7 @@ from roadproof.controllers.protocol import Controller, PedalController
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
+from roadproof.geometry import MOST_PIXELS
 
 NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy, argmax or rounding on the way"
 
@@ -89,6 +91,8 @@ def frame_size_of(controller: Controller) -> tuple[int, int] | None:
             f"the controller's input_size is {size!r:.100}, expected a tuple (height, width) of whole numbers above 0, "
             "or None for any size"
         )
+    if math.prod(cast("tuple[int, int]", pair)) > MOST_PIXELS:
+        raise ControllerError(f"the controller's input_size is {size!r:.100}, expected {MOST_PIXELS:,} pixels at most")
     return cast("tuple[int, int]", size)
 
 

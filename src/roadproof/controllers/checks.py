@@ -71,6 +71,9 @@ class ControllerReport:
             )
 
 
+_ON_A_COPY = "work on a copy: steer must not write into the frames it is given"
+
+
 class _Drive(NamedTuple):
     """Made-up frames with speeds and commands."""
 
@@ -129,7 +132,8 @@ def require_usable(
         gradients: whether gradients are needed.
 
     Raises:
-        ControllerError: the controller takes another frame size, raises, answers wrongly, or has no finite gradient.
+        ControllerError: the controller takes another frame size, raises, answers wrongly, writes into its frames, or
+            has no finite gradient.
     """
     if (own := frame_size_of(controller)) not in (None, size):
         raise ControllerError(
@@ -139,6 +143,11 @@ def require_usable(
     few = _Drive(*(values[:2] for values in _made_up_drive(size, device, seed=0)))
     leaf = few.frames.clone().requires_grad_()
     steer = steer_of(controller, leaf, few.speed_mps, few.command)
+    with torch.no_grad():
+        given = few.frames.clone()
+        steer_of(controller, given, few.speed_mps, few.command)
+    if not torch.equal(given, few.frames):
+        raise ControllerError(f"the controller's steer changes the frames that it is given; {_ON_A_COPY}")
     gradient = _gradient_of(steer, leaf) if gradients else leaf
     if gradient is None:
         raise ControllerError(f"no gradient of the controller's steer reaches the frames; {NO_GRADIENT}")
@@ -178,8 +187,7 @@ def _steer_checks(
     yield _repeated("determinism", controller, [drive], answer, tolerance, advice)
     advice = "answer each frame by itself: batch normalisation in eval mode, no statistics over the batch"
     yield _repeated("batch consistency", controller, parts, answer, tolerance, advice)
-    advice = "work on a copy: steer must not write into the frames it is given"
-    yield ControllerCheck("frames untouched", torch.equal(before, drive.frames), "frames compared", advice)
+    yield ControllerCheck("frames untouched", torch.equal(before, drive.frames), "frames compared", _ON_A_COPY)
 
 
 def _repeated(

@@ -21,7 +21,7 @@ from roadproof.drives.trajectories import Scheme, SteeringNoise, Swerve, Traject
 from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.io.files import AnyPath, as_path, write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, check_closed, write_folder_atomically
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Side, Track
@@ -148,8 +148,8 @@ class Drives:
         return sum(drive.calls for drive in self.drives)
 
 
-def write_settings(settings: Settings, folder: Path) -> None:
-    """Write the settings of a recording, which begins its folder.
+def write_settings(settings: Settings, folder: Path) -> bool:
+    """Write the settings of a recording, which begins its folder; says whether it was not begun before.
 
     Raises:
         RecordingError: the folder holds a recording with other settings; the message names the first difference.
@@ -160,8 +160,14 @@ def write_settings(settings: Settings, folder: Path) -> None:
         before = _SETTINGS.content(path)
         _SETTINGS.made(path, before)  # damage is named as such
         require_same(folder, "a recording", before, _SETTINGS.stated(settings), RecordingError)
-        return
+        return False
     _SETTINGS.write(path, settings)
+    return True
+
+
+def forget_settings(folder: Path) -> None:
+    """Take the settings of a recording away again, of which no drive could be made."""
+    (folder / "record.json").unlink(missing_ok=True)
 
 
 def write_drive(drive: Drive, folder: Path) -> None:
@@ -201,6 +207,7 @@ def load_drives(folder: AnyPath) -> Drives:
     folder = as_path(folder)
     if not (folder / "record.json").is_file():
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
+    check_closed(folder, RecordingError)
     settings = _SETTINGS.read(folder / "record.json")
     plans = settings.trajectories.plans()
     drives = [read_drive(plan.name, folder) for plan in plans]

@@ -16,12 +16,12 @@ from roadproof.controllers import Controller
 from roadproof.controllers.asking import act_of
 from roadproof.controllers.identity import identity_of
 from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
-from roadproof.drives.folder import Drive, Drives, Settings, read_drive, write_drive, write_settings
+from roadproof.drives.folder import Drive, Drives, Settings, forget_settings, read_drive, write_drive, write_settings
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
 from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
-from roadproof.errors import GeometryError, RecordingError
+from roadproof.errors import GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.io.files import AnyPath, as_path
 from roadproof.recordings import Side
@@ -83,17 +83,23 @@ def record(
         view=simulator.input,
         dt_s=simulator.dt_s,
     )
-    if folder is not None:
-        write_settings(settings, folder)
+    began = folder is not None and write_settings(settings, folder)
     drives: list[Drive] = []
     for done, plan in enumerate(settings.trajectories.plans()):
         on_drive(done)
         drive = None if folder is None else read_drive(plan.name, folder)
         if drive is None:
-            clean = drives[0] if drives else None
-            drive = (
-                _perturbed(simulator, driver, settings, plan, clean) if clean else _clean(simulator, driver, settings)
-            )
+            try:
+                drive = (
+                    _perturbed(simulator, driver, settings, plan, drives[0])
+                    if drives
+                    else _clean(simulator, driver, settings)
+                )
+            except RoadproofError:
+                if began and not drives and folder is not None:
+                    # A scenario that the simulator refuses can be mended, and recorded here.
+                    forget_settings(folder)
+                raise
             if folder is not None:
                 write_drive(drive, folder)
         drives.append(drive)

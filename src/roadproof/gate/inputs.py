@@ -9,7 +9,7 @@ from typing import Any
 from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
 from roadproof.errors import CheckError
-from roadproof.io.files import check_name
+from roadproof.io.files import check_name, first_twice
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.scenarios import Scenario, find_scenario
 
@@ -40,8 +40,8 @@ def each_once(values: tuple[Any, ...], what: str) -> None:
     """
     if not values:
         raise CheckError(f"{what} is empty, expected at least one")
-    if twice := [value for value in values if values.count(value) > 1]:
-        raise CheckError(f"{what} has {twice[0]} twice, expected each once")
+    if (twice := first_twice(values)) is not None:
+        raise CheckError(f"{what} has {twice} twice, expected each once")
 
 
 def stored_patterns(

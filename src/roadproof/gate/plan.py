@@ -148,8 +148,9 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
     try:
         if content.pop("format", None) != FORMAT:
             raise CheckError(f'expected format = "{FORMAT}"')
-        if (version := content.pop("version", None)) != FORMAT_VERSION:
-            raise CheckError(f"version is {version!r}, expected {FORMAT_VERSION}")
+        version = content.pop("version", None)
+        if type(version) is not int or version != FORMAT_VERSION:
+            raise CheckError(f"version is {version!r:.40}, expected {FORMAT_VERSION}")
         plan = _plan(build(_Stated, content, "the check", CheckError), path.parent, budget)
         if not trust:
             refuse_untrusted(plan.controller, plan.simulator if plan.budget == "full" else None)

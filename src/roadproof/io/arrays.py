@@ -21,10 +21,12 @@ from typing import Any, cast
 import numpy as np
 
 from roadproof.errors import RoadproofError
-from roadproof.io.files import check_format, one_line, parse_json, write_atomically
+from roadproof.io.files import check_format, one_line, open_file, parse_json, write_atomically
 
 MOST_BYTES = 4 * 2**30
 """An archive, or an array, that would take more memory is not read."""
+
+_PIECE_BYTES = 2**24
 
 HEADER = "header"
 _KINDS = "biuf"
@@ -152,8 +154,8 @@ def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarr
         error: the file is missing, holds anything but numbers, or holds more or less than it claims.
     """
     try:
-        with path.open("rb") as file:
-            return _array(file, os.fstat(file.fileno()).st_size, _KINDS)
+        with open_file(path) as file:
+            return _array(cast("io.BufferedIOBase", file), os.fstat(file.fileno()).st_size, _KINDS)
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None
     except _DAMAGE as reason:
@@ -166,7 +168,7 @@ def _opened(
 ) -> Generator[zipfile.ZipFile, None, None]:
     """An archive to read from; whatever is wrong with it, there or while it is read, is an `error`."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_file(path) as file, zipfile.ZipFile(file) as archive:
             _check(archive, most_bytes)
             yield archive
     except FileNotFoundError:
@@ -211,8 +213,12 @@ def _array(file: io.BufferedIOBase, size: int, kinds: str) -> np.ndarray:
     left = size - file.tell()
     if math.prod(shape) * dtype.itemsize != left or min(shape, default=0) < 0:
         raise ValueError(f"it claims {dtype} of shape {shape} and holds {left} bytes")
-    values = file.read(left)
+    # Piece by piece: at once, it would be in memory twice.
+    values, at = np.empty(left, np.uint8), 0
+    while at < left and (piece := file.read(min(left - at, _PIECE_BYTES))):
+        values[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
+        at += len(piece)
     # To the end, since only there zip compares the checksum.
-    if len(values) != left or file.read(1):
-        raise ValueError(f"it holds {len(values)} bytes of {left}")
-    return np.frombuffer(bytearray(values), dtype).reshape(shape, order="F" if by_column else "C")
+    if at != left or file.read(1):
+        raise ValueError(f"it holds {at} bytes of {left}")
+    return values.view(dtype).reshape(shape, order="F" if by_column else "C")

@@ -6,12 +6,13 @@ import json
 import math
 import os
 import shutil
+import stat
 import tempfile
 import tomllib
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar, cast
 
 from roadproof.errors import OutputError, RoadproofError
 
@@ -22,11 +23,19 @@ if TYPE_CHECKING:
 AnyPath: TypeAlias = str | os.PathLike[str]
 """What public functions take as a path."""
 
+MOST_TEXT_BYTES = 32 * 2**20
+"""A longer JSON or TOML file is not read."""
+
+T = TypeVar("T")
+
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
 _LONGEST_TEXT = 1000
 _MOST_DIGITS = 20
-_DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(10))})
+_DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in "0123456789¹²³")})
+
+_kept_inside: list[Path] = []
+"""Folders that are worked in: what is written to them stays inside."""
 
 
 def as_path(path: Any) -> Path:  # noqa: ANN401  # users without a type checker give anything
@@ -93,6 +102,71 @@ def inside(folder: Path, name: object, what: str, error: type[RoadproofError]) -
     return path
 
 
+def check_closed(folder: Path, error: type[RoadproofError]) -> None:
+    """Check that no link in a folder leads out of it, before anything in it is read.
+
+    Raises:
+        error: a link leads out; the message names it.
+    """
+    root = folder.resolve()
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(place) / name
+            if path.is_symlink() and not path.resolve().is_relative_to(root):
+                raise error(f"{path} is a link that leads out of {folder}; put what it leads to in its place")
+
+
+@contextmanager
+def kept_inside(folder: Path) -> Generator[None]:
+    """Refuse, meanwhile, to write anything to a folder that a link in it would put elsewhere."""
+    _kept_inside.append(folder.absolute())
+    try:
+        yield
+    finally:
+        _kept_inside.remove(folder.absolute())
+
+
+def _check_inside(path: Path) -> None:
+    """Check that a file or folder to write lies where its name says.
+
+    Raises:
+        OutputError: a link in a folder that is worked in leads out of it.
+    """
+    for root in _kept_inside:
+        if path.absolute().is_relative_to(root) and not path.parent.resolve().is_relative_to(root.resolve()):
+            raise OutputError(f"{path.parent} is reached by a link that leads out of {root}; remove the link")
+
+
+def first_twice(values: Iterable[T]) -> T | None:
+    """The first value that came before; None where each is there once."""
+    seen: set[T] = set()
+    for value in values:
+        if value in seen:
+            return value
+        seen.add(value)
+    return None
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a file to read its bytes; a pipe or a device, which would be waited for, is refused.
+
+    Raises:
+        OSError: the file cannot be opened, or is none.
+    """
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise OSError("it is a pipe or a device, expected a file")
+    return path.open("rb")
+
+
+def _text_of(path: Path, most_bytes: int) -> str:
+    with open_file(path) as file:
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise ValueError(f"it is larger than {most_bytes:,} bytes")
+    return content.decode("utf-8")
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then move it into place.
 
@@ -144,9 +218,12 @@ def _settle(path: Path) -> None:
 @contextmanager
 def _writing(path: Path) -> Generator[None]:
     """Make the folder that `path` is to be in; what the system refuses is an `OutputError`."""
+    _check_inside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
+    except OutputError:
+        raise
     except OSError as error:
         raise OutputError(
             f"cannot write {path}: {error.strerror or error}; choose a folder that can be written"
@@ -261,15 +338,15 @@ def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
             characters, or with a NUL; the message names it.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(_text_of(path, MOST_TEXT_BYTES))
+        odd = next((text for text in _texts(content) if len(text) > _LONGEST_TEXT or "\0" in text), None)
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
-    except (ValueError, RecursionError) as reason:
-        raise error(f"{path} is not valid TOML ({reason})") from None
-    for text in _texts(content):
-        if len(text) > _LONGEST_TEXT or "\0" in text:
-            told = f"{text!r:.40} of {len(text)} characters"
-            raise error(f"{path} has the text {told}, expected at most {_LONGEST_TEXT} and no NUL")
+    except (MemoryError, ValueError, RecursionError) as reason:
+        raise error(f"{path} is not valid TOML ({one_line(reason)})") from None
+    if odd is not None:
+        told = f"{odd!r:.40} of {len(odd)} characters"
+        raise error(f"{path} has the text {told}, expected at most {_LONGEST_TEXT} and no NUL")
     return content
 
 
@@ -285,7 +362,9 @@ def _texts(value: object) -> Generator[str]:
             yield from _texts(each)
 
 
-def read_json(path: Path, file_format: str, version: int, error: type[RoadproofError]) -> dict[str, Any]:
+def read_json(
+    path: Path, file_format: str, version: int, error: type[RoadproofError], *, most_bytes: int = MOST_TEXT_BYTES
+) -> dict[str, Any]:
     """Read a JSON file that names its format and version.
 
     Args:
@@ -293,16 +372,17 @@ def read_json(path: Path, file_format: str, version: int, error: type[RoadproofE
         file_format: the "format" that the file must name.
         version: the newest "version" that is understood.
         error: the type of error to raise.
+        most_bytes: how long the file may be.
 
     Raises:
         error: the file is missing, is no JSON object (`parse_json`), or is of another format or a newer version.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(_text_of(path, most_bytes))
     except OSError as reason:
         raise error(f"cannot read {path}: {reason.strerror or reason}") from None
-    except (ValueError, RecursionError) as reason:
-        raise error(f"{path} is not valid JSON ({reason})") from None
+    except (MemoryError, ValueError, RecursionError) as reason:
+        raise error(f"{path} is not valid JSON ({one_line(reason)})") from None
     except TypeError:
         raise error(f"{path} holds no JSON object, expected a {file_format} file") from None
     check_format(content, path, file_format, version, error)

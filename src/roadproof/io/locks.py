@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from roadproof.errors import OutputError
-from roadproof.io.files import check_writable, write_atomically
+from roadproof.io.files import check_writable, kept_inside, write_atomically
 
 _held = ExitStack()
 atexit.register(_held.close)
@@ -26,6 +26,7 @@ def working_in(folder: Path) -> Generator[None]:
     """Keep other processes from writing to a folder meanwhile; in this one it can be asked for again.
 
     The lock is the system's own and ends with its process, however that ends; it holds on one machine, for one user.
+    What is written to the folder meanwhile stays in it, whatever links are there.
 
     Args:
         folder: the folder to work in; made where it is not there, and taken away again where nothing came of it.
@@ -43,7 +44,8 @@ def working_in(folder: Path) -> Generator[None]:
         raise OutputError(f"{_worker(place)} works in {folder}; wait for its end, or choose another folder") from None
     except (NotImplementedError, OSError):
         # A disk that knows no locks: better unguarded than not at all.
-        yield
+        with kept_inside(folder):
+            yield
         return
     try:
         first = lock.lock_counter == 1
@@ -52,7 +54,8 @@ def working_in(folder: Path) -> Generator[None]:
             doing = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) or "roadproof"
             told = f"{doing} (process {os.getpid()}, since {since})\n"
             write_atomically(place, lambda part: part.write_text(told, encoding="utf-8"))
-        yield
+        with kept_inside(folder):
+            yield
         if first:
             place.unlink(missing_ok=True)
     finally:
@@ -73,10 +76,17 @@ def hold(folder: Path) -> None:
 
 def _place(folder: Path) -> Path:
     """The file that says who works in a folder: outside of the folder, which holds results alone."""
-    locks = (
-        Path(tempfile.gettempdir()) / f"roadproof-locks-{getattr(os, 'getuid', int)()}"
-    )  # a user may have no name, or no number
-    locks.mkdir(mode=0o700, exist_ok=True)
+    # Where every process looks, whatever its TMPDIR says.
+    shared = Path("/tmp")  # noqa: S108  # the folder in it is the user's own
+    user: int = getattr(os, "getuid", int)()  # a user may have no name, or no number
+    locks = (shared if shared.is_dir() else Path(tempfile.gettempdir())) / f"roadproof-locks-{user}"
+    try:
+        locks.mkdir(mode=0o700, exist_ok=True)
+        whose = locks.stat().st_uid
+    except OSError as error:
+        raise OutputError(f"cannot keep locks in {locks}: {error.strerror}; remove what is there") from None
+    if whose != user:
+        raise OutputError(f"{locks} belongs to another user, expected yours; have it removed")
     return locks / hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
 
 

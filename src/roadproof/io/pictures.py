@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from roadproof.errors import RoadproofError
+from roadproof.io.files import open_file
 
 MOST_PIXELS = 40_000_000
 """A picture that claims more pixels is not unpacked."""
@@ -26,13 +27,25 @@ def read_picture(
         mode: the channels to return, "RGB" or "RGBA".
 
     Raises:
-        error: the picture is missing, damaged, of another kind, or larger than any picture here.
+        error: the picture is missing, damaged, of another kind, larger than any picture here, has more than 8 bits a
+            channel or is animated; or it is transparent where RGB is wanted.
     """
     try:
         # Pillow leaves a file open whose first bytes cannot be read.
-        with path.open("rb") as file, Image.open(file, formats=("PNG", "JPEG")) as picture:
+        with open_file(path) as file, Image.open(file, formats=("PNG", "JPEG")) as picture:
             if picture.width * picture.height > MOST_PIXELS:
                 raise ValueError(f"{picture.width}×{picture.height} pixels, expected at most {MOST_PIXELS}")
+            if (frames := getattr(picture, "n_frames", 1)) > 1:
+                raise ValueError(f"it is an animation of {frames} pictures, expected one")
+            if picture.mode[0] in "IF":
+                # Pillow would clip them to 8 bits: nearly all white.
+                raise ValueError(f"its channels have more than 8 bits (mode {picture.mode}), expected 8")
+            if (
+                mode == "RGB"
+                and picture.has_transparency_data
+                and np.array(picture.convert("RGBA"))[..., 3].min() < 255
+            ):
+                raise ValueError("parts of it are transparent, expected a picture that is not")
             return np.array(picture.convert(mode))
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None

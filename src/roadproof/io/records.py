@@ -25,7 +25,7 @@ from jaxtyping import AbstractArray, Float, Int
 
 from roadproof.errors import RoadproofError
 from roadproof.io.arrays import HEADER, MOST_BYTES, read_record, write_archive
-from roadproof.io.files import AnyPath, as_path, one_line, read_json, write_json
+from roadproof.io.files import MOST_TEXT_BYTES, AnyPath, as_path, one_line, read_json, write_json
 from roadproof.io.tables import declared_types, unknown_keys
 
 T = TypeVar("T")
@@ -63,7 +63,7 @@ class RecordFile(Generic[T]):
         renamed: today's names of fields, by the names that older files have for them, at any depth.
         notes: what the file says besides the fields, for people, such as units.
         header: name of an archive's JSON header; None where all its fields are arrays and numbers.
-        most_bytes: how many bytes an archive may unpack to.
+        most_bytes: how many bytes an archive may unpack to, and JSON may have (`MOST_TEXT_BYTES` at most).
     """
 
     kind: type[T]
@@ -132,7 +132,10 @@ class RecordFile(Generic[T]):
             error: the file is missing, damaged, of another format or a newer version.
         """
         if path.suffix == ".json":
-            return _renamed(read_json(path, self.name, self.version, self.error), self.renamed)
+            content = read_json(
+                path, self.name, self.version, self.error, most_bytes=min(self.most_bytes, MOST_TEXT_BYTES)
+            )
+            return _renamed(content, self.renamed)
         stated, arrays = read_record(
             path,
             self._members(path),

@@ -26,7 +26,7 @@ from roadproof.datatypes import Obstacle
 from roadproof.errors import ColourError, OutputError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.io.arrays import read_archive, read_array, write_archive
-from roadproof.io.files import AnyPath, as_path, inside, write_folder_atomically
+from roadproof.io.files import AnyPath, as_path, check_closed, inside, write_folder_atomically
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import Form, RecordFile
 from roadproof.paint.site import LaneMark
@@ -109,6 +109,7 @@ _PER_FRAME = RecordFile(
     remedy=_AGAIN,
     elsewhere=("name", "side", "frames", "maps", "track", "weather"),
     header=None,
+    most_bytes=_MOST_TRACK_BYTES,
 )
 _TRACK = RecordFile(kind=Track, error=RecordingError, remedy=_AGAIN, header=None, most_bytes=_MOST_TRACK_BYTES)
 
@@ -191,6 +192,7 @@ def load_recordings(folder: AnyPath) -> RecordingSet:
         raise RecordingError(f"no folder {folder}; expected a set of recordings with a recordings.json")
     if not (folder / "recordings.json").is_file():
         raise RecordingError(f"{folder} has no recordings.json; expected a set of recordings made by roadproof")
+    check_closed(folder, RecordingError)
     manifest = _MANIFEST.read(folder / "recordings.json")
     return RecordingSet(
         camera=manifest.camera,

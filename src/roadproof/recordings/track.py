@@ -17,6 +17,17 @@ FASTEST_MPS = 70.0
 """No car of a recording moves faster between two steps: a pose that jumps further is wrong."""
 
 
+_RANGES = (
+    ("steer", -1, 1),
+    ("throttle", 0, 1),
+    ("brake", 0, 1),
+    ("speed_mps", -1, FASTEST_MPS),
+    ("x_m", -1e10, 1e10),
+    ("y_m", -1e10, 1e10),
+    ("yaw_rad", -1e4, 1e4),
+)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Track:
     """The n steps of a drive whose poses are known.
@@ -53,7 +64,7 @@ class Track:
         if count == 0:
             raise RecordingError("the track has no step, expected at least one")
         check_arrays(self, [field.name for field in fields(self)[1:]], (count,), "of the track", RecordingError)
-        for name, low, high in (("steer", -1, 1), ("throttle", 0, 1), ("brake", 0, 1), ("speed_mps", -1, FASTEST_MPS)):
+        for name, low, high in _RANGES:
             values: np.ndarray = getattr(self, name)
             if values.min() < low or values.max() > high:
                 raise RecordingError(

@@ -33,6 +33,7 @@ from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.arrays import read_archive
+from roadproof.io.files import check_closed
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
@@ -157,6 +158,7 @@ def read_run(folder: Path) -> Run:
     """
     if not folder.is_dir():
         raise RoadproofError(f"no folder {folder}; expected a run with record, recordings, attack or evaluation in it")
+    check_closed(folder, RoadproofError)
     attack = AttackResult.load(folder / "attack") if (folder / "attack" / "result.json").exists() else None
     chosen = load_pattern(path) if (path := folder / "pattern.json").exists() else attack and attack.pattern
     report = folder / "calibration" / "report.json"

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from roadproof.errors import StudyError
-from roadproof.io.files import read_json, write_atomically
+from roadproof.io.files import check_closed, read_json, write_atomically
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, Row
 
@@ -119,6 +119,7 @@ def read_table(folder: Path, name: str = "rows.parquet") -> Frame:
     path = folder / name
     if not path.is_file():
         raise StudyError(f"{folder} has no {name}; run the study first")
+    check_closed(folder, StudyError)
     try:
         return pandas().read_parquet(path)
     except (OSError, ValueError) as error:

@@ -17,7 +17,7 @@ from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
-from roadproof.io.files import AnyPath, as_path, read_toml
+from roadproof.io.files import AnyPath, as_path, first_twice, read_toml
 from roadproof.io.tables import build
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
@@ -191,9 +191,8 @@ class Study(Conditions):
         for what in ("figures", "seeds", "weathers"):
             named[what] = list(map(str, getattr(self, what)))
         for what, names in named.items():
-            twice = [name for name in names if names.count(name) > 1]
-            if twice:
-                raise StudyError(f"{what} has {twice[0]} twice, expected each once")
+            if (twice := first_twice(names)) is not None:
+                raise StudyError(f"{what} has {twice} twice, expected each once")
         if self.reference is not None and self.reference not in named["method"]:
             raise StudyError(f"reference is {self.reference!r}, expected one of {', '.join(named['method'])}")
 
@@ -254,7 +253,8 @@ class _Stated(Conditions):
 def _study(content: dict[str, Any], folder: Path) -> Study:
     if content.pop("format", None) != FORMAT:
         raise StudyError(f'expected format = "{FORMAT}"')
-    if (version := content.pop("version", None)) != FORMAT_VERSION:
+    version = content.pop("version", None)
+    if type(version) is not int or version != FORMAT_VERSION:
         raise StudyError(
             f"version is {version!r}, expected {FORMAT_VERSION}; version 1 had other keys, see docs/studies.md"
         )

@@ -109,6 +109,8 @@ class OwnDrives:
     def __post_init__(self) -> None:
         if not self.drive:
             raise RecordingError("there is no [[drive]], expected at least a clean one")
+        if not 0.0 < self.dt_s <= 1.0:
+            raise RecordingError(f"dt_s is {self.dt_s:g}, expected seconds above 0 and at most 1")
 
 
 def read_plan(folder: Path) -> OwnDrives:

@@ -111,10 +111,9 @@ def _recording(
     track: Track | None = None,
 ) -> Recording:
     command = table.column("command", 2.0)[kept]
-    if (command != command.round()).any():
-        raise RecordingError(
-            f"{table.drive.table}: command {command[command != command.round()][0]:g} is no whole number"
-        )
+    odd = command[(command != command.round()) | (np.abs(command) > 100)]
+    if odd.size:
+        raise RecordingError(f"{table.drive.table}: command {odd[0]:g} is no command, expected 2, 3, 4 or 5")
     return Recording(
         name=table.drive.name,
         side=table.drive.side,

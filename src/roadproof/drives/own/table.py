@@ -85,6 +85,8 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
         raise RecordingError(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
     except (ValueError, csv.Error) as reason:
         raise RecordingError(f"{path} is no table of comma-separated values ({reason})") from None
+    if (long := next((k for k, row in enumerate(rows, 1) if None in row), None)) is not None:
+        raise RecordingError(f"{path}, row {long}: it has more cells than the {len(names)} columns; check its commas")
     if "picture" not in names or not rows:
         raise RecordingError(f"{path} has {len(rows)} rows and columns {', '.join(names)!r:.200}; expected one picture")
     numbers = {name: _numbers(path, name, rows) for name in names if name in _COLUMNS}
