@@ -113,7 +113,12 @@ MISTAKES = {
     "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),
     "another scenario": ([*EVALUATE, "--scenario", "left-03"], "the scenario's canvas has y_m"),
     "no folder": ([*EVALUATE[:-1], "recorded:"], "expected the folder of recordings"),
-    "missing set": ([*EVALUATE[:-1], "recorded:nobody"], "no folder nobody"),
+    "missing set": ([*EVALUATE[:-1], "recorded:nobody"], "nobody has no recordings.json"),
+    "missing set, dry run": ([*EVALUATE[:-1], "recorded:nobody", "--dry-run"], "nobody has no recordings.json"),
+    "another weather": (
+        [*EVALUATE, "--weathers", "rainy-noon", "--dry-run"],
+        "--weathers has rainy-noon, but the drives",
+    ),
     "no canvas": ([*EVALUATE[:-1], "recorded:nowhere-known"], "canvas"),
     "expert": (["drive", "--simulator", "recorded:run"], "the expert needs a map"),
     "traffic": (

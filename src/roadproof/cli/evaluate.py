@@ -13,11 +13,12 @@ from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import answer, say, stored, table
 from roadproof.cli.verbs import begin
-from roadproof.cli.worlds import open_world, world_asked
+from roadproof.cli.worlds import Recorded, open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD
 
 if TYPE_CHECKING:
+    from roadproof.datatypes import Weather
     from roadproof.driving.evaluation import Evaluation
     from roadproof.pipeline.fidelity import Fidelity
 
@@ -84,7 +85,7 @@ def evaluate(
     if weathers is not None:
         skies = options.weathers_of(weathers, "weathers")
     if where.recorded is not None:
-        _check_recorded(runs, recordings)
+        _check_recorded(where.recorded, skies, runs, recordings)
         runs = cars = pedestrians = 0
     else:
         options.check_simulator(simulator, processes)
@@ -132,12 +133,18 @@ def evaluate(
     answer(stored(out / "evaluation.json") | surrogate)
 
 
-def _check_recorded(runs: int | None, recordings: Path | None) -> None:
+def _check_recorded(
+    recorded: Recorded, weathers: tuple[Weather, ...], runs: int | None, recordings: Path | None
+) -> None:
     """Refuse what recordings cannot give, before anything is driven.
 
     Raises:
-        RoadproofError: traffic, or renders to compare with, are asked for.
+        RoadproofError: another weather, traffic, or renders to compare with, are asked for.
     """
+    if other := [weather for weather in weathers if weather != recorded.weather]:
+        raise RoadproofError(
+            f"--weathers has {other[0]}, but the drives were recorded at {recorded.weather}; leave it out"
+        )
     if runs:
         raise RoadproofError(f"--runs is {runs}, but recordings hold no others on the road; expected 0")
     if recordings is not None:

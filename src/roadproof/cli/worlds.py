@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from roadproof.cli.options import RECORDED, scenario_of
-from roadproof.errors import RoadproofError
+from roadproof.errors import RecordingError, RoadproofError
 
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
@@ -109,10 +109,13 @@ def recorded_in(spec: str) -> Recorded | None:
         )
     folder = Path(spec.removeprefix(RECORDED))
     run = folder if (folder / "recordings").is_dir() else folder.parent if folder.name == "recordings" else None
+    there = folder if run is None else run / "recordings"
+    if not (there / "recordings.json").is_file():
+        raise RecordingError(f"{there} has no recordings.json; expected recordings, or a run that has some")
     if run is None or not (run / "record" / "record.json").is_file():
-        return Recorded(folder if run is None else run / "recordings", None, Weather.CLEAR_NOON)
+        return Recorded(there, None, Weather.CLEAR_NOON)
     settings = load_drives(run / "record").settings
-    return Recorded(run / "recordings", settings.scenario, settings.weather)
+    return Recorded(there, settings.scenario, settings.weather)
 
 
 @contextmanager
