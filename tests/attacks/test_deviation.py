@@ -8,14 +8,14 @@ import torch
 
 from painted_ground import RampFollower, recorded_road
 from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack, methods
-from roadproof.attacks.gradopt import BEHIND, Rung, gradopt
+from roadproof.attacks.gradopt import BEHIND, DRAWN, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.recorded import RecordedWorld, Start, Vehicle
 from roadproof.recorded.world import UNSURE
 from roadproof.recordings import pooled
-from roadproof.search_space import SearchSpace
+from roadproof.search_space import SearchSpace, derived_seed
 
 SPACE = SearchSpace(figures=1)
 SHORT = GradOpt(iterations=8, restarts=2, halving=False)
@@ -172,7 +172,12 @@ class OneSided(RampFollower):
 
 
 def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
-    rungs = (Rung(9, 0, open_loop=True), Rung(4, 2, every=4), Rung(2, 3, groups_compete=True), Rung(2, 2, 0.01))
+    rungs = (
+        Rung(4, 1, open_loop=True, screened=2),
+        Rung(4, 2, every=4),
+        Rung(2, 3, groups_compete=True),
+        Rung(2, 2, 0.01),
+    )
     groups = (RIGHT_GROUP, LEFT_GROUP)
     measure = PathDeviation().measure(road, OneSided(), groups, device="cpu")
     found = gradopt(measure, SPACE, rungs, seed=0)
@@ -189,7 +194,7 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
     stopped = tmp_path / "search.safetensors"
 
     def interrupt(step, _):
-        if step == 4:
+        if step == 5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -200,7 +205,7 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
 
 
 def test_a_result_says_which_side_gave_way(road, monkeypatch):
-    monkeypatch.setattr(methods, "PATH_RUNGS", (Rung(9, 0, open_loop=True), Rung(4, 2, every=4)))
+    monkeypatch.setattr(methods, "PATH_RUNGS", (Rung(4, 1, open_loop=True, screened=2), Rung(4, 2, every=4)))
     method = GradOpt(iterations=2, restarts=2)
     result = attack(road, OneSided(), SPACE, objective=PathDeviation(), method=method)
     assert list(result.by_group) == [str(LEFT_GROUP)]
@@ -210,14 +215,17 @@ def test_a_result_says_which_side_gave_way(road, monkeypatch):
     assert "clean+right reached" in said.finding
 
 
-def test_starts_are_the_best_of_many_that_are_only_valued(road):
+def test_some_starts_are_the_best_of_many_and_the_others_at_random(road):
     measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
-    seen: list[int] = []
-    found = gradopt(measure, SPACE, (Rung(20, 0), Rung(3, 1)), seed=4, on_step=lambda step, _: seen.append(step))
-    drawn = SPACE.random((2, 20), torch.Generator().manual_seed(4))
-    best = measure.values(SPACE, drawn).topk(3, 1).values
-    assert torch.allclose(found.history[0], best, atol=1e-5), "the first step values where it begins"
-    assert seen == [0, 1]
+    plain = gradopt(measure, SPACE, (Rung(3, 1),), seed=4).history[0]
+    found = gradopt(measure, SPACE, (Rung(3, 1, screened=2),), seed=4).history[0]
+    assert torch.equal(found[:, 0], plain[:, 0]), "at random as before"
+    drawn = SPACE.random((2, DRAWN), torch.Generator().manual_seed(derived_seed(4, 10**6)))
+    assert torch.allclose(found[:, 1:], measure.values(SPACE, drawn).topk(2, 1).values, atol=1e-5)
+    # Starts that were given stay.
+    given = [SPACE.random((3,), torch.Generator().manual_seed(k)) for k in (1, 2)]
+    kept = gradopt(measure, SPACE, (Rung(3, 1, screened=2),), seed=4, starts=given).history[0]
+    assert torch.allclose(kept, measure.values(SPACE, torch.stack(given)), atol=1e-5)
 
 
 def test_a_search_without_gradients_drives_in_the_recorded_world_too(road, tmp_path):

@@ -34,15 +34,16 @@ class Rung:
 
     Args:
         starts: number of starts of every group: the best of the rung before, and random points if those are fewer.
-        iterations: number of steps of each start; 0 only values the starts, without gradients.
+        iterations: number of steps of each start.
         learning_rate: Adam's learning rate, as a share of each parameter's range.
         every: use every n-th frame of each drive; in the recorded world, a picture every n-th step. 1 uses all.
         open_loop: whether to climb the steering shift on recorded frames, whatever the objective of the search.
         groups_compete: whether a group whose best is below `BEHIND` of the best of all gives its starts to the others
             before this rung, if the measure can be had of some groups alone (`Grouped`).
+        screened: how many of the random starts of every group are the best of `DRAWN` that are valued first.
 
     Raises:
-        RoadproofError: `starts`, `learning_rate` or `every` is not positive, or `iterations` is negative.
+        RoadproofError: `starts`, `iterations`, `learning_rate` or `every` is not positive.
     """
 
     starts: int
@@ -51,9 +52,10 @@ class Rung:
     every: int = 1
     open_loop: bool = False
     groups_compete: bool = False
+    screened: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.starts, self.iterations + 1, self.every) < 1 or not self.learning_rate > 0:
+        if min(self.starts, self.iterations, self.every) < 1 or not self.learning_rate > 0:
             raise RoadproofError(f"{self} has a number that is too small; expected 1 or more, and a rate above 0")
 
     def view(self, measure: RecordedMeasure) -> RecordedMeasure:
@@ -70,6 +72,10 @@ Ladder = tuple[Rung, ...]
 
 BEHIND = 1 / 3
 """Where groups compete, one that has reached less than this share of the best group's value gives its places away."""
+
+
+DRAWN = 256
+"""Random points of which a rung that screens keeps the best."""
 
 
 def dropping(
@@ -162,15 +168,16 @@ def gradopt(
             places = rung.starts * len(measure.groups) // len(state["best"])
             state = _next_rung(state, space, rungs[number - 1], rung, places, derived_seed(seed, number))
         climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
-        while int(state["done"]) < max(rung.iterations, 1):
+        free = rung.starts - (0 if number else max(map(len, starts), default=0))
+        if min(rung.screened, free) > 0 and not int(state["done"]):
+            # Far from the numbers of other draws.
+            own = derived_seed(seed, 10**6 + number)
+            state["unit"] = _screened(climbed, space, state["unit"], min(rung.screened, free), own)
+        while int(state["done"]) < rung.iterations:
             if isinstance(climbed, Varied):
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
-            if rung.iterations:
-                state = _step(climbed, space, rung.learning_rate, momentum, state)
-                on_step(done + int(state["done"]), float(state["best"].max()))
-            else:
-                state |= {"best": climbed.values(space, state["unit"]), "done": torch.tensor(1)}
-                on_step(done, float(state["best"].max()))
+            state = _step(climbed, space, rung.learning_rate, momentum, state)
+            on_step(done + int(state["done"]), float(state["best"].max()))
             if checkpoint:
                 frames = measure.frames_evaluated + (0 if climbed is measure else climbed.frames_evaluated)
                 whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames), "behind": behind}
@@ -198,6 +205,16 @@ def _starts(
     for group, points in enumerate(given):
         unit[group, : len(points)] = points[:count]
     return unit.to(measure.device)
+
+
+def _screened(
+    measure: RecordedMeasure, space: SearchSpace, unit: Float[Tensor, "g r k n"], count: int, seed: int
+) -> Float[Tensor, "g r k n"]:
+    """The starts, the last of which are the best of many random points by a measure."""
+    drawn = space.random((len(unit), DRAWN), torch.Generator().manual_seed(seed)).to(unit)
+    best = measure.values(space, drawn).topk(count, 1).indices
+    kept = drawn[torch.arange(len(best), device=best.device)[:, None], best]
+    return torch.cat([unit[:, :-count], kept], 1)
 
 
 def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:

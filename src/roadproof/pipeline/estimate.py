@@ -14,7 +14,7 @@ import torch
 from torch.nn import Module
 
 from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published
-from roadproof.attacks.gradopt import Rung
+from roadproof.attacks.gradopt import DRAWN, Rung
 from roadproof.calibration import Method as Calibration
 from roadproof.calibration.published import PAINTS, RUNS
 from roadproof.controllers import Controller
@@ -115,9 +115,10 @@ def of_search(
         rungs = method.ladder
     else:
         rungs = (Rung(1, method.steps(objective), 1.0),)
-    # Starts that are only valued take a third of a step.
+    # A start that is only valued takes a third of a step.
     count = sum(
-        rung.starts * max(rung.iterations, 1 / 3) * math.ceil((frames if rung.open_loop else steps) / rung.every)
+        (rung.starts * rung.iterations + (DRAWN / 3 if rung.screened else 0))
+        * math.ceil((frames if rung.open_loop else steps) / rung.every)
         for rung in rungs
     )
     seconds = groups * count * frame_seconds(controller, gradients=method.by_gradient)
