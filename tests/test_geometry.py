@@ -159,7 +159,7 @@ def test_homographies_of_wrong_sign_or_rank_are_refused():
         {"width_px": 10**6},
         {"fov_deg": 180.0},
         {"fov_deg": float("nan")},
-        {"up_m": 0.0},
+        {"up_m": 1e300},
         {"pitch_deg": 1e300},
         {"left_m": float("inf")},
     ],

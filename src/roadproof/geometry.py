@@ -44,8 +44,8 @@ class CameraModel:
         pitch_deg: pitch in degrees, positive looking up; CARLA's imitation agent looks down by −15.
 
     Raises:
-        GeometryError: a size is not positive, the field of view is outside (0, 180), the camera is not above the ground
-            or further than 100 m from the vehicle's origin, or does not look ahead.
+        GeometryError: a size is not positive or the picture is larger than any here, the field of view is outside (0,
+            180), or a place or the pitch is beyond all reason.
     """
 
     width_px: int
@@ -63,15 +63,10 @@ class CameraModel:
             raise GeometryError(f"camera fov_deg is {self.fov_deg}, expected a value between 0 and 180")
         if self.width_px * self.height_px > MOST_PIXELS:
             raise GeometryError(f"camera picture is {self.width_px}×{self.height_px}, expected {MOST_PIXELS:,} at most")
-        for name, low, high in (
-            ("forward_m", -100, 100),
-            ("left_m", -100, 100),
-            ("up_m", 0.01, 100),
-            ("pitch_deg", -89, 89),
-        ):
+        for name, most in (("forward_m", 1e4), ("left_m", 1e4), ("up_m", 1e4), ("pitch_deg", 360.0)):
             value: float = getattr(self, name)
-            if not low <= value <= high:
-                raise GeometryError(f"camera {name} is {value:g}, expected {low:g} to {high:g}")
+            if not abs(value) <= most:
+                raise GeometryError(f"camera {name} is {value:g}, expected −{most:g} to {most:g}")
 
     @property
     def focal_px(self) -> float:

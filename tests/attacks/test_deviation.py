@@ -219,13 +219,13 @@ def test_some_starts_are_the_best_of_many_and_the_others_at_random(road):
     measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     plain = gradopt(measure, SPACE, (Rung(3, 1),), seed=4).history[0]
     found = gradopt(measure, SPACE, (Rung(3, 1, screened=2),), seed=4).history[0]
-    assert torch.equal(found[:, 0], plain[:, 0]), "at random as before"
+    assert torch.allclose(found[:, 0], plain[:, 0], atol=1e-3), "at random as before"
     drawn = SPACE.random((2, DRAWN), torch.Generator().manual_seed(derived_seed(4, 10**6)))
-    assert torch.allclose(found[:, 1:], measure.values(SPACE, drawn).topk(2, 1).values, atol=1e-5)
+    assert torch.allclose(found[:, 1:], measure.values(SPACE, drawn).topk(2, 1).values, atol=1e-3)
     # Starts that were given stay.
     given = [SPACE.random((3,), torch.Generator().manual_seed(k)) for k in (1, 2)]
     kept = gradopt(measure, SPACE, (Rung(3, 1, screened=2),), seed=4, starts=given).history[0]
-    assert torch.allclose(kept, measure.values(SPACE, torch.stack(given)), atol=1e-5)
+    assert torch.allclose(kept, measure.values(SPACE, torch.stack(given)), atol=1e-3)
 
 
 def test_a_search_without_gradients_drives_in_the_recorded_world_too(road, tmp_path):

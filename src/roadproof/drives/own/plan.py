@@ -109,6 +109,11 @@ class OwnDrives:
     def __post_init__(self) -> None:
         if not self.drive:
             raise RecordingError("there is no [[drive]], expected at least a clean one")
+        camera = self.camera
+        if not (camera.up_m > 0.0 and abs(camera.pitch_deg) < 90):
+            raise RecordingError(
+                f"the camera has up_m {camera.up_m:g}, pitch_deg {camera.pitch_deg:g}; expected above 0, and −90 to 90"
+            )
         if not 0.0 < self.dt_s <= 1.0:
             raise RecordingError(f"dt_s is {self.dt_s:g}, expected seconds above 0 and at most 1")
 
