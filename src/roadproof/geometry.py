@@ -19,12 +19,10 @@ from PIL import Image
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError
+from roadproof.io.pictures import MOST_PIXELS
 
 CANVAS_SIZE_PX = 400
 _MOST_SCALE = 1e9
-
-MOST_PIXELS = 40_000_000
-"""A picture, or a controller's input, has no more pixels."""
 
 Points = Float[np.ndarray, "*n 2"]
 Homography = Float[np.ndarray, "3 3"]
@@ -114,7 +112,7 @@ class CropResize:
             wide as one).
 
     Raises:
-        GeometryError: the box or the input has no pixels, or the input has more than `MOST_PIXELS`.
+        GeometryError: the box or the input has no pixels, or the input has too many.
     """
 
     left_px: int

@@ -20,7 +20,8 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError, OutputError, ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import AnyPath, as_path, check_name, first_twice, inside, read_toml
+from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml
+from roadproof.io.tables import first_twice
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

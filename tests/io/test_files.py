@@ -12,7 +12,6 @@ from roadproof.errors import OutputError, RecordingError, RoadproofError, Scenar
 from roadproof.io.files import (
     as_path,
     check_closed,
-    first_twice,
     inside,
     is_plain_name,
     read_json,
@@ -21,6 +20,7 @@ from roadproof.io.files import (
     write_folder_atomically,
 )
 from roadproof.io.locks import working_in
+from roadproof.io.tables import first_twice
 from roadproof.patterns import Pattern
 from roadproof.scenarios import builtin_scenarios, load_scenarios, save_scenarios
 from scenes import recording_set

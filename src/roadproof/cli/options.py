@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 import typer
 
 from roadproof.errors import RoadproofError
-from roadproof.io.files import first_twice
+from roadproof.io.tables import first_twice
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES, MAX_SEED
 
 if TYPE_CHECKING:

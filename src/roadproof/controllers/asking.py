@@ -18,7 +18,7 @@ from roadproof.controllers.protocol import Controller, PedalController
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
-from roadproof.geometry import MOST_PIXELS
+from roadproof.io.pictures import MOST_PIXELS
 
 NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy, argmax or rounding on the way"
 

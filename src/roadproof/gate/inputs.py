@@ -9,7 +9,8 @@ from typing import Any
 from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
 from roadproof.errors import CheckError
-from roadproof.io.files import check_name, first_twice
+from roadproof.io.files import check_name
+from roadproof.io.tables import first_twice
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.scenarios import Scenario, find_scenario
 

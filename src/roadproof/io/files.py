@@ -9,10 +9,10 @@ import shutil
 import stat
 import tempfile
 import tomllib
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 from roadproof.errors import OutputError, RoadproofError
 
@@ -25,8 +25,6 @@ AnyPath: TypeAlias = str | os.PathLike[str]
 
 MOST_TEXT_BYTES = 32 * 2**20
 """A longer JSON or TOML file is not read."""
-
-T = TypeVar("T")
 
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
@@ -135,16 +133,6 @@ def _check_inside(path: Path) -> None:
     for root in _kept_inside:
         if path.absolute().is_relative_to(root) and not path.parent.resolve().is_relative_to(root.resolve()):
             raise OutputError(f"{path.parent} is reached by a link that leads out of {root}; remove the link")
-
-
-def first_twice(values: Iterable[T]) -> T | None:
-    """The first value that came before; None where each is there once."""
-    seen: set[T] = set()
-    for value in values:
-        if value in seen:
-            return value
-        seen.add(value)
-    return None
 
 
 def open_file(path: Path) -> BinaryIO:

@@ -12,7 +12,7 @@ from roadproof.errors import RoadproofError
 from roadproof.io.files import open_file
 
 MOST_PIXELS = 40_000_000
-"""A picture that claims more pixels is not unpacked."""
+"""A picture, or a controller's input, has no more pixels; one that claims more is not unpacked."""
 
 
 def read_picture(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -108,3 +108,13 @@ def _part(declared: Any, fits: Callable[[Any], bool]) -> Any:  # noqa: ANN401
 
 def _names_words(declared: object) -> bool:
     return get_origin(declared) is Literal or (isinstance(declared, type) and issubclass(declared, Enum))
+
+
+def first_twice(values: Iterable[T]) -> T | None:
+    """The first value that came before; None where each is there once."""
+    seen: set[T] = set()
+    for value in values:
+        if value in seen:
+            return value
+        seen.add(value)
+    return None

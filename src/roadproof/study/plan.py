@@ -17,8 +17,8 @@ from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import StudyError
-from roadproof.io.files import AnyPath, as_path, first_twice, read_toml
-from roadproof.io.tables import build
+from roadproof.io.files import AnyPath, as_path, read_toml
+from roadproof.io.tables import build, first_twice
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
