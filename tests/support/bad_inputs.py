@@ -68,7 +68,7 @@ GATES = {
     ("study", "run"): ("nowhere.toml",), ("study", "tables"): ("nowhere",), ("controllers",): ("nosuch",),
     ("study", "transfer"): ("nowhere.toml", "--controllers", "nosuch"), ("scenarios",): ("--scenarios", "nowhere.toml"),
     ("carla", "scenario"): ("--port", "0", "0", "1"), ("carla", "doctor"): ("--port", "0"),
-    ("carla", "serve"): ("--map", "nowhere.xodr"),
+    ("carla", "serve"): ("--map", "nowhere.xodr"), ("open",): ("nowhere",),
 }  # fmt: skip
 """What ends each command before it works, where nothing else does; by default the folder that cannot be written."""
 
