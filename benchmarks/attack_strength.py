@@ -22,7 +22,7 @@ from roadproof.attacks import GradOpt, SteeringShift, Surrogate
 from roadproof.attacks.gradopt import dropping, gradopt, random_search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.controllers import load_controller
-from roadproof.memory import keep_freed_memory
+from roadproof.machine import keep_freed_memory
 from roadproof.recordings import load_recordings
 from roadproof.search_space import SearchSpace
 

@@ -34,7 +34,7 @@ from roadproof.controllers import CIL, pilotnet_controller
 from roadproof.controllers.asking import controls_of
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
-from roadproof.memory import keep_freed_memory
+from roadproof.machine import keep_freed_memory
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet, Side, load_recordings
 from roadproof.search_space import SearchSpace

@@ -36,7 +36,7 @@ from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.calibration import calibrate
 from roadproof.drives import record
 from roadproof.io.files import write_atomically
-from roadproof.memory import keep_freed_memory
+from roadproof.machine import keep_freed_memory
 from roadproof.patterns import Pattern
 from roadproof.pipeline.budget import QUICK
 from roadproof.recordings import RecordingSet

@@ -35,7 +35,7 @@ from roadproof.drives import record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.intervals import mean_95
 from roadproof.io.files import write_atomically
-from roadproof.memory import keep_freed_memory
+from roadproof.machine import keep_freed_memory
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.selection import select_by_driving
 from roadproof.processes import processes_beside

@@ -92,3 +92,11 @@ def test_another_temporary_folder_is_no_way_round(child, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", None)
     with pytest.raises(OutputError, match="works in"), working_in(place):
         pass
+
+
+def test_one_may_go_to_another_directory_while_working(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with working_in(Path("run")):
+        monkeypatch.chdir("/")
+    with working_in(tmp_path / "run"):
+        pass

@@ -40,7 +40,7 @@ from roadproof.cli.train import train
 from roadproof.cli.verbs import verb
 from roadproof.errors import RoadproofError
 from roadproof.foreign import LIMIT_S, end_calls_after
-from roadproof.memory import keep_freed_memory
+from roadproof.machine import keep_freed_memory, sleep_while_waiting
 
 app = Verbs("Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.")
 VERBS = (
@@ -99,6 +99,7 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 def main() -> None:
     """Entry point of the `roadproof` command."""
     keep_freed_memory()
+    sleep_while_waiting()
     for stream in (sys.stdout, sys.stderr):
         # A terminal or pipe of another encoding gets ä as \xe4 instead of an error.
         if isinstance(stream, io.TextIOWrapper):

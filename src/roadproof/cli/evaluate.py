@@ -159,11 +159,16 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
         columns = ("drives", "predicted m", "aside m", "left lane", "infractions")
         title = "Predicted: composited into recorded frames, nothing was driven for real"
     note = "deviation: median (least–most); aside: furthest; clean: points on the bare road"
-    shown = table(("pattern", "weather", "with"), columns, title=title, note=note)
-    for row in evaluation.rows():
-        points = [mean_in_words(row.points, 1), mean_in_words(row.clean_points, 1)]
+    rows = evaluation.rows()
+    several = len({row.pattern for row in rows}) > 1
+    shown = table((*(["pattern"] if several else []), "weather", "with"), columns, title=title, note=note)
+    for row in rows:
+        points = [
+            mean_in_words(row.points, 1),
+            UNKNOWN if row.clean_points is None else f"{row.clean_points.value:.1f}",
+        ]
         shown.add_row(
-            row.pattern,
+            *([row.pattern] if several else []),
             row.weather or "all",
             "traffic" if row.traffic else "nobody",
             str(row.count),

@@ -16,6 +16,7 @@ from rich.table import Table
 from roadproof.cli.progress import is_quiet
 
 _answers: TextIO | None = None  # one command a process
+_WIDEST = 1000
 
 
 @contextmanager
@@ -54,6 +55,8 @@ def stored(path: Path) -> dict[str, Any]:
 def say(*lines: RenderableType, wrapped: bool = False) -> None:
     """Print lines or tables; nothing in them is read as markup. With --json they go to standard error, if anywhere.
 
+    A table is as wide as it needs to be where nobody's terminal ends, and closer where it would not fit.
+
     Args:
         *lines: the lines or tables.
         wrapped: whether they are wrapped where the terminal ends.
@@ -62,11 +65,18 @@ def say(*lines: RenderableType, wrapped: bool = False) -> None:
         return
     console = Console(soft_wrap=not wrapped, highlight=False, markup=False, emoji=False)
     for line in lines:
+        if isinstance(line, Table):
+            # Alone it would be made to fit, also into 80 columns of a file.
+            wide = Console(width=_WIDEST).measure(line).maximum
+            if not console.is_terminal:
+                console.width = max(console.width, wide)
+            elif wide > console.width:
+                line.padding = 0
         console.print(line)
 
 
 def table(words: tuple[str, ...], numbers: tuple[str, ...] = (), *, title: str | None = None, note: str = "") -> Table:
-    """An empty table.
+    """An empty table. Where it does not fit, names stay whole, and numbers wrap, or all texts but the first.
 
     Args:
         words: the columns that hold text.
@@ -74,7 +84,9 @@ def table(words: tuple[str, ...], numbers: tuple[str, ...] = (), *, title: str |
         title: a line above the table; None for none.
         note: a line below the table; empty for none.
     """
-    made = Table(*words, box=box.SIMPLE, title=title, title_justify="left", caption=note, caption_justify="left")
+    made = Table(box=box.SIMPLE, title=title, title_justify="left", caption=note, caption_justify="left")
+    for column in words:
+        made.add_column(column, no_wrap=bool(numbers) or column == words[0])
     for column in numbers:
-        made.add_column(column, justify="right", no_wrap=True)
+        made.add_column(column, justify="right")
     return made

@@ -24,7 +24,7 @@ from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, rep
 from roadproof.errors import GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.io.files import AnyPath, as_path
-from roadproof.recordings import Side
+from roadproof.recordings import Side, evenly
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
@@ -287,11 +287,6 @@ def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
         )
     which = which[evenly(which.size, settings.window.frames)]
     return np.array(film.steps)[which], np.stack([film.frames[int(k)] for k in which]), which
-
-
-def evenly(count: int, most: int) -> Int[np.ndarray, " f"]:
-    """Indices of at most `most` of `count` frames, evenly spread, the first and the last included."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def in_view(

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from roadproof.drives.record import evenly
 from roadproof.errors import EpisodeError
 from roadproof.gate.result import Case, CheckResult
 from roadproof.gate.verdict import Status
 from roadproof.io.arrays import read_archive
 from roadproof.io.files import write_atomically
+from roadproof.recordings import evenly
 from roadproof.report.formatting import MISSING, in_words
 
 WORST = "worst.jpg"

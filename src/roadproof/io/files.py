@@ -117,11 +117,13 @@ def check_closed(folder: Path, error: type[RoadproofError]) -> None:
 @contextmanager
 def kept_inside(folder: Path) -> Generator[None]:
     """Refuse, meanwhile, to write anything to a folder that a link in it would put elsewhere."""
-    _kept_inside.append(folder.absolute())
+    # Known from here on by one name, since a user's controller may go to another directory meanwhile.
+    whole = folder.absolute()
+    _kept_inside.append(whole)
     try:
         yield
     finally:
-        _kept_inside.remove(folder.absolute())
+        _kept_inside.remove(whole)
 
 
 def _check_inside(path: Path) -> None:

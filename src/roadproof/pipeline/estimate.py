@@ -108,7 +108,6 @@ def of_search(
         controller: controller that is timed.
         groups: number of groups searched.
     """
-    steps = STRETCH_STEPS if isinstance(objective, PathDeviation) else frames
     if isinstance(method, GradOpt):
         rungs = method.ladder(objective)
     elif isinstance(method, Published):
@@ -117,12 +116,18 @@ def of_search(
         rungs = (Rung(1, method.steps(objective), 1.0),)
     # A start that is only valued takes a third of a step.
     count = sum(
-        (rung.starts * rung.iterations + (DRAWN / 3 if rung.screened else 0))
-        * math.ceil((frames if rung.open_loop else steps) / rung.every)
+        (rung.starts * rung.iterations + (DRAWN / 3 if rung.screened else 0)) * _pictures(rung, objective, frames)
         for rung in rungs
     )
     seconds = groups * count * frame_seconds(controller, gradients=method.by_gradient)
     return Estimate(seconds=seconds, megabytes=1.0, basis=_MEASURED)
+
+
+def _pictures(rung: Rung, objective: Objective, frames: int) -> int:
+    """What one start of a rung takes at a step."""
+    if rung.open_loop or not isinstance(objective, PathDeviation):
+        return math.ceil(frames / rung.every)
+    return math.ceil(STRETCH_STEPS / (rung.every if rung.every > 1 else objective.every))
 
 
 def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Estimate:

@@ -6,6 +6,7 @@ from roadproof.recordings.folder import save_recordings as save_recordings
 from roadproof.recordings.recording import Recording as Recording
 from roadproof.recordings.recording import RecordingSet as RecordingSet
 from roadproof.recordings.recording import Side as Side
+from roadproof.recordings.recording import evenly as evenly
 from roadproof.recordings.recording import pooled as pooled
 from roadproof.recordings.track import FASTEST_MPS as FASTEST_MPS
 from roadproof.recordings.track import Track as Track

@@ -212,3 +212,8 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
         drives += [replace(drive, name=before + drive.name, weather=drive.weather or name) for drive in each.recordings]
     origin = "; ".join(each.origin for each in sets.values())
     return replace(first, recordings=tuple(drives), origin=origin)
+
+
+def evenly(count: int, most: int) -> Int[np.ndarray, " f"]:
+    """Indices of at most `most` of `count` frames, evenly spread, the first and the last included."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))

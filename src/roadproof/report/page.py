@@ -15,13 +15,12 @@ import numpy as np
 import roadproof
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
-from roadproof.drives.record import evenly
 from roadproof.driving.infractions import counted
 from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.patterns import Pattern, raster
-from roadproof.recordings import Recording
+from roadproof.recordings import Recording, evenly
 from roadproof.report import charts
 from roadproof.report.commands import commands_of
 from roadproof.report.html import environment

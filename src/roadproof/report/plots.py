@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from roadproof.attacks import AttackResult, ShownDrive
-from roadproof.drives.record import evenly
 from roadproof.io.files import write_atomically
+from roadproof.recordings import evenly
 
 LINE_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 _UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m"}

@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from roadproof.drives.record import evenly
 from roadproof.errors import ScenarioError
 from roadproof.patterns import raster
+from roadproof.recordings import evenly
 from roadproof.report.formatting import in_words
 from roadproof.report.road_view import Ground, around_canvas, draw_road, on_asphalt
 from roadproof.roads.maps import load_map

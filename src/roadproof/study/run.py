@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.io.locks import working_in
-from roadproof.memory import keep_freed_memory
+from roadproof.machine import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
 from roadproof.study.folder import is_done, write_result, write_study, write_table

@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 from roadproof.drives.own.place import canvas_on, fitted_camera, track_of
 from roadproof.drives.own.plan import PLAN, OwnColour, OwnDrives, read_plan
 from roadproof.drives.own.table import CORNERS, Table, read_table
-from roadproof.drives.record import evenly, in_view
+from roadproof.drives.record import in_view
 from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, homography_from_points, homography_from_pose
@@ -27,7 +27,7 @@ from roadproof.io.files import AnyPath, as_path, inside
 from roadproof.io.pictures import read_picture
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded import placed
-from roadproof.recordings import Recording, RecordingSet, Track
+from roadproof.recordings import Recording, RecordingSet, Track, evenly
 
 WINDOW = Window(frames=40, least_px=8)
 """Frames that are kept of a drive, as a recording for the recorded world has them."""

@@ -1,0 +1,52 @@
+"""Freed memory is kept, measured by page faults of a process that asks for the same blocks; waiting threads sleep."""
+
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+ASK_AGAIN = """
+import resource, torch
+from roadproof.machine import keep_freed_memory
+{first}
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+def step():
+    first, second = torch.ones(8 << 18), torch.ones(40 << 18)
+    del first
+    third = torch.ones(20 << 18)
+for _ in range(10):  # the heap grows to what is needed
+    step()
+before = faults()
+for _ in range(10):
+    step()
+print(faults() - before)
+"""
+
+
+def page_faults(first: str) -> int:
+    told = subprocess.run(
+        [sys.executable, "-c", ASK_AGAIN.format(first=first)], capture_output=True, text=True, check=True
+    )
+    return int(told.stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+def test_blocks_that_were_freed_are_used_again() -> None:
+    assert page_faults("keep_freed_memory()") < 0.3 * page_faults("")
+
+
+ASK_CONTROLLER = (
+    "import sys; sys.argv[1:] = ['check-controller', 'cil-small', '--no-drive']; import roadproof.cli as c; c.main()"
+)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="torch's threads are not those of GNU OpenMP")
+@pytest.mark.parametrize(("asked", "spins"), [({}, "0"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "30000000000")])
+def test_threads_of_a_command_sleep_while_they_wait_unless_the_user_says_otherwise(asked, spins) -> None:
+    environment = {**os.environ, "OMP_DISPLAY_ENV": "VERBOSE", **asked}
+    told = subprocess.run(
+        [sys.executable, "-c", ASK_CONTROLLER], env=environment, capture_output=True, text=True, check=True
+    )
+    assert f"GOMP_SPINCOUNT = '{spins}'" in told.stderr
