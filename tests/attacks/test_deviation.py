@@ -8,7 +8,7 @@ import torch
 
 from painted_ground import RampFollower, recorded_road
 from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack, methods
-from roadproof.attacks.gradopt import BEHIND, DRAWN, Rung, gradopt
+from roadproof.attacks.gradopt import BEHIND, DRAWN, MUTATION, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
@@ -175,7 +175,7 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
     rungs = (
         Rung(4, 1, open_loop=True, screened=2),
         Rung(4, 2, every=4),
-        Rung(2, 3, groups_compete=True),
+        Rung(2, 3, groups_compete=True, offspring=8),
         Rung(2, 2, 0.01),
     )
     groups = (RIGHT_GROUP, LEFT_GROUP)
@@ -226,6 +226,20 @@ def test_some_starts_are_the_best_of_many_and_the_others_at_random(road):
     given = [SPACE.random((3,), torch.Generator().manual_seed(k)) for k in (1, 2)]
     kept = gradopt(measure, SPACE, (Rung(3, 1, screened=2),), seed=4, starts=given).history[0]
     assert torch.allclose(kept, measure.values(SPACE, torch.stack(given)), atol=1e-3)
+
+
+def test_offspring_with_figures_of_two_of_the_best_compete_with_them(road):
+    measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    first = Rung(4, 1)
+    alone = gradopt(measure, SPACE, (first, Rung(4, 1, every=4)), seed=1)
+    found = gradopt(measure, SPACE, (first, Rung(4, 1, every=4, offspring=64)), seed=1)
+    ranked, before = (each.history[0].sort(1).values for each in (found, alone))
+    assert (ranked >= before - 1e-6).all()
+    assert (ranked > before + 0.01).any(), "some are better than what they come from"
+    # One figure of a pattern comes whole from one parent, but for a little.
+    parents = gradopt(measure, SPACE, (first,), seed=1).best_unit
+    apart = (found.best_unit[:, :, None] - parents[:, None]).abs().amax(-1).amin(2)
+    assert (apart < 6 * MUTATION).all()
 
 
 def test_a_search_without_gradients_drives_in_the_recorded_world_too(road, tmp_path):

@@ -4,7 +4,8 @@ All starts of all groups are one batch and take one step together; each keeps it
 
 A search is a ladder of rungs. Where a start ends depends on where it began far more than on how long it climbs, and
 after some 20 steps on every fourth frame their order is much that of the end. So many starts climb the first rungs on
-few frames, and the best of them alone go on (successive halving). The last rungs have the starts and frames of the
+few frames, and the best of them alone go on (successive halving). What makes two of them good are often different
+figures, so offspring with figures of both compete for the places too. The last rungs have the starts and frames of the
 whole search, and smaller and smaller steps; each begins at the best points so far with a fresh optimiser, as in the
 paper. A group that is far behind by then gives its places to the others: some controllers give way to one side only.
 """
@@ -41,6 +42,7 @@ class Rung:
         groups_compete: whether a group whose best is below `BEHIND` of the best of all gives its starts to the others
             before this rung, if the measure can be had of some groups alone (`Grouped`).
         screened: how many of the random starts of every group are the best of `DRAWN` that are valued first.
+        offspring: how many children of the rung before's best points compete with these for the places of this one.
 
     Raises:
         RoadproofError: `starts`, `iterations`, `learning_rate` or `every` is not positive.
@@ -53,6 +55,7 @@ class Rung:
     open_loop: bool = False
     groups_compete: bool = False
     screened: int = 0
+    offspring: int = 0
 
     def __post_init__(self) -> None:
         if min(self.starts, self.iterations, self.every) < 1 or not self.learning_rate > 0:
@@ -76,6 +79,9 @@ BEHIND = 1 / 3
 
 DRAWN = 256
 """Random points of which a rung that screens keeps the best."""
+
+PARENTS, MUTATION = 12, 0.02
+"""Best points of a group that have offspring, and how far these are moved: the spread of every share of a range."""
 
 
 def dropping(
@@ -162,12 +168,14 @@ def gradopt(
         measure.frames_evaluated += int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung = rungs[number]
+        if number > at and rung.groups_compete and isinstance(measure, Grouped):
+            state, behind = _without_those_behind(state, behind)
+        climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
         if number > at:
-            if rung.groups_compete and isinstance(measure, Grouped):
-                state, behind = _without_those_behind(state, behind)
+            if rung.offspring:
+                state = _with_offspring(climbed, space, state, rung.offspring, derived_seed(seed, 2 * 10**6 + number))
             places = rung.starts * len(measure.groups) // len(state["best"])
             state = _next_rung(state, space, rungs[number - 1], rung, places, derived_seed(seed, number))
-        climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
         free = rung.starts - (0 if number else max(map(len, starts), default=0))
         if min(rung.screened, free) > 0 and not int(state["done"]):
             # Far from the numbers of other draws.
@@ -240,6 +248,26 @@ def _without_those_behind(
         behind[behind.isnan()] = torch.where(ahead, torch.nan, best).cpu()
         state = state | {name: state[name][ahead] for name in ("unit", "best_unit", "best")}
     return state, behind
+
+
+def _with_offspring(
+    measure: RecordedMeasure, space: SearchSpace, state: dict[str, Tensor], count: int, seed: int
+) -> dict[str, Tensor]:
+    """The best points of every group and their offspring, each with every figure of one of two parents, a little moved.
+
+    All are valued by the measure of the rung to come.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    groups, points = state["best"].shape
+    parents = state["best"].topk(min(PARENTS, points), 1).indices
+    each = torch.arange(groups, device=parents.device)[:, None]
+    best = state["best_unit"][each, parents]
+    mother, father = torch.randint(best.shape[1], (2, groups, count), generator=generator).to(parents)
+    from_mother = torch.rand(groups, count, space.figures, 1, generator=generator).to(best) < 0.5
+    moved = MUTATION * torch.randn(groups, count, *best.shape[2:], generator=generator).to(best)
+    children = space.project(torch.where(from_mother, best[each, mother], best[each, father]) + moved)
+    unit = torch.cat([best, children], 1)
+    return {"best_unit": unit, "best": measure.values(space, unit)}
 
 
 def _next_rung(

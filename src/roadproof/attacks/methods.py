@@ -61,8 +61,8 @@ class GradOpt(Method):
         path has hardly a gradient there, while what also turns the wheel where a car is aside takes it further
         (measured). Random patterns join them, for controllers that need no such help. Most starts are the best of many
         that are valued once, which helps with controllers that random patterns hardly move, and the others at random,
-        which helps with those that nearly every pattern moves (measured). A side to which the car hardly goes gives its
-        places to the other.
+        which helps with those that nearly every pattern moves (measured). Figures of two good patterns together are
+        often better than either (measured). A side to which the car hardly goes gives its places to the other.
         """
         shift = isinstance(objective, SteeringShift)
         rate, usual, first = (0.1, 100, SHIFT_RUNGS) if shift else (0.05, 32, PATH_RUNGS)
@@ -89,7 +89,7 @@ SHIFT_RUNGS = (Rung(24, 30, every=4), Rung(8, 30, every=2))
 PATH_RUNGS = (
     Rung(24, 12, every=8, open_loop=True, screened=16),
     Rung(32, 4, every=6),
-    Rung(6, 10, every=4),
+    Rung(6, 10, every=4, offspring=128),
 )
 """On which starts compete before a search of the steering shift, and of the path; most for their cost (measured)."""
 

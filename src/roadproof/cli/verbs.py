@@ -109,7 +109,7 @@ def begin(estimate: Estimate, *folders: Path) -> None:
     for folder in folders:
         hold(folder)
     if estimate.seconds > SHORT_S and not is_quiet():
+        less = ", less what is done already" if begun else ""
         Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(
-            f"This takes {told}{', less what is done already' if begun else ''}; when it is interrupted, the same command "
-            "goes on"
+            f"This takes {told}{less}; when it is interrupted, the same command goes on"
         )

@@ -116,7 +116,8 @@ def of_search(
         rungs = (Rung(1, method.steps(objective), 1.0),)
     # A start that is only valued takes a third of a step.
     count = sum(
-        (rung.starts * rung.iterations + (DRAWN / 3 if rung.screened else 0)) * _pictures(rung, objective, frames)
+        (rung.starts * rung.iterations + ((DRAWN if rung.screened else 0) + rung.offspring) / 3)
+        * _pictures(rung, objective, frames)
         for rung in rungs
     )
     seconds = groups * count * frame_seconds(controller, gradients=method.by_gradient)
