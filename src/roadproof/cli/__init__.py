@@ -5,9 +5,11 @@ A `RoadproofError` is one line on standard error and exit code 2, a traceback on
 
 from __future__ import annotations
 
+import atexit
 import io
 import math
 import os
+import signal
 import sys
 import traceback
 from typing import Annotated, Any, NoReturn
@@ -98,15 +100,17 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 
 def main() -> None:
     """Entry point of the `roadproof` command."""
-    keep_freed_memory()
-    sleep_while_waiting()
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal or pipe of another encoding gets ä as \xe4 instead of an error.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
     try:
+        keep_freed_memory()
+        sleep_while_waiting()
+        for stream in (sys.stdout, sys.stderr):
+            # A terminal or pipe of another encoding gets ä as \xe4 instead of an error.
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
         code = app(prog_name="roadproof", standalone_mode=False)
         sys.stdout.flush()
+        # All is done: the end of the process has nothing to interrupt. What is registered last is called first.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     except _UsageError as error:
         # Where no words were given, the help was shown instead, and there is nothing to say.
         if said := error.format_message().rstrip("."):
@@ -121,7 +125,8 @@ def main() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         where = "the output" if error.filename is None else repr(str(error.filename)[:200])
         _fail(f"{where}: {error.strerror}; check the path" if error.strerror else str(error))
-    except typer.Abort:
+    except (typer.Abort, KeyboardInterrupt):
+        # The latter while the command is still put together.
         code = _INTERRUPTED
     if code == _INTERRUPTED:
         _complain("interrupted; give the same command again to go on")
