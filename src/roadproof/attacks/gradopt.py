@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Required, TypedDict, Unpack, cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
@@ -220,9 +220,13 @@ def _screened(
 ) -> Float[Tensor, "g r k n"]:
     """The starts, the last of which are the best of many random points by a measure."""
     drawn = space.random((len(unit), DRAWN), torch.Generator().manual_seed(seed)).to(unit)
-    best = measure.values(space, drawn).topk(count, 1).indices
-    kept = drawn[torch.arange(len(best), device=best.device)[:, None], best]
+    kept = _at(drawn, measure.values(space, drawn).topk(count, 1).indices)
     return torch.cat([unit[:, :-count], kept], 1)
+
+
+def _at(unit: Float[Tensor, "g r k n"], index: Int64[Tensor, "g i"]) -> Float[Tensor, "g i k n"]:
+    """Of every group's points those with the given numbers."""
+    return unit[torch.arange(len(unit), device=index.device)[:, None], index]
 
 
 def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:
@@ -259,13 +263,11 @@ def _with_offspring(
     """
     generator = torch.Generator().manual_seed(seed)
     groups, points = state["best"].shape
-    parents = state["best"].topk(min(PARENTS, points), 1).indices
-    each = torch.arange(groups, device=parents.device)[:, None]
-    best = state["best_unit"][each, parents]
-    mother, father = torch.randint(best.shape[1], (2, groups, count), generator=generator).to(parents)
+    best = _at(state["best_unit"], state["best"].topk(min(PARENTS, points), 1).indices)
+    mother, father = torch.randint(best.shape[1], (2, groups, count), generator=generator).to(best.device)
     from_mother = torch.rand(groups, count, space.figures, 1, generator=generator).to(best) < 0.5
     moved = MUTATION * torch.randn(groups, count, *best.shape[2:], generator=generator).to(best)
-    children = space.project(torch.where(from_mother, best[each, mother], best[each, father]) + moved)
+    children = space.project(torch.where(from_mother, _at(best, mother), _at(best, father)) + moved)
     unit = torch.cat([best, children], 1)
     return {"best_unit": unit, "best": measure.values(space, unit)}
 
@@ -277,8 +279,7 @@ def _next_rung(
     if rung.goes_on(before):
         kept = ("best_unit", "best", "history")
         return {name: state[name] for name in kept} | {"unit": state["best_unit"], "done": torch.tensor(0)}
-    best = state["best"].topk(min(places, state["best"].shape[1]), 1).indices
-    unit = state["best_unit"][torch.arange(len(best), device=best.device)[:, None], best]
+    unit = _at(state["best_unit"], state["best"].topk(min(places, state["best"].shape[1]), 1).indices)
     drawn = space.random((len(unit), places - unit.shape[1]), torch.Generator().manual_seed(seed))
     return _state_at(torch.cat([unit, drawn.to(unit)], 1))
 

@@ -105,11 +105,10 @@ def begin(estimate: Estimate, *folders: Path) -> None:
         say(f"{told}; less where the folder holds some of it already ({estimate.basis})")
         answer(asdict(estimate))
         raise typer.Exit
-    begun = any(folder.is_dir() and any(folder.iterdir()) for folder in folders)
     for folder in folders:
         hold(folder)
     if estimate.seconds > SHORT_S and not is_quiet():
-        less = ", less what is done already" if begun else ""
+        less = ", less what is done already" if any(any(folder.iterdir()) for folder in folders) else ""
         Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(
             f"This takes {told}{less}; when it is interrupted, the same command goes on"
         )
