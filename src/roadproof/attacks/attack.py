@@ -228,7 +228,7 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
 def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
     """Every start's best, the strongest first: by what is predicted where that is known, else by its own value.
 
-    Of what is predicted with small errors of steering the least counts: where the way forks, a pattern that depends on
+    Of what is predicted with small errors the least counts: where the way forks, a pattern that depends on
     a hair does not come first.
     """
     shifts, predicted = None, None

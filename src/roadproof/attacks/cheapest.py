@@ -6,7 +6,7 @@ From the strongest patterns found, in the recorded world:
     2. lower the limit of the area by a factor, search on from where the search is, and go on while the pattern that
        comes of it still reaches the deviation; where it does not, try half of the step, some times.
 
-What counts as reached is the least deviation over small errors of steering, so that a drive over it should reach it.
+What counts as reached is the least deviation over small errors, so that a drive over it should reach it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Level:
     Args:
         area_m2: sum of the figures' areas, m².
         figures: number of figures.
-        predicted_m: paper's deviation in the recorded world, metres: the least over small errors of steering.
+        predicted_m: paper's deviation in the recorded world, metres: the least over small errors.
     """
 
     area_m2: float
@@ -62,7 +62,7 @@ class Cheapest:
         pattern: the cheapest pattern.
         group: name of the group of drives that it was found for, such as "clean+right".
         wanted_m: deviation that it had to reach, metres.
-        predicted_m: deviation that it is predicted to cause, metres: the least over small errors of steering.
+        predicted_m: deviation that it is predicted to cause, metres: the least over small errors.
         conspicuousness: how conspicuous the pattern is on this road.
         levels: every pattern that still reached the deviation, the strongest first.
     """
@@ -133,7 +133,7 @@ def cheapest(
 
     Returns:
         The cheapest pattern; None where the strongest one is not predicted to reach the deviation under all small
-        errors of steering.
+        errors.
 
     Raises:
         RoadproofError: `wanted_m` is out of its range.
@@ -183,7 +183,7 @@ def in_words(found: Cheapest | None, wanted_m: float) -> str:
     """The outcome of the search for less paint, as one sentence."""
     if found is None:
         return (
-            f"The strongest pattern is not predicted to deviate by {wanted_m:g} m under all small errors of steering, "
+            f"The strongest pattern is not predicted to deviate by {wanted_m:g} m under all small errors, "
             "so there is none with less paint"
         )
     return (
@@ -245,5 +245,5 @@ class _Run:
         return replace(self, space=space, unit=search.best_unit)
 
     def _least_m(self, space: SearchSpace, unit: Float[Tensor, "1 s k n"]) -> Float[Tensor, " s"]:
-        """The least deviation that each pattern is predicted to cause, metres, over small errors of steering."""
+        """The least deviation that each pattern is predicted to cause, metres, over small errors."""
         return self.measure.readings(space, unit)[1].amin(-1)[0]

@@ -124,7 +124,7 @@ class DeviationMeasure:
     def readings(
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
-        """Steering shift on the recorded frames, and the paper's deviation as predicted, with small steering errors.
+        """Steering shift on the recorded frames, and the paper's deviation as predicted, with small errors.
 
         The predictions of all weathers stand one after another.
         """

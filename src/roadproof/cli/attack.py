@@ -155,8 +155,8 @@ def _summarise(result: AttackResult, out: Path) -> None:
         least, most = result.predicted_range_m or (result.predicted_m, result.predicted_m)
         looks = " and variations" if result.objective.endswith("variations") else ""
         shift = (
-            f"{result.predicted_m:.2f} m of deviation predicted ({least:.2f} to {most:.2f} over small errors of "
-            f"steering{looks}), nothing was driven for real; {shift}"
+            f"{result.predicted_m:.2f} m of deviation predicted ({least:.2f} to {most:.2f} over small errors"
+            f"{looks}), nothing was driven for real; {shift}"
         )
     say(
         f"Strongest for {result.group}: {shift}",

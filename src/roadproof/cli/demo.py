@@ -116,7 +116,7 @@ def _report(result: StressTest, out: Path) -> None:
     if (foretold := result.prediction) is not None:
         say(
             f"Predicted in the recordings {foretold.predicted_m:.2f} m of deviation ({foretold.least_m:.2f} to "
-            f"{foretold.most_m:.2f} over small errors of steering), driven {foretold.driven_m:.2f} m; "
+            f"{foretold.most_m:.2f} over small errors), driven {foretold.driven_m:.2f} m; "
             f"{foretold.path_error_m:.2f} m between the paths on average"
         )
     for stage, cost in result.cost.items():

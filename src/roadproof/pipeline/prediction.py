@@ -24,7 +24,7 @@ class Prediction(Saved):
 
     Args:
         predicted_m: the paper's deviation in the recorded world, metres, from the drive over the bare road there; mean
-            over small errors of steering.
+            over small errors.
         least_m: least predicted deviation over those errors, metres.
         most_m: largest predicted deviation over those errors, metres.
         driven_m: the paper's deviation of the drive in the simulator, metres.
