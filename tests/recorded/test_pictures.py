@@ -109,6 +109,20 @@ def test_pictures_of_several_poses_are_those_of_each_alone(bank):
         assert (found[k] - expected[0]).abs().mean() < 1e-4
 
 
+def test_no_pixel_of_a_picture_depends_on_what_else_is_in_the_batch(bank):
+    """Rows of a batch are filled up; what fills them must not paint over the picture's own last pixel."""
+    # Both reach the lower edge of the picture, where the last pixel of a row is; the nearer one is cut off there.
+    cut, whole = pose(0.0), pose(-8.0)
+    alone, together = seen_from(bank, [cut]), seen_from(bank, [cut, whole])
+    assert alone.canvas.pixel.shape[1] < together.canvas.pixel.shape[1]
+    boxes, colours = torch.tensor([[[199.5, 199.5, 2000.0, 2000.0, 0.0]]]), torch.tensor([[[1.0, 0.0, 0.0]]])
+    painted = Pattern((Shape.RECTANGLE,), boxes.repeat(2, 1, 1), colours.repeat(2, 1, 1))
+    first = Pattern(painted.shapes, painted.boxes[:1], painted.colours[:1])
+    expected = composite_own(first, alone.frames, alone.canvas)[0]
+    found = composite_own(painted, together.frames, together.canvas)[0]
+    assert torch.allclose(found, expected, atol=1e-4)
+
+
 def test_light_of_the_recorded_frame_moves_with_the_ground():
     from roadproof.photometry import AffineResponse, PixelMaps
 

@@ -251,7 +251,7 @@ class FrameBank:
         if most == 0:
             return None
         _, pixel = touches.nonzero(as_tuple=True)
-        # Rows are filled up with copies of their last pixel.
+        # Rows are filled up with copies of their last pixel, which are painted as it is.
         start = counts.cumsum(0) - counts
         number = torch.arange(most, device=depth.device)
         place = start[:, None] + torch.minimum(number, (counts[:, None] - 1).clamp_min(0))
@@ -266,7 +266,7 @@ class FrameBank:
         footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
         flat = own + first
         gain, offset, share = self._light.at(flat, _picked(source, flat).mT, gap.frame, footprints)
-        share = torch.where(valid, share, 0.0)[..., None]
+        share = torch.where(some, share, 0.0)[..., None]
         clean = _picked(frames.flatten(2), flat).mT
         gain, bias = share * gain, share * (offset - clean)
         return OwnViews(
