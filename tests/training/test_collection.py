@@ -9,6 +9,7 @@ from roadproof.controllers import CIL, PurePursuit, save_controller
 from roadproof.errors import TrainingError
 from roadproof.scenarios import builtin_scenarios
 from roadproof.training.collection import CollectionPlan, collect, record_drive
+from roadproof.training.random_scenarios import Disturbance
 from roadproof.training.shards import Shard
 from roadproof.training.workers import Worker
 
@@ -111,3 +112,25 @@ def test_scenarios_are_not_what_is_driven():
 def test_plans_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError, match=next(iter(changes))):
         CollectionPlan(**({"drives": 1, "seed": 0} | changes))
+
+
+def test_a_disturbance_lasts_as_long_in_a_simulator_with_shorter_steps(monkeypatch):
+    made = []
+
+    class Kept(Disturbance):
+        def __init__(self, steps, dt_s, generator):
+            super().__init__(steps, dt_s, generator)
+            made.append((steps * dt_s, self))
+
+    monkeypatch.setattr("roadproof.training.collection.Disturbance", Kept)
+    plan = CollectionPlan(drives=1, seed=3, disturbed=1.0, traffic=0.0)
+    lengths = []
+    for dt_s in (0.1, 0.05):
+        worker = Worker(None, dt_s)
+        lengths.append(len(record_drive(worker.town, plan, 0, None)) * dt_s)
+        worker.close()
+    (long_s, long), (short_s, short) = made
+    assert long_s == pytest.approx(short_s, abs=0.25)
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.2)
+    # The same pushes, told at twice as many instants.
+    assert np.abs(short._steer).sum() * 0.05 == pytest.approx(np.abs(long._steer).sum() * 0.1, rel=0.1)

@@ -138,7 +138,7 @@ def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, control
         number: the drive's number in the plan, from 0.
         controller: the controller that drives; None for the expert.
     """
-    given = _conditions(plan, number)
+    given = _conditions(plan, number, town.dt_s)
     rows: list[_Row] = []
 
     def driver(town: TownSimulator) -> Policy:
@@ -179,7 +179,7 @@ def _record(worker: Worker, work: tuple[CollectionPlan, int, Path]) -> None:
     record_drive(worker.town, plan, number, worker.controller).save(path)
 
 
-def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
+def _conditions(plan: CollectionPlan, number: int, dt_s: float) -> _Conditions:
     generator = np.random.default_rng([plan.seed, number])
     # First what does not depend on the shares, so that plans that differ in them alone share weathers and numbers.
     disturbed, busy, painted = generator.uniform(size=3) < (plan.disturbed, plan.traffic, plan.painted)
@@ -193,14 +193,14 @@ def _conditions(plan: CollectionPlan, number: int) -> _Conditions:
         command=COMMANDS[number % len(COMMANDS)],
         displacement=Displacement() if disturbed else None,
     )
-    steps = int(scenario.time_limit_s / STEP_S) + 2
+    steps = int(scenario.time_limit_s / dt_s) + 2
     return _Conditions(
         scenario=scenario,
         weather=weather,
         cars=cars if busy else 0,
         pedestrians=pedestrians if busy else 0,
         pattern=_random_paint(generator) if painted else None,
-        disturbance=Disturbance(steps, STEP_S, generator) if disturbed else None,
+        disturbance=Disturbance(steps, dt_s, generator) if disturbed else None,
     )
 
 
