@@ -1,6 +1,8 @@
 """`roadproof record`, `calibrate` and `attack` one after another, as their users call them."""
 
+import html
 import json
+import shlex
 import shutil
 import textwrap
 
@@ -8,9 +10,11 @@ import pytest
 
 import needs
 from command import answered, stored
+from roadproof.cli import verbs
 from roadproof.drives import load_drives
 from roadproof.pipeline.selection import Selection
 from roadproof.recordings import load_recordings
+from roadproof.report.run import COMMANDS, read_run
 
 needs.town()
 
@@ -91,6 +95,21 @@ def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call
     assert answered(call(*select, "--json")) == stored(place / "selection" / "selection.json")
     assert {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")} == before
     assert "holds a choice with candidates 2, now it is 1" in call(*select[:-1], "1", code=2)
+    call("report", place)
+    commands = read_run(place).commands
+    assert commands[0] == shlex.join(["roadproof", *RECORD])
+    assert commands[1] == "roadproof calibrate runs --method pose"
+    assert commands[3:] == (shlex.join(["roadproof", *map(str, select)]), f"roadproof report {place}")
+    page = (place / "report.html").read_text(encoding="utf-8")
+    assert all(html.escape(each, quote=False) in page for each in commands)
+
+
+def test_a_kept_command_does_not_say_where_a_server_stood_or_how_much_was_said(tmp_path, monkeypatch):
+    words = ("roadproof", "evaluate", "a b.json", "--simulator", "carla://10.0.0.7:2001?paint=native", "--json")
+    monkeypatch.setattr(verbs, "words_given", lambda: words)
+    verbs.keep_command(tmp_path)
+    line = (tmp_path / COMMANDS).read_text()
+    assert line == "roadproof evaluate 'a b.json' --simulator 'carla://HOST:PORT?paint=native'\n"
 
 
 def test_a_second_call_goes_on_where_the_first_ended(run, call):

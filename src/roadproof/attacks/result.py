@@ -47,7 +47,8 @@ class Candidate:
         group: name of the group of drives that it was found on, such as "clean+right".
         surrogate_shift: mean steering shift per frame towards that group's side on recorded frames, in steer units;
             None without recorded frames.
-        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors; None if the search did not drive there.
+        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors;
+            None if the search did not drive there.
         predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
         driven: effect in the drive that chose the pattern; None if nothing was driven in a simulator.
     """
@@ -74,7 +75,8 @@ class AttackResult:
         objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
         surrogate_shift: mean steering shift of the pattern per frame towards that group's side, in steer units; None
             without recorded frames.
-        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors; None if the search did not drive there.
+        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors;
+            None if the search did not drive there.
         predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
         driven: effect of the strongest pattern in the drive that chose it; None if nothing was driven in a simulator.
         by_group: best value of every group, in the objective's unit: steer units per frame, or metres; for the

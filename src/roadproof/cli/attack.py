@@ -11,7 +11,7 @@ from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import answer, say, stored
 from roadproof.cli.paint import Paint, with_paint
-from roadproof.cli.verbs import begin
+from roadproof.cli.verbs import begin, keep_command
 from roadproof.limits import MANY
 
 if TYPE_CHECKING:
@@ -131,6 +131,7 @@ def attack(
             on_step=on_step,
         )
     result.save(out)
+    keep_command(out)
     winner = next(group for group in chosen if str(group) == result.group)
     draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
     checkpoint.unlink(missing_ok=True)

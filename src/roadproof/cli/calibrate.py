@@ -9,6 +9,7 @@ import typer
 
 from roadproof.cli.options import SimulatorSpec, argument, choice
 from roadproof.cli.output import answer, say, stored
+from roadproof.cli.verbs import keep_command
 
 if TYPE_CHECKING:
     from roadproof.calibration import CalibrationReport
@@ -56,6 +57,7 @@ def calibrate(
                 world, drives, how, folder=path / "calibration", on_call=lambda done, show=show: show(done, 0.0)
             )
         result.save(path)
+        keep_command(path / "calibration")
         _summarise(result.report, path)
     answer({"runs": [{"folder": str(run), **stored(run / "calibration" / "report.json")} for run in runs]})
 

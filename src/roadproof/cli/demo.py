@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +12,8 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import number
 from roadproof.cli.output import answer, say, stored
-from roadproof.cli.paint import Paint, with_paint, words
-from roadproof.cli.verbs import begin
+from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.verbs import begin, keep_command
 
 if TYPE_CHECKING:
     from roadproof.pipeline.stress_test import StressTest
@@ -50,7 +49,6 @@ def demo(
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
-    from roadproof.io.files import write_atomically
     from roadproof.pipeline.budget import BUDGETS
     from roadproof.pipeline.estimate import of_run
     from roadproof.pipeline.stress_test import stress_test
@@ -81,22 +79,7 @@ def demo(
             cheapest_m=cheapest,
             on_progress=show,
         )
-    given = {
-        "scenario": scenario,
-        "controller": controller,
-        "budget": budget,
-        "rounds": rounds,
-        "attack-weathers": attack_weathers,
-        "figures": figures,
-        "seed": seed,
-        "simulator": simulator,
-        **({"scenarios": scenarios} if scenarios else {}),
-        **({"cheapest": cheapest} if cheapest else {}),
-        **paint.given,
-        "out": out,
-    }
-    command = shlex.join(["roadproof", "demo", *words(given)])
-    write_atomically(out / "commands.txt", lambda part: part.write_text(command + "\n", encoding="utf-8"))
+    keep_command(out)
     _report(result, out)
     if cheapest is not None:
         less = result.cheapest

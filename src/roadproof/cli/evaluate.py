@@ -12,7 +12,7 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import answer, say, stored, table
-from roadproof.cli.verbs import begin
+from roadproof.cli.verbs import begin, keep_command
 from roadproof.cli.worlds import Recorded, open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD
@@ -128,6 +128,7 @@ def evaluate(
         fidelity = None
         if recorded is not None and figures is not None and isinstance(who, Controller):
             fidelity = measure_fidelity(world, who, driven, figures, recorded, out, weather=skies[0], device=device)
+    keep_command(out)
     _summarise(evaluation, fidelity, out, compared=recorded is not None)
     surrogate = {} if fidelity is None else {"surrogate": {"agreement": asdict(fidelity.agreement)}}
     answer(stored(out / "evaluation.json") | surrogate)

@@ -1,4 +1,4 @@
-"""Verbs and groups of verbs whose help names no type beside what takes no value."""
+"""Verbs and groups of verbs whose help names no type beside what takes no value, and which know the words given."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+_words: tuple[str, ...] = ()  # one command a process
+
+
+def words_given() -> tuple[str, ...]:
+    """The command that is being carried out, word for word."""
+    return _words
 
 
 def _plain(options: list[Any]) -> list[Any]:
@@ -16,6 +23,11 @@ def _plain(options: list[Any]) -> list[Any]:
 
 
 class _Verb(TyperCommand):
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401  # as below
+        global _words
+        _words = ("roadproof", *ctx.command_path.split()[1:], *args)
+        return super().parse_args(ctx, args)
+
     def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401  # typer brings click along, in a place that changes
         return _plain(super().get_params(ctx))
 

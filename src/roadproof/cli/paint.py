@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -27,12 +27,10 @@ class Paint:
     Args:
         limits: limits on paint; None where nothing is limited.
         variation: what the search takes the mean over; None for paint and camera as recorded.
-        given: the options that were given, by name, to give the same command again.
     """
 
     limits: PaintLimits | None
     variation: Variation | None
-    given: dict[str, Any]
 
 
 def _grouped(option: Any) -> Any:  # noqa: ANN401
@@ -101,19 +99,9 @@ def _paint(
     Raises:
         RoadproofError: the file is missing or damaged, or a value is out of its range.
     """
-    given = {
-        "max-area": max_area,
-        "colours": colours,
-        "printable": printable,
-        "contrast": contrast,
-        "keep-out": keep_out,
-        "robust": robust,
-        "paint": paint,
-    }
-    given = {name: value for name, value in given.items() if value is not None and value is not False}
-    if not given:
+    if not (printable or robust) and all(each is None for each in (max_area, colours, contrast, keep_out, paint)):
         # Torch takes seconds to import; commands without limits read their other options first.
-        return Paint(None, None, {})
+        return Paint(None, None)
     from roadproof.compositing import Variation
     from roadproof.errors import PatternError
     from roadproof.io.files import read_toml
@@ -131,13 +119,4 @@ def _paint(
     said = {name: value for name, value in said.items() if value is not None}
     if said:
         limits = replace(limits or PaintLimits(), **said)
-    return Paint(limits, variation or (Variation() if robust else None), given)
-
-
-def words(given: dict[str, Any]) -> list[str]:
-    """Options as a command line has them."""
-    told: list[str] = []
-    for name, value in given.items():
-        many = cast("tuple[object, ...]", value if isinstance(value, tuple) else () if value is True else (value,))
-        told += [f"--{name}", *map(str, many)]
-    return told
+    return Paint(limits, variation or (Variation() if robust else None))

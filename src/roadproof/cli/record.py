@@ -10,7 +10,7 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, number
 from roadproof.cli.output import answer, say, stored
-from roadproof.cli.verbs import begin
+from roadproof.cli.verbs import begin, keep_command
 
 if TYPE_CHECKING:
     from roadproof.drives import Drives
@@ -93,6 +93,7 @@ def record(
                     folder=places[scenario.name] / "record",
                     on_drive=lambda done, show=show: show(done, 0.0),
                 )
+            keep_command(places[scenario.name] / "record")
             _summarise(drives, places[scenario.name])
             made.append(_answer(drives, places[scenario.name]))
     answer({"runs": made})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from roadproof.cli import options
 from roadproof.cli.options import argument, number
 from roadproof.cli.output import answer, say, stored
+from roadproof.cli.verbs import keep_command
 from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ def select(
             folder=run / "selection",
             on_drive=show,
         )
+    keep_command(run / "selection")
     save_pattern(selection.pattern, run / "pattern.json")
     _summarise(selection, found, run)
     answer(stored(run / "selection" / "selection.json"))

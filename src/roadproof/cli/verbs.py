@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
+import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -13,9 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from rich.console import Console
 
+from roadproof.cli.group import words_given
 from roadproof.cli.output import answer, in_json, say
 from roadproof.cli.progress import Loudness, in_words, is_quiet, speak
 from roadproof.errors import RoadproofError
+from roadproof.io.files import write_text
 from roadproof.io.locks import hold
 
 if TYPE_CHECKING:
@@ -32,6 +36,7 @@ _DryRun = Annotated[
 _Json = Annotated[
     bool, typer.Option("--json", help="Print the results as one JSON document, all else on standard error.")
 ]
+_LOUD = frozenset({"--quiet", "--verbose", "--json"})
 _dry_run = False  # one command a process
 
 
@@ -112,3 +117,17 @@ def begin(estimate: Estimate, *folders: Path) -> None:
         Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(
             f"This takes {told}{less}; when it is interrupted, the same command goes on"
         )
+
+
+def keep_command(folder: Path) -> None:
+    """Keep the command that is being carried out beside what it made, for the report.
+
+    How much it said is left out, and so is where a server stood, which is nobody's to keep.
+    """
+    from roadproof.report.run import COMMANDS
+
+    kept = [re.sub(r"^carla://[^?]*", "carla://HOST:PORT", word) for word in words_given() if word not in _LOUD]
+    line = shlex.join(kept) + "\n"
+    place = folder / COMMANDS
+    if not place.exists() or place.read_text(encoding="utf-8") != line:
+        write_text(place, line)

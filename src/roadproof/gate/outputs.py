@@ -13,7 +13,7 @@ from roadproof.errors import EpisodeError
 from roadproof.gate.result import Case, CheckResult
 from roadproof.gate.verdict import Status
 from roadproof.io.arrays import read_archive
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_atomically, write_text
 from roadproof.recordings import evenly
 from roadproof.report.formatting import MISSING, in_words
 
@@ -115,7 +115,7 @@ def write_summary(result: CheckResult, pictured: Case | None, path: Path) -> Non
     if pictured is not None:
         about = f"Furthest astray, {pictured}: above without paint, below with it, at the same instants"
         lines += ["", f"![{about}]({WORST})", "", f"*{about} (`{WORST}`).*"]
-    write_atomically(path, lambda part: part.write_text("\n".join(lines) + "\n", encoding="utf-8"))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _row(cells: Iterable[str]) -> str:

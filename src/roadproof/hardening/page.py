@@ -9,7 +9,7 @@ from PIL import Image
 import roadproof
 from roadproof.hardening.harden import Hardened
 from roadproof.hardening.judgement import Judged
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_text
 from roadproof.io.html import encoded
 from roadproof.patterns import load_pattern, raster
 from roadproof.report.html import environment
@@ -45,7 +45,7 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
         ],
     )  # fmt: skip
     page = folder / "hardening.html"
-    write_atomically(page, lambda part: part.write_text(text, encoding="utf-8"))
+    write_text(page, text)
     return page
 
 

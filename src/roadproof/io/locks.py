@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from roadproof.errors import OutputError
-from roadproof.io.files import check_writable, kept_inside, write_atomically
+from roadproof.io.files import check_writable, kept_inside, write_text
 
 _held = ExitStack()
 atexit.register(_held.close)
@@ -53,7 +53,7 @@ def working_in(folder: Path) -> Generator[None]:
             since = datetime.now().astimezone().isoformat(" ", "seconds")
             doing = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) or "roadproof"
             told = f"{doing} (process {os.getpid()}, since {since})\n"
-            write_atomically(place, lambda part: part.write_text(told, encoding="utf-8"))
+            write_text(place, told)
         with kept_inside(folder):
             yield
         if first:

@@ -57,8 +57,8 @@ UNSURE = (
     *(Start(right_m=right_m) for right_m in (-0.1, 0.1)),
     *(Start(faster_mps=faster_mps) for faster_mps in (-0.3, 0.3)),
 )
-"""Drives that show whether a prediction hangs by a thread: pictures are wrong by about so much steering (measured), and a
-car comes to the paint a little beside its clean path, or at another speed."""
+"""Drives that show whether a prediction hangs by a thread: pictures are wrong by about so much steering (measured), and
+a car comes to the paint a little beside its clean path, or at another speed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

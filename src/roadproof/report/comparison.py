@@ -15,7 +15,7 @@ from roadproof.driving.evaluation import ATTACK, Row
 from roadproof.driving.intervals import Mean, mean_95
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
-from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.io.files import AnyPath, as_path, write_text
 from roadproof.io.html import encoded
 from roadproof.report import charts
 from roadproof.report.html import environment
@@ -119,7 +119,7 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
         patterns=[encoded(on_asphalt(each.judged.paint, 360, _size(each)), "PNG") for each in runs],
         above=[_above(each, number) for number, each in enumerate(runs)],
     )  # fmt: skip
-    write_atomically(as_path(page), lambda part: part.write_text(text, encoding="utf-8"))
+    write_text(as_path(page), text)
     return runs
 
 

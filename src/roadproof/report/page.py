@@ -16,13 +16,12 @@ import roadproof
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
 from roadproof.driving.infractions import counted
-from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.io.files import AnyPath, as_path, write_text
 from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording, evenly
 from roadproof.report import charts
-from roadproof.report.commands import commands_of
 from roadproof.report.html import environment
 from roadproof.report.road_view import on_asphalt
 from roadproof.report.run import Run, read_run
@@ -65,8 +64,8 @@ def write_report(folder: AnyPath) -> Path:
     run = read_run(folder)
     result = json.dumps(result_of(run), indent=1, ensure_ascii=False) + "\n"
     page = render(run)
-    write_atomically(folder / "result.json", lambda part: part.write_text(result, encoding="utf-8"))
-    write_atomically(folder / "report.html", lambda part: part.write_text(page, encoding="utf-8"))
+    write_text(folder / "result.json", result)
+    write_text(folder / "report.html", page)
     return folder / "report.html"
 
 
@@ -94,7 +93,7 @@ def render(run: Run) -> str:
             recorded=_recorded(run),
             recordings=run.recordings,
             calibration=run.calibration,
-            commands=commands_of(run),
+            commands=run.commands,
         )
     )
 

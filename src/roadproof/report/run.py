@@ -10,11 +10,12 @@ RUN/prediction.npz             optional: the predicted path beside the driven on
 RUN/cheapest/                  optional: the least paint for a deviation, driven over (`attacks.cheapest`)
 RUN/pattern.json               optional: the pattern that was chosen in the end
 RUN/run.json                   optional: what the stages took (`roadproof.pipeline.stage_costs`)
-RUN/commands.txt               optional: the commands that made it, one a line
+RUN/commands.txt               optional: the commands that made it, one a line; each stage's folder may have its own
 """
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass
 from itertools import chain, count, takewhile
 from pathlib import Path
@@ -43,6 +44,9 @@ from roadproof.pipeline.stage_costs import StageCost, read_cost
 from roadproof.pipeline.stages import CHEAPEST
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.simulators.protocol import PatternImage
+
+COMMANDS = "commands.txt"
+_STAGES = ("record", "calibration", "attack", "selection", "evaluation")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -95,7 +99,7 @@ class Run:
         prediction: the path that the recorded world predicted for the chosen pattern, beside the path that was driven.
         pattern: the pattern that was chosen in the end; the attack's own where the run says nothing else.
         cost: what each stage took since the run began; empty where the run keeps no account of it.
-        commands: the commands that made the run, where they were kept.
+        commands: the commands that made the run, as they were given; none where it was made in Python.
         cheapest: the least paint for a deviation, where it was looked for.
         cheapest_driven: the drive over the least paint, where it was driven over.
     """
@@ -173,7 +177,7 @@ def read_run(folder: Path) -> Run:
         prediction=Prediction.load(path) if (path := folder / "prediction.npz").exists() else None,
         pattern=chosen,
         cost=read_cost(folder),
-        commands=_commands(folder / "commands.txt"),
+        commands=_commands(folder),
         cheapest=_cheapest(folder),
         cheapest_driven=Selection.load(path)
         if ((path := folder / CHEAPEST / "selection") / "selection.json").exists()
@@ -198,7 +202,16 @@ def _cheapest(folder: Path) -> Cheapest | None:
     return next((Cheapest.load(place) for place in places if (place / "cheapest.json").exists()), None)
 
 
-def _commands(path: Path) -> tuple[str, ...]:
+def _commands(folder: Path) -> tuple[str, ...]:
+    """The commands kept in a run, or else those kept in the folders of its stages."""
+    if whole := _lines(folder / COMMANDS):
+        return whole
+    # What a stage made for several runs at once stands in each of them.
+    stages = tuple(chain.from_iterable(_lines(folder / stage / COMMANDS) for stage in _STAGES))
+    return (*stages, shlex.join(["roadproof", "report", str(folder)])) if stages else ()
+
+
+def _lines(path: Path) -> tuple[str, ...]:
     try:
         return tuple(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
     except FileNotFoundError:

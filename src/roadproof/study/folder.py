@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from roadproof.errors import StudyError
-from roadproof.io.files import check_closed, read_json, write_atomically
+from roadproof.io.files import check_closed, read_json, write_atomically, write_text
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, Row
 
@@ -141,4 +141,4 @@ def pandas() -> Any:  # noqa: ANN401  # the module
 
 def _write_json(path: Path, content: object) -> None:
     text = json.dumps(content, indent=1, default=str, allow_nan=False) + "\n"
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    write_text(path, text)

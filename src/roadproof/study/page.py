@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import roadproof
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_text
 from roadproof.io.html import data_url
 from roadproof.report.formatting import in_words
 from roadproof.report.html import environment
@@ -126,4 +126,4 @@ def _sentence(results: Results, jobs: Iterable[KeptJob]) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    write_text(path, text)

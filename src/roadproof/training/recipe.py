@@ -28,7 +28,7 @@ from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, way
 from roadproof.controllers.loading import load_network
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.errors import TrainingError
-from roadproof.io.files import read_json, write_atomically
+from roadproof.io.files import read_json, write_text
 from roadproof.training.collection import CollectionPlan, collect
 from roadproof.training.dataset import Dataset
 from roadproof.training.imitation import Learner, TrainingPlan, imitate
@@ -226,4 +226,4 @@ def _claim(recipe: Recipe, folder: Path) -> None:
                 )
         return
     content = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked}, indent=1)
-    write_atomically(path, lambda part: part.write_text(content + "\n", encoding="utf-8"))
+    write_text(path, content + "\n")
