@@ -85,6 +85,7 @@ def kills(count: int, seed: int, place: Path) -> dict[str, Any]:
             lost = kill_and_resume(begin, name, straight, whole_s, rng)
             counted[f"{name}, {'lost' if lost else 'the same'}"] += 1
             wrong += [lost] if lost else []
+            print(f"kill {sum(counted.values())} of {count}: {lost or name}", flush=True)
     return {"kills": sum(counted.values()), "counted": counted, "wrong": wrong}
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import random
+import shutil
 import time
 
 import numpy as np
 import pytest
 
 import needs
-from killable import EXPECTED, kill_and_resume, starter
+from killable import EXPECTED, REFUSED, differences, kill_and_resume, starter
 from roadproof.attacks import AttackResult
 from roadproof.driving.evaluation import Evaluation
 from roadproof.pipeline.selection import Selection
@@ -114,3 +116,31 @@ def test_what_is_killed_at_any_time_ends_as_what_is_not(start, tmp_path):
     whole_s = time.monotonic() - began
     rng = random.Random(name)
     assert [kill_and_resume(start, name, straight, whole_s, rng) for _ in range(2)] == ["", ""]
+
+
+@pytest.mark.slow
+def test_a_study_names_a_damaged_file_and_goes_on_without_it(start, tmp_path):
+    """Its other jobs are done all the same, so it ends as with a failed job, not as one that is refused."""
+    straight, damaged = tmp_path / "straight", tmp_path / "damaged"
+    whole = start("study", straight)
+    until = time.monotonic() + PATIENCE_S
+    while not list(straight.glob("work/*/evaluation/episodes/[!.]*.npz")):
+        assert whole.is_alive(), straight.with_suffix(".log").read_text()
+        assert time.monotonic() < until, "no job drives"
+        time.sleep(0.002)
+    # As it is now, on a disk: what is written under another name first is not there yet.
+    shutil.copytree(straight, damaged, ignore=shutil.ignore_patterns(".*"))
+    whole.join(PATIENCE_S)
+    assert whole.exitcode == 0, straight.with_suffix(".log").read_text()
+    lost = min(damaged.glob("work/*/evaluation/episodes/*.npz"))
+    os.truncate(lost, lost.stat().st_size // 2)
+    log = damaged.with_suffix(".log")
+    for expected in (REFUSED["study"], EXPECTED["study"]):
+        process = start("study", damaged)
+        process.join(PATIENCE_S)
+        assert process.exitcode == expected, log.read_text()
+        if expected == REFUSED["study"]:
+            assert lost.name in log.read_text()
+            assert "remove a file first that is called damaged" in log.read_text()
+            lost.unlink()
+    assert differences(straight, damaged) == []

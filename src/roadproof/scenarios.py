@@ -6,21 +6,19 @@ road is for the simulator that knows the map to say.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import hashlib
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 from roadproof.datatypes import VehicleState
-from roadproof.errors import GeometryError, OutputError, ScenarioError
+from roadproof.errors import GeometryError, ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml
+from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml, write_text
 from roadproof.io.tables import first_twice
 
 Kind = Literal["straight", "left", "right"]
@@ -147,15 +145,7 @@ def save_scenarios(scenarios: Sequence[Scenario], path: AnyPath) -> None:
     """
     path = as_path(path)
     blocks = [_block(scenario, path.parent) for scenario in scenarios]
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text("\n".join(blocks), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise OutputError(f"scenarios cannot be written to {path} ({error.strerror}); choose another place") from error
+    write_text(path, "\n".join(blocks))
 
 
 def _block(scenario: Scenario, folder: Path) -> str:

@@ -115,6 +115,6 @@ def test_a_wrong_name_is_refused(tmp_path):
 
 def test_a_film_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    refused = pytest.raises(OutputError, match=r"the film cannot be written to .*; choose another place")
+    refused = pytest.raises(OutputError, match=r"cannot write .*; choose a folder that can be written")
     with refused, film_file(tmp_path / "file" / "x.mp4", SIZE, 0.05):
         pass

@@ -131,6 +131,8 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
 }
 EXPECTED = {name: 1 if name == "check" else 0 for name in COMMANDS}
 """How each ends: the team's controller fails its check."""
+REFUSED = {name: 1 if name == "study" else 2 for name in COMMANDS}
+"""How each ends that finds a damaged file: a study does its other jobs first, and says which job failed and why."""
 
 
 def run(name: str, folder: Path) -> None:
@@ -235,7 +237,7 @@ def kill_and_resume(
     time.sleep(1.5)  # workers end with it, and look for that once a second
     lost = _lose_the_end(folder, rng) if rng.random() < 0.5 else None
     code, said = _again(begin, name, folder)
-    if lost is not None and code == 2 and lost.name in said and "Traceback" not in said:
+    if lost is not None and code == REFUSED[name] and lost.name in said and "Traceback" not in said:
         lost.unlink()
         code, said = _again(begin, name, folder)
     if code != EXPECTED[name]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives import Drive, Drives
-from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.rollout import drive_again
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.io.arrays import read_record, write_archive
@@ -113,15 +113,14 @@ class Replays:
             step += 1
 
         settings, began = self._drives.settings, time.perf_counter()
-        rollout(
+        drive_again(
             self._simulator,
-            replay(drive.episode),
+            drive.episode,
             settings.scenario,
-            weather=settings.weather,
             pattern=paint,
+            steps=last + 1,
             full_pictures=frozenset(wanted) if full_pictures else False,
             on_step=keep,
-            until=lambda _: step > last,
         )
         if len(seen_there) != len(wanted):
             raise CalibrationError(

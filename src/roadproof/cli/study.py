@@ -61,7 +61,7 @@ def run(
     bad = failures(rows)
     say(*(f"FAILED {line}" for line in bad))
     if bad:
-        say("Give the same command again to try those once more")
+        say("Give the same command again to try those once more; remove a file first that is called damaged")
     answer({"rows": rows.to_dict("records")})
     if bad:
         raise typer.Exit(1)

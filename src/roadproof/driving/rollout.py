@@ -135,6 +135,54 @@ def replay(episode: Episode) -> Driver[Simulator]:
     return begin
 
 
+def drive_again(
+    simulator: Simulator,
+    episode: Episode,
+    scenario: Scenario,
+    *,
+    pattern: Pattern | PatternImage | None = None,
+    steps: int,
+    full_pictures: Pictures = False,
+    on_step: OnStep | None = None,
+) -> Episode:
+    """Drive an episode again from its controls, in its weather and traffic, over other paint: the states are the same.
+
+    Args:
+        simulator: an open simulator of the kind that the episode was driven in.
+        episode: episode whose controls are given again.
+        scenario: scenario of the episode, from the start that it had.
+        pattern: pattern painted on the canvas, or a picture of the canvas; None leaves the road bare.
+        steps: number of observations after which the drive ends, at least 1.
+        full_pictures: which observations show the full camera picture.
+        on_step: called after each step, as by `rollout`.
+
+    Raises:
+        SimulatorError, ScenarioError, PatternError: as `rollout` does.
+    """
+    seen = 0
+
+    def told(observation: Observation, control: Control | None) -> None:
+        nonlocal seen
+        seen += 1
+        if on_step is not None:
+            on_step(observation, control)
+
+    return rollout(
+        simulator,
+        replay(episode),
+        scenario,
+        weather=episode.weather,
+        pattern=pattern,
+        cars=episode.cars,
+        pedestrians=episode.pedestrians,
+        seed=episode.seed,
+        full_pictures=full_pictures,
+        on_step=told,
+        # The last observation is told of, too, once the drive has ended.
+        until=lambda _: seen >= steps - 1,
+    )
+
+
 def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:
     """The policy of a driver for a drive that has just begun."""
     if not isinstance(driver, Controller):

@@ -167,6 +167,8 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
     each_once(stated.seeds, "seeds")
     for seed in stated.seeds:
         _within(seed, "seeds", 0, MAX_SEED)
+    if budget is not None:
+        _one_of(budget, "budget", BUDGETS)
     chosen: BudgetName = "full" if (budget or stated.budget) == "full" else "smoke"
     listed = stated.scenario_file
     own = None if listed is None else _beside(folder, listed, "scenario_file")

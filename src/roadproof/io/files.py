@@ -163,7 +163,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         OutputError: the folder cannot be made or written, or the disk is full; nothing is left behind.
     """
-    with _writing(path):
+    with writing(path):
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
         os.close(handle)
         part = Path(name)
@@ -186,7 +186,7 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], object]) -> No
     Raises:
         OutputError: the folder cannot be made or written, or the disk is full; nothing is left behind.
     """
-    with _writing(folder):
+    with writing(folder):
         part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
         try:
             write(part)
@@ -206,7 +206,7 @@ def _settle(path: Path) -> None:
 
 
 @contextmanager
-def _writing(path: Path) -> Generator[None]:
+def writing(path: Path) -> Generator[None]:
     """Make the folder that `path` is to be in; what the system refuses is an `OutputError`."""
     _check_inside(path)
     try:

@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from roadproof.errors import OutputError
+from roadproof.io.files import writing
 
 
 def can_film() -> bool:
@@ -45,8 +46,7 @@ def film_file(
         raise OutputError("films need PyAV, which is not installed: pip install 'roadproof[video]'")
     av: Any = importlib.import_module("av")
     part = path.with_name(f".{os.getpid()}.{path.name}")
-    with _writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path):
         container = av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"})
     try:
         options = {"crf": str(quality), "threads": "1", "preset": "veryfast"}
@@ -55,11 +55,11 @@ def film_file(
         stream.pix_fmt = "yuv420p"
 
         def add(image: UInt8[ndarray, "h w 3"]) -> None:
-            with _writing(path):
+            with writing(path):
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
 
         yield add
-        with _writing(path):
+        with writing(path):
             container.mux(stream.encode())
             container.close()
         part.replace(path)
@@ -67,11 +67,3 @@ def film_file(
         with suppress(OSError):
             container.close()
         part.unlink(missing_ok=True)
-
-
-@contextmanager
-def _writing(path: Path) -> Generator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"the film cannot be written to {path} ({error}); choose another place") from error

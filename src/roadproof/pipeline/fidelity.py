@@ -16,7 +16,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.datatypes import Control, Observation, Weather
 from roadproof.driving.episode import Episode
-from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.rollout import drive_again, rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
@@ -116,6 +116,7 @@ def measure_fidelity(
         clean = rollout(simulator, controller, scenario, weather=weather)
     if not is_drive_of(recorded, clean):
         return None
+    _require_paint(_covered(pattern, recordings, recorded))
     rendered = rendered_frames(simulator, scenario, clean, pattern, recorded.frame_number)
     fidelity = compare_with_rendered(pattern, recordings, controller, rendered, drive=recorded.name, device=device)
     fidelity.save(folder / "fidelity.npz")
@@ -197,7 +198,7 @@ def rendered_frames(
             frames.append(seen.frame)
         step += 1
 
-    rollout(simulator, replay(episode), scenario, weather=episode.weather, pattern=pattern, on_step=keep)
+    drive_again(simulator, episode, scenario, pattern=pattern, steps=max(wanted) + 1, on_step=keep)
     return np.stack(frames)
 
 
@@ -224,6 +225,11 @@ def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) ->
     return composite(white, dark)[:, 0].numpy() >= 0.5
 
 
+def _require_paint(paint: Bool[np.ndarray, "f h w"]) -> None:
+    if not paint.any():
+        raise EpisodeError("no frame shows any paint, so there is nothing to compare; check the pattern and the drive")
+
+
 def agreement(
     composited: UInt8[np.ndarray, "f h w 3"],
     rendered: UInt8[np.ndarray, "f h w 3"],
@@ -246,8 +252,7 @@ def agreement(
     Raises:
         EpisodeError: no pixel shows paint.
     """
-    if not paint.any():
-        raise EpisodeError("no frame shows any paint, so there is nothing to compare; check the pattern and the drive")
+    _require_paint(paint)
     error = np.abs(composited.astype(np.float32) - rendered).mean(-1)
     return Agreement(
         frames=len(composited),

@@ -18,7 +18,7 @@ from roadproof.driving.deviation import lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
-from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.rollout import drive_again
 from roadproof.io.arrays import write_archive
 from roadproof.io.files import write_atomically
 from roadproof.io.video import can_film, film_file
@@ -139,26 +139,14 @@ def _pictures(simulator: Simulator, start: Scenario, episode: Episode, paint: Pa
     """
     kept: list[bytes] = []
     moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
-    enough = int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s) if moving.size else 1
+    enough = min(int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s), len(episode)) if moving.size else 1
 
     def keep(seen: Observation, _: Control | None) -> None:
         file = io.BytesIO()
         Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
         kept.append(file.getvalue())
 
-    rollout(
-        simulator,
-        replay(episode),
-        start,
-        weather=episode.weather,
-        pattern=paint,
-        cars=episode.cars,
-        pedestrians=episode.pedestrians,
-        seed=episode.seed,
-        full_pictures=True,
-        on_step=keep,
-        until=lambda _: len(kept) >= enough,
-    )
+    drive_again(simulator, episode, start, pattern=paint, steps=enough, full_pictures=True, on_step=keep)
     return kept
 
 

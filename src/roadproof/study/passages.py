@@ -15,7 +15,7 @@ from roadproof.driving.deviation import passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
-from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.rollout import drive_again
 from roadproof.driving.trial import Trial
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -67,18 +67,14 @@ def _strip(
             small = Image.fromarray(seen.shown).resize(SIZE_PX, Image.Resampling.LANCZOS)
             taken.extend([np.asarray(small)] * times)
 
-    rollout(
+    drive_again(
         simulator,
-        replay(painted),
+        painted,
         trial.start.of(scenario),
-        weather=painted.weather,
         pattern=paint,
-        cars=painted.cars,
-        pedestrians=painted.pedestrians,
-        seed=painted.seed,
+        steps=steps[-1] + 1,
         full_pictures=frozenset(steps),
         on_step=keep,
-        until=lambda _: len(taken) == PICTURES,
     )
     return np.concatenate(taken, 1)
 
