@@ -12,7 +12,7 @@ from roadproof.calibration import Calibrated, CalibrationReport, Method, calibra
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.drives import Swerve, Trajectories, Window, record
-from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.rollout import drive_again, replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import load_recordings, save_recordings
@@ -170,7 +170,7 @@ def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, scene, dr
     canvas = dataclasses.replace(scene.canvas, x_m=scene.canvas.x_m + 1.5, y_m=scene.canvas.y_m + 1.0)
     scenario = dataclasses.replace(scene, canvas=canvas)
     monkeypatch.setattr(
-        "roadproof.calibration.replays.rollout", lambda sim, who, _, **how: rollout(sim, who, scene, **how)
+        "roadproof.calibration.replays.drive_again", lambda sim, drive, _, **how: drive_again(sim, drive, scene, **how)
     )
     moved = dataclasses.replace(drives, settings=dataclasses.replace(drives.settings, scenario=scenario))
     with pytest.raises(CalibrationError, match=r"miss what was seen by .* px on average"):
@@ -180,8 +180,8 @@ def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, scene, dr
 def test_a_canvas_that_never_shows_is_refused(town, drives, monkeypatch):
     """As if something stood before all of it: light and dark look alike."""
     monkeypatch.setattr(
-        "roadproof.calibration.replays.rollout",
-        lambda sim, who, scenario, **how: rollout(sim, who, scenario, **how | {"pattern": None}),
+        "roadproof.calibration.replays.drive_again",
+        lambda sim, drive, scenario, **how: drive_again(sim, drive, scenario, **how | {"pattern": None}),
     )
     with pytest.raises(CalibrationError, match="drive clean: light and dark frames do not differ anywhere"):
         calibrate(town, drives)
