@@ -111,7 +111,7 @@ def test_lists_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> Non
     with pytest.raises(ScenarioError, match="cannot read"):
         load_scenarios(tmp_path / "missing.toml")
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot write"):
         save_scenarios([SCENARIO], tmp_path / "file" / "list.toml")
     elsewhere = dataclasses.replace(SCENARIO, map_name="/elsewhere/map.xodr")
     with pytest.raises(ScenarioError, match="copy it there first"):
