@@ -21,12 +21,12 @@ import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 import roadproof
-from roadproof.controllers import save_controller
+from roadproof.controllers import ConditionalPilotNet, save_controller
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.world import RecordedWorld
 from roadproof.recordings import load_recordings
@@ -88,9 +88,9 @@ def mildest(recordings: Path) -> Pattern:
         return patterns[int(world.deviations_m(controller, patterns).mean(1).argmin())]
 
 
-def spoilt(seed: int, noise: float) -> Any:
+def spoilt(seed: int, noise: float) -> ConditionalPilotNet:
     """PilotNet with noise on its weights."""
-    controller: Any = roadproof.load_controller("pilotnet")
+    controller = cast("ConditionalPilotNet", roadproof.load_controller("pilotnet"))
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for weight in controller.parameters():
