@@ -34,7 +34,10 @@ from roadproof.patterns import Pattern, load_pattern, save_pattern
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
-_LOWER, _SMALLEST_STEP, _MOST_LEVELS = 0.7, 0.9, 14
+MOST_LEVELS = 14
+"""Limits of the area that are tried at most."""
+
+_LOWER, _SMALLEST_STEP = 0.7, 0.9
 _NO_LIMIT_M2 = 1e4
 _RUNGS = (Rung(1, 8, 0.03),)
 
@@ -154,7 +157,7 @@ def cheapest(
     if level.predicted_m < wanted_m:
         return None
     levels, factor = [level], _LOWER
-    for number in range(1, _MOST_LEVELS + 1):
+    for number in range(1, MOST_LEVELS + 1):
         while (fewer := run.without_a_figure()) is not None:
             run, level = fewer, fewer.level()
             levels.append(level)

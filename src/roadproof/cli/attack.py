@@ -75,7 +75,7 @@ def attack(
     from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern, site_of
     from roadproof.attacks import attack as run
     from roadproof.attacks import cheapest as fewest
-    from roadproof.attacks.cheapest import in_words
+    from roadproof.attacks.cheapest import MOST_LEVELS, in_words
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
@@ -138,7 +138,7 @@ def attack(
     _summarise(result, out)
     found = stored(out / "result.json")
     if cheapest is not None:
-        with progress("Looking for less paint", 14) as on_step:
+        with progress("Looking for less paint", MOST_LEVELS) as on_step:
             less = fewest(
                 drives, attacked, result, cheapest, groups=chosen, objective=goal, device=device, on_level=on_step
             )

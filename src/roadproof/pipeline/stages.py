@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeAlias, cast
 
 from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, parse_groups
-from roadproof.attacks.cheapest import FILE
+from roadproof.attacks.cheapest import FILE, MOST_LEVELS
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
@@ -179,7 +179,7 @@ class Stages:
         self, recordings: RecordingSet, found: AttackResult, wanted_m: float, drives: Drives
     ) -> tuple[Cheapest, Selection] | None:
         """The least paint for a deviation, and the drive over it; None if nothing found reaches that deviation."""
-        folder, total = self.folder / CHEAPEST, 15
+        folder, total = self.folder / CHEAPEST, MOST_LEVELS + 1
         made_of = {"wanted_m": wanted_m, "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]}
         if (folder / "cheapest.json").exists():
             require_same(folder, "a search", FILE.content(folder / "cheapest.json")["made_of"], made_of, RoadproofError)
