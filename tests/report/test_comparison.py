@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from browser import hindrances
 from command import answered, roadproof
 from pages import HOSTILE, Page
 from roadproof.errors import RoadproofError
@@ -47,6 +48,12 @@ def test_the_page_shows_both_and_needs_nothing_else(runs, tmp_path):
     assert {"runs", "weathers", "offsets", "patterns"} <= set(names)
     assert write_comparison(runs, tmp_path / "again.html")
     assert (tmp_path / "again.html").read_text() == text
+
+
+@pytest.mark.slow
+def test_nothing_on_the_page_keeps_anybody_out(runs, tmp_path):
+    write_comparison(runs, tmp_path / "compare.html")
+    assert hindrances(tmp_path / "compare.html") == []
 
 
 def test_what_is_not_alike_is_said(runs, tmp_path):

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from browser import opened, until
+from browser import hindrances, opened, until
 from pages import HOSTILE, Page
 from roadproof.driving.evaluation import load_paint
 from roadproof.errors import EpisodeError, RoadproofError
@@ -280,6 +280,13 @@ def test_a_browser_shows_everything_and_has_nothing_to_complain_about(tmp_path):
         )
         assert film == [None, 1280, pytest.approx(1.2, abs=0.1), pytest.approx(0.8)]
         assert complaints == []
+
+
+@pytest.mark.slow
+def test_nothing_on_the_page_keeps_anybody_out(tmp_path):
+    write_run(tmp_path, events=CRASH)
+    write_film(tmp_path / "evaluation")
+    assert hindrances(write_report(tmp_path)) == []
 
 
 @pytest.mark.slow

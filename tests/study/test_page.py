@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from pandas import concat
 from PIL import Image
 
+from browser import hindrances
 from made_up_study import METHODS, made_up_study, write_made_up_study
 from roadproof.errors import PatternError, StudyError
 from roadproof.study import charts
@@ -52,6 +53,11 @@ def test_every_file_is_there(finished):
         if name.endswith(".png"):
             with Image.open(folder / "tables" / name) as drawn:
                 assert min(drawn.size) > 200
+
+
+@pytest.mark.slow
+def test_nothing_on_the_page_keeps_anybody_out(finished):
+    assert hindrances(finished[2]) == []
 
 
 def test_the_page_escapes_and_needs_nothing_else(finished):

@@ -48,6 +48,20 @@ def opened(page: Path, *, width=1280, height=900, dark=False):
             browser.close()
 
 
+def hindrances(page: Path):
+    """What axe finds that keeps some people from reading or using a page: narrow and wide, light and dark."""
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe is not installed (development group)"
+    )
+    found = []
+    for width, dark in ((360, False), (800, True), (1400, False)):
+        with opened(page, width=width, dark=dark) as (shown, complaints):
+            for rule in axe.Axe().run(shown).response["violations"]:
+                found += [f"{width} px, {rule['id']}: {rule['help']}: {each['html'][:200]}" for each in rule["nodes"]]
+            found += complaints
+    return found
+
+
 def _note_request(request, page, complaints):
     if not request.url.startswith(("data:", page.as_uri())):
         complaints.append(f"request: {request.url[:200]}")
