@@ -20,6 +20,7 @@ from roadproof.limits import MAX_CROWD
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
     from roadproof.driving.evaluation import Evaluation
+    from roadproof.patterns import Pattern
     from roadproof.pipeline.fidelity import Fidelity
 
 
@@ -73,7 +74,7 @@ def evaluate(
     from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange
-    from roadproof.patterns import load_pattern, read_paint
+    from roadproof.patterns import read_paint
     from roadproof.pipeline.estimate import of_evaluation
     from roadproof.pipeline.fidelity import measure_fidelity
     from roadproof.pipeline.film import film_trial
@@ -90,17 +91,12 @@ def evaluate(
     else:
         options.check_simulator(simulator, processes)
     begun = StartRange(**dict(zip(StartRange.__slots__, start_range, strict=True)))
-    figures = load_pattern(pattern) if pattern.suffix == ".json" else None
-    paint = read_paint(pattern)
-    if figures is None and (random or recordings):
-        raise PatternError(f"{pattern} is a picture; --random and --recordings need the pattern.json of an attack")
+    figures, paint = _figures(pattern, needed=bool(random or recordings)), read_paint(pattern)
     recorded = None if recordings is None else load_recordings(recordings)
     if recorded is not None and recorded.canvas is not None and where.scenario is not None:
         check_canvas(where.scenario.canvas, recorded.canvas)
     who = options.driver_of(controller, device)
-    runs = 10 if runs is None else runs
-    if runs and not cars + pedestrians:
-        raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
+    runs = _runs(runs, cars + pedestrians)
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
     begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
     with where.open() as (world, driven):
@@ -132,6 +128,33 @@ def evaluate(
     _summarise(evaluation, fidelity, out, compared=recorded is not None)
     surrogate = {} if fidelity is None else {"surrogate": {"agreement": asdict(fidelity.agreement)}}
     answer(stored(out / "evaluation.json") | surrogate)
+
+
+def _figures(pattern: Path, *, needed: bool) -> Pattern | None:
+    """The figures of a pattern; None of a picture.
+
+    Raises:
+        PatternError: the file is damaged, or a picture where figures are needed.
+    """
+    from roadproof.patterns import load_pattern
+
+    if pattern.suffix == ".json":
+        return load_pattern(pattern)
+    if needed:
+        raise PatternError(f"{pattern} is a picture; --random and --recordings need the pattern.json of an attack")
+    return None
+
+
+def _runs(given: int | None, others: int) -> int:
+    """Drives in traffic: those asked for, or ten.
+
+    Raises:
+        RoadproofError: drives in traffic are wanted, and nobody is to be on the road.
+    """
+    runs = 10 if given is None else given
+    if runs and not others:
+        raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
+    return runs
 
 
 def _check_recorded(
