@@ -4,14 +4,16 @@ Convention:
     World: right-handed, metres, z up; yaw 0 looks along x, y points left. Camera pictures and canvases: x right,
     y down, pixel centres at integers, so that a picture of W columns spans [−0.5, W − 0.5]. A homography named
     `b_from_a` maps column vectors (x, y, 1) of a to b; `image_from_canvas` has a positive third coordinate for what
-    is in front of the camera. Everything here is float64 numpy: calibration is data, never differentiated.
+    is in front of the camera, and maps to the picture that the camera would take without its lens. Everything here is
+    float64 numpy: calibration is data, never differentiated.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -20,6 +22,7 @@ from PIL import Image
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError
 from roadproof.io.pictures import MOST_PIXELS
+from roadproof.lens import Lens
 
 CANVAS_SIZE_PX = 400
 _MOST_SCALE = 1e9
@@ -30,20 +33,22 @@ Homography = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CameraModel:
-    """A pinhole camera without distortion, and where it sits on the car.
+    """A camera, and where it sits on the car: a pinhole with square pixels, or one behind a lens that distorts.
 
     Args:
         width_px: number of columns of the picture.
         height_px: number of rows of the picture.
-        fov_deg: horizontal field of view, degrees, in (0, 180).
+        fov_deg: horizontal field of view, degrees, in (0, 180); with a lens, that of a pinhole of the same focal
+            length, 2 atan(width / (2 fx)).
         forward_m: distance ahead of the vehicle's origin, metres.
         left_m: distance to the left of the vehicle's origin, metres.
         up_m: height above the ground, metres.
         pitch_deg: pitch in degrees, positive looking up; CARLA's imitation agent looks down by −15.
+        lens: the distortion of its lens, about the middle of the picture; None for a pinhole.
 
     Raises:
         GeometryError: a size is not positive or the picture is larger than any here, the field of view is outside (0,
-            180), or a place or the pitch is beyond all reason.
+            180), a place or the pitch is beyond all reason, or the lens would fold the picture before its corners.
     """
 
     width_px: int
@@ -53,6 +58,7 @@ class CameraModel:
     left_m: float = 0.0
     up_m: float = 1.4
     pitch_deg: float = 0.0
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         if self.width_px < 1 or self.height_px < 1:
@@ -65,6 +71,18 @@ class CameraModel:
             value: float = getattr(self, name)
             if not abs(value) <= most:
                 raise GeometryError(f"camera {name} is {value:g}, expected −{most:g} to {most:g}")
+        if self.lens is not None and self.focal_px < (least := self.least_focal_px):
+            raise GeometryError(
+                f"camera lens folds the picture {self.lens.reach * self.focal_px:.0f} px from its middle, before its "
+                f"corners at {self.lens.reach * least:.0f} px; check the order of its coefficients, and fov_deg, which "
+                "is that of the focal length"
+            )
+
+    @property
+    def stated(self) -> dict[str, object]:
+        """The camera as files have it: its fields, of which a pinhole has no lens."""
+        fields = asdict(self)
+        return fields if self.lens is not None else {name: fields[name] for name in fields if name != "lens"}
 
     @property
     def focal_px(self) -> float:
@@ -72,13 +90,20 @@ class CameraModel:
         return self.width_px / 2 / math.tan(math.radians(self.fov_deg) / 2)
 
     @property
+    def least_focal_px(self) -> float:
+        """The least focal length, px, with which the lens shows every point once, up to the picture's corners."""
+        return 0.0 if self.lens is None else math.hypot(self.width_px, self.height_px) / 2 / self.lens.reach
+
+    @property
     def intrinsics(self) -> Homography:
-        """Picture from camera axes (x right, y down, z forward), (3, 3)."""
+        """Picture from camera axes (x right, y down, z forward), (3, 3), without the lens."""
         f = self.focal_px
         return np.array([[f, 0, (self.width_px - 1) / 2], [0, f, (self.height_px - 1) / 2], [0, 0, 1.0]])
 
     def image_from_world(self, state: VehicleState) -> Float[np.ndarray, "3 4"]:
         """Projection of homogeneous world points (X, Y, Z, 1), in metres; the third coordinate is the depth in metres.
+
+        The lens is left out: `distorted` gives where the picture shows them.
 
         Args:
             state: pose of the vehicle that carries the camera.
@@ -92,6 +117,42 @@ class CameraModel:
         ground = np.array([state.x_m, state.y_m, state.z_m])
         centre = ground + self.forward_m * forward + self.left_m * left + self.up_m * up
         return self.intrinsics @ np.column_stack([camera_from_world, -camera_from_world @ centre])
+
+    def distorted(self, points: Float[np.ndarray, "*n 3"]) -> Points:
+        """Where the picture shows points, px.
+
+        Args:
+            points: where a pinhole would show them, as homogeneous px with a positive third coordinate for what is in
+                front of the camera.
+        """
+        if self.lens is None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return points[..., :2] / points[..., 2:]
+        x, y, z = np.moveaxis(points @ np.linalg.inv(self.intrinsics).T, -1, 0)
+        return np.stack(self.lens.distort(x, y, z), -1) * self.focal_px + self.intrinsics[:2, 2]
+
+    def undistorted(
+        self, points_px: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 2"]]:
+        """Where a pinhole would show what the picture shows at some places: the inverse of `distorted`.
+
+        Args:
+            points_px: places in the picture, px.
+
+        Returns:
+            Homogeneous px of any positive scale, whose third coordinate is positive for what is in front of the camera
+            (a fisheye shows more), and their derivatives by the place.
+        """
+        if self.lens is None:
+            one = np.ones_like(points_px[..., :1])
+            return np.concatenate([points_px, one], -1), np.broadcast_to(np.eye(3, 2), (*points_px.shape[:-1], 3, 2))
+        directions, slopes = self.lens.undistort((points_px - self.intrinsics[:2, 2]) / self.focal_px)
+        return directions @ self.intrinsics.T, self.intrinsics @ slopes / self.focal_px
+
+    def straightened(self, points_px: Float[np.ndarray, "n 2"]) -> Points:
+        """Where a pinhole would show what the picture shows at some places, px; NaN for what only a fisheye can see."""
+        seen, _ = self.undistorted(points_px)
+        return seen[:, :2] / np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
 
 
 Resampling = Literal["antialiased-bilinear", "area"]
@@ -162,6 +223,46 @@ class CropResize:
         return np.asarray(Image.fromarray(picture).crop(box).resize((self.width_px, self.height_px), method))
 
 
+class Sight(NamedTuple):
+    """Where the N pixels of a controller's input look, row after row, as the input of a camera without its lens has it.
+
+    Args:
+        through: the place at which that input would show what the pixel's middle shows, homogeneous px, (3, N); a
+            homography's inverse takes it to where the pixel looks.
+        slope: its derivative by the pixel's column and row, (N, 3, 2).
+    """
+
+    through: Float[np.ndarray, "3 n"]
+    slope: Float[np.ndarray, "n 3 2"]
+
+    def on(self, canvas_from_input: Homography) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+        """Where the pixels look on a canvas or the ground, without a warning, and whether that is ahead of them."""
+        mapped = self.through[:2].T @ canvas_from_input[:, :2].T + self.through[2:].T * canvas_from_input[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return mapped[:, :2] / mapped[:, 2:], mapped[:, 2] > 0
+
+
+@lru_cache(maxsize=8)
+def sight(view: CropResize, camera: CameraModel | None = None) -> Sight:
+    """Where the pixels of a controller's input look.
+
+    Args:
+        view: crop and resize that make the input from the camera picture.
+        camera: camera that takes the picture, of which only the lens counts; None for any pinhole.
+    """
+    columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
+    pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
+    if camera is None or camera.lens is None:
+        found = Sight(pixels, np.tile(np.eye(3, 2), (rows.size, 1, 1)))
+    else:
+        camera_from_input = np.linalg.inv(view.input_from_camera)
+        through, slope = camera.undistorted((camera_from_input @ pixels)[:2].T)
+        found = Sight(view.input_from_camera @ through.T, view.input_from_camera @ slope @ camera_from_input[:2, :2])
+    for part in found:
+        part.flags.writeable = False
+    return found
+
+
 CIL_CAMERA = CameraModel(width_px=800, height_px=600, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)
 """The camera of CARLA's imitation-learning agent."""
 
@@ -212,9 +313,16 @@ def homography_from_pose(camera: CameraModel, state: VehicleState, canvas: Canva
     return camera.image_from_world(state) @ canvas.world_from_canvas
 
 
+def homogeneous(
+    b_from_a: Float[np.ndarray, "*b 3 3"], points: Float[np.ndarray, "*b n 2"]
+) -> Float[np.ndarray, "*b n 3"]:
+    """Map points of a to homogeneous points of b."""
+    return points @ np.swapaxes(b_from_a[..., :2], -1, -2) + b_from_a[..., None, :, 2]
+
+
 def apply_homography(b_from_a: Float[np.ndarray, "*b 3 3"], points: Float[np.ndarray, "*b n 2"]) -> Points:
     """Map points of a to b. Points at infinity come out as inf or NaN, without a warning."""
-    mapped = points @ np.swapaxes(b_from_a[..., :2], -1, -2) + b_from_a[..., None, :, 2]
+    mapped = homogeneous(b_from_a, points)
     with np.errstate(divide="ignore", invalid="ignore"):
         return mapped[..., :2] / mapped[..., 2:]
 
@@ -237,7 +345,8 @@ def homography_from_points(
 
     Args:
         canvas: points on the canvas, px, (N, 2).
-        image: camera px at which each was seen, (N, 2); all points lie in front of the camera.
+        image: camera px at which each was seen, (N, 2), behind a lens those that `CameraModel.straightened` gives; all
+            points lie in front of the camera.
         outlier_px: where given, correspondences further than this from the best of 500 seeded four-point fits are
             left out (RANSAC); otherwise all count, as in the paper.
         seed: seed of the four-point draws.

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from own_drives import CORNER_NAMES, PLAN, changed_table, write_own
+from lenses import BARREL, LENSES, behind
+from own_drives import CORNER_NAMES, PLAN, changed_table, through, write_own
 from paint_shy import PaintShy
 from recorded_drives import CANVAS, track
 from roadproof.attacks import GradOpt, PathDeviation, attack
@@ -89,6 +90,42 @@ def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():
         fitted_camera(CIL_CAMERA, [*ground[:3], replace(ground[3], y_px=ground[3].y_px + 200)])
 
 
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_corners_seen_through_a_lens_give_the_same_canvas(tmp_path, lens):
+    plan, camera = through(lens, PLAN[: PLAN.index("[canvas]")]), behind(lens)
+    folder = write_own(tmp_path / "own", ["clean"], CORNER_NAMES, plan, every=1, camera=camera)
+    recordings = import_drives(folder)
+    assert recordings.camera == camera
+    assert recordings.canvas.width_m == pytest.approx(CANVAS.width_m, rel=1e-6)
+    assert recordings.canvas.length_m == pytest.approx(CANVAS.length_m, rel=1e-6)
+
+
+def test_poses_place_the_canvas_behind_a_lens_too(tmp_path):
+    folder = write_own(tmp_path / "own", plan=through(BARREL))
+    recordings, straight = import_drives(folder), import_drives(write_own(tmp_path / "straight"))
+    clean = recordings.recordings[0]
+    assert recordings.camera == behind(BARREL)
+    for number, seen in zip(clean.frame_number.tolist(), clean.image_from_canvas, strict=True):
+        np.testing.assert_allclose(seen, homography_from_pose(CIL_CAMERA, track().state(number), CANVAS), rtol=1e-12)
+    off = np.abs(np.asarray(preview(recordings)).astype(int) - np.asarray(preview(straight)))
+    assert (off.max(-1) > 50).sum() > 200  # the outline is drawn where the lens shows it
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_known_points_seen_through_a_lens_give_height_pitch_and_field_of_view(lens):
+    true = replace(behind(lens), up_m=1.62, pitch_deg=-11.0, fov_deg=88.0)
+    places = np.array([[6.0, -1.5, 0.0, 1.0], [6.0, 1.5, 0.0, 1.0], [14.0, -3.0, 0.0, 1.0], [25.0, 2.0, 0.0, 1.0]])
+    state = replace(track().state(0), x_m=0.0, y_m=0.0, yaw_rad=0.0)
+    seen = true.distorted(places @ true.image_from_world(state).T)
+    ground = [
+        GroundPoint(x_px=x, y_px=y, ahead_m=ahead, left_m=left)
+        for (x, y), (ahead, left, _, _) in zip(seen, places, strict=True)
+    ]
+    found = fitted_camera(behind(lens), ground)
+    assert (found.up_m, found.pitch_deg, found.fov_deg) == pytest.approx((1.62, -11.0, 88.0), abs=1e-3)
+    assert found.lens == lens
+
+
 def test_black_and_white_are_seen_as_stated(tmp_path):
     plan = PLAN + "\n[colour]\nblack = [0.1, 0.1, 0.2]\nwhite = [0.8, 0.7, 0.9]\n"
     response = import_drives(write_own(tmp_path / "own", ["clean"], plan=plan)).colour.response
@@ -110,7 +147,13 @@ def test_black_and_white_are_seen_as_stated(tmp_path):
         (PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 1e4"), "expected 0 to 4"),
         (PLAN[: PLAN.index("[canvas]")], r"no table \[canvas\]"),
         (PLAN + "\n[colour]\nblack = [0.9, 0, 0]\nwhite = [0.8, 1, 1]\n", "0 ≤ black < white ≤ 1"),
-        (PLAN.replace("[camera]", "[camera]\nlens = 3"), "camera has an unknown key 'lens'; did you mean"),
+        (PLAN.replace("[camera]", "[camera]\nzoom = 3"), "camera has an unknown key 'zoom'; did you mean"),
+        (PLAN.replace("[camera]", "[camera]\nlens = 3"), "camera.lens is 3, expected table"),
+        (through(BARREL).replace("brown-conrady", "tessar"), "camera.lens.model is 'tessar', expected one of brown"),
+        (through(BARREL).replace("model", "modle"), "camera.lens has an unknown key 'modle'; did you mean 'model'"),
+        (through(BARREL).replace(", -0.0009]", "]"), "brown-conrady lens has 4 coefficients, expected 5: k1, k2, p1"),
+        (through(BARREL).replace("-0.12", "nan"), "brown-conrady lens has k1 nan, expected −1000 to 1000"),
+        (through(BARREL).replace("-0.12", "-0.9"), "camera lens folds the picture 1"),
         (PLAN.replace("fov_deg = 100.0", 'fov_deg = "wide"'), "camera.fov_deg is 'wide', expected float"),
         (PLAN.replace("fov_deg = 100.0\n", ""), "camera lacks fov_deg"),
     ],

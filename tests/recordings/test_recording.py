@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from lenses import LENSES, behind
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
@@ -68,6 +69,21 @@ def test_a_saved_set_is_the_same_when_loaded(tmp_path, compact):
         for field in PER_FRAME:
             np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=str)
+def test_the_lens_travels_with_the_set(tmp_path, lens):
+    original = replace(recording_set(frames=2), camera=behind(lens))
+    save_recordings(original, tmp_path / "set")
+    assert load_recordings(tmp_path / "set").camera == original.camera
+    manifest = json.loads((tmp_path / "set" / "recordings.json").read_text())
+    assert manifest["camera"]["lens"] == {"model": lens.model, "coefficients": list(lens.coefficients)}
+
+
+def test_pinholes_are_kept_as_before_there_were_lenses(saved):
+    camera = json.loads((saved / "recordings.json").read_text())["camera"]
+    assert set(camera) == {"width_px", "height_px", "fov_deg", "forward_m", "left_m", "up_m", "pitch_deg"}
+    assert load_recordings(saved).camera.lens is None
 
 
 def test_pixel_maps_travel_with_their_drive(tmp_path):
@@ -161,11 +177,20 @@ def cut(path):
     path.write_bytes(path.read_bytes()[:60])
 
 
+def edit_lens(model, *coefficients):
+    return lambda folder: edit_manifest(
+        folder, lambda m: m["camera"].update(lens={"model": model, "coefficients": coefficients})
+    )
+
+
 DAMAGE = {
     "manifest missing": (lambda s: (s / "recordings.json").unlink(), "no recordings.json"),
     "manifest cut": (lambda s: cut(s / "recordings.json"), "not valid JSON"),
     "newer version": (lambda s: edit_manifest(s, lambda m: m.update(version=9)), "version 9"),
     "unknown camera field": (lambda s: edit_manifest(s, lambda m: m["camera"].update(zoom=2)), "zoom"),
+    "a lens that folds": (edit_lens("brown-conrady", -0.9, 0, 0, 0, 0), "camera lens folds the picture"),
+    "a lens of too few numbers": (edit_lens("fisheye", 0.1), "fisheye lens has 1 coefficients, expected 4"),
+    "an unknown lens": (edit_lens("tessar", 0.1), "Invalid enum value 'tessar'"),
     "no camera": (lambda s: edit_manifest(s, lambda m: m.pop("camera")), "camera"),
     "path out of the folder": (
         lambda s: edit_manifest(s, lambda m: m["drives"][0].update(name="../x")),

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from recorded_drives import CANVAS, track
-from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, homogeneous, homography_from_pose
 
 PLAN = """
 dt_s = 0.05
@@ -40,12 +40,20 @@ CORNERS_PX = np.array([[-0.5, -0.5], [399.5, -0.5], [399.5, 399.5], [-0.5, 399.5
 CORNER_NAMES = [f"{corner}_{axis}" for corner in ("far_left", "far_right", "near_right", "near_left") for axis in "xy"]
 
 
-def corners(state):
+def corners(state, camera=CIL_CAMERA):
     """Where the corners of the canvas are seen, px."""
-    return apply_homography(homography_from_pose(CIL_CAMERA, state, CANVAS), CORNERS_PX).ravel()
+    return camera.distorted(homogeneous(homography_from_pose(camera, state, CANVAS), CORNERS_PX)).ravel()
 
 
-def write_own(folder, drives=("clean", "right", "left"), columns=("x_m", "y_m", "yaw_rad"), plan=PLAN, every=4):
+def through(lens, plan=PLAN):
+    """A plan whose camera has a lens."""
+    stated = f'[camera.lens]\nmodel = "{lens.model}"\ncoefficients = {list(lens.coefficients)}\n\n'
+    return plan.replace("[input]", stated + "[input]")
+
+
+def write_own(
+    folder, drives=("clean", "right", "left"), columns=("x_m", "y_m", "yaw_rad"), plan=PLAN, every=4, camera=CIL_CAMERA
+):
     """Drives towards the canvas, a picture every so many steps from 30 to 8 m before it."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "drives.toml").write_text(plan + "".join(DRIVE.format(name) for name in drives))
@@ -60,7 +68,7 @@ def write_own(folder, drives=("clean", "right", "left"), columns=("x_m", "y_m", 
             known = {each: getattr(driven, each)[k] for each in STATED}
             known |= {"yaw_rate_rad_s": rate[k], "picture": f"{name}/{k}.png" if k in shown else ""}
             if "far_left_x" in columns:
-                known |= dict(zip(CORNER_NAMES, corners(driven.state(k)), strict=True))
+                known |= dict(zip(CORNER_NAMES, corners(driven.state(k), camera), strict=True))
             wanted = ("picture", *columns, "speed_mps", "steer", "throttle")
             rows.append({each: known[each] for each in dict.fromkeys(wanted)})
             if k in shown:

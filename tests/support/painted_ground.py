@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from roadproof.datatypes import Control, VehicleState
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose, sight
 from roadproof.recordings import Recording, RecordingSet, Side, Track
 from scenes import PLAIN
 
@@ -21,11 +21,10 @@ def pose(ahead_m, left_m=0.0, yaw_rad=0.0):
     return VehicleState(CANVAS.x_m + ahead_m, CANVAS.y_m + left_m, 0.0, yaw_rad, SPEED_MPS)
 
 
-def picture(state):
+def picture(state, camera=CIL_CAMERA):
     """What the camera sees, at the controller's input: colours by where on the ground, or by direction in the sky."""
-    image = VIEW.input_from_camera @ CIL_CAMERA.image_from_world(state)
-    columns, rows = np.meshgrid(np.arange(VIEW.width_px), np.arange(VIEW.height_px))
-    pixels = np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1)
+    image = VIEW.input_from_camera @ camera.image_from_world(state)
+    pixels = sight(VIEW, camera).through
     ground = np.linalg.inv(image[:, [0, 1, 3]]) @ pixels
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = ground[0] / ground[2] - CANVAS.x_m, ground[1] / ground[2] - CANVAS.y_m
@@ -40,7 +39,7 @@ def picture(state):
     return np.clip(np.round(shown), 0, 255).astype(np.uint8).T.reshape(VIEW.height_px, VIEW.width_px, 3)
 
 
-def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0):
+def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0, camera=CIL_CAMERA):
     """A straight drive past the canvas, so far to the left, looking that way; it may stand for some steps first."""
     speed = np.full(67, SPEED_MPS)
     if stands:
@@ -54,7 +53,7 @@ def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, st
     return Recording(
         name=name or str(side),
         side=side,
-        frames=np.stack([picture(state) for state in states]),
+        frames=np.stack([picture(state, camera) for state in states]),
         frame_number=shown,
         image_from_canvas=np.stack([homography_from_pose(CIL_CAMERA, state, CANVAS) for state in states]),
         speed_mps=speed[shown],
@@ -74,14 +73,14 @@ def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, st
     )
 
 
-def recorded_road(*, every=1):
+def recorded_road(*, every=1, camera=CIL_CAMERA):
     """A clean drive and one a metre and a half to each side."""
     drives = (
-        recorded(every=every),
-        recorded(Side.RIGHT, -1.5, every=every),
-        recorded(Side.LEFT, 1.5, every=every),
+        recorded(every=every, camera=camera),
+        recorded(Side.RIGHT, -1.5, every=every, camera=camera),
+        recorded(Side.LEFT, 1.5, every=every, camera=camera),
     )
-    return RecordingSet(camera=CIL_CAMERA, view=VIEW, colour=PLAIN, recordings=drives, canvas=CANVAS)
+    return RecordingSet(camera=camera, view=VIEW, colour=PLAIN, recordings=drives, canvas=CANVAS)
 
 
 MIDDLE = float(picture(pose(-15.0))[50:, :, 2].mean()) / 255

@@ -189,6 +189,8 @@ def kept_attack(
     for drive in recordings.recordings:
         for values in (drive.frames, drive.frame_number, drive.image_from_canvas):
             frames.update(np.ascontiguousarray(values).tobytes())
+    if recordings.camera.lens is not None:
+        frames.update(repr(recordings.camera.lens).encode())
     made_of = {
         "space": space.stated,
         "objective": objective.name,

@@ -159,6 +159,7 @@ class PublishedMeasure:
                 np.concatenate([drive.image_from_canvas for drive in members]),
                 exact.recordings.view,
                 colour,
+                camera=exact.recordings.camera,
                 device=self.device,
             )
             for members in (group.select(exact.recordings) for group in self.groups)

@@ -47,7 +47,7 @@ def _asphalt(recordings: RecordingSet) -> Rgb | None:
 def _flat(recordings: RecordingSet, drive: Recording, k: int) -> Float[Tensor, "p 3"] | None:
     """The bare canvas' pixels of one frame without gain and offset: what the response would have to be there."""
     try:
-        index, _, _ = canvas_pixels(drive.image_from_canvas[k : k + 1], recordings.view)
+        index, _, _ = canvas_pixels(drive.image_from_canvas[k : k + 1], recordings.view, recordings.camera)
     except GeometryError:
         return None
     place = torch.as_tensor(index)

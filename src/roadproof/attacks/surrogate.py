@@ -228,6 +228,7 @@ def _view(recordings: RecordingSet, drives: Sequence[Recording], device: torch.d
         np.concatenate([drive.image_from_canvas for drive in drives]),
         recordings.view,
         recordings.colour,
+        camera=recordings.camera,
         maps=_joined_maps([drive.maps for drive in drives]),
         device=device,
     )

@@ -1,7 +1,7 @@
 """Homographies from what two paints show of the canvas, starting from the pose.
 
     symbol   meaning                                                                      shape
-    H        image_from_canvas                                                            (F, 3, 3)
+    H        image_from_canvas; pixels are looked up through the lens (`geometry.sight`)    (F, 3, 3)
     K        camera intrinsics
     ω, τ     small rotation (rad) and translation (m) of the camera in its own axes       (F, 3) each
     D        difference of the light and the dark frame                                   (F, H, W)
@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from roadproof.coverage import FOOTPRINT_VARIANCE
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 
 SQUARES = 4
 """Along each side of the canvas in the dark frames."""
@@ -94,7 +94,7 @@ def fit_outline(
     Args:
         prior: homographies from the pose, canvas px to camera px, (F, 3, 3).
         contrast: D: light minus dark frames, mean over channels, 1 for white minus black, (F, H, W).
-        camera: pinhole camera of the frames.
+        camera: camera of the frames.
         view: crop and resize that make the controller's input from the camera picture.
         doubt: standard deviations of the pose; `PoseDoubt()` by default.
     """
@@ -120,16 +120,16 @@ def outline_errors_px(
 
 
 def predicted_contrast(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
+    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel
 ) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, "f h w"]]:
     """Share of the canvas in every pixel's footprint, and the predicted contrast p, which the squares reduce."""
     canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
-    row, column = np.divmod(np.arange(view.height_px * view.width_px), view.width_px)
-    pixel = np.stack([column, row, np.ones_like(row)], -1).astype(np.float64)
-    frames, count = len(image_from_canvas), len(pixel)
+    through, bend = sight(view, camera)
+    frames, count = len(image_from_canvas), len(bend)
     share, paint = _canvas_shares(
         np.repeat(canvas_from_input, count, 0),
-        np.tile(pixel, (frames, 1)),
+        np.tile(through.T, (frames, 1)),
+        np.tile(bend, (frames, 1, 1)),
         FOOTPRINT_VARIANCE[view.resampling],
     )
     shape = (frames, view.height_px, view.width_px)
@@ -144,7 +144,7 @@ def moved(
     Args:
         image_from_canvas: homographies whose third coordinate is the depth in metres, as a pose gives them, (F, 3, 3).
         moves: rotation ω in radians and translation τ in metres for each frame, (F, 6).
-        camera: pinhole camera of the frames.
+        camera: camera of the frames.
     """
     K = camera.intrinsics
     turned = _rotation(moves[:, :3]) @ (np.linalg.inv(K) @ image_from_canvas)
@@ -176,10 +176,12 @@ class _Outline:
     ) -> None:
         self._prior, self._camera, self._view = prior, camera, view
         self._variance = FOOTPRINT_VARIANCE[view.resampling] + blur_px**2
-        _, expected = predicted_contrast(moved(prior, moves, camera), view)
+        _, expected = predicted_contrast(moved(prior, moves, camera), view, camera)
         blurred, whole = _blurred(_over_gain(contrast, expected), blur_px)
         self._frame, row, column = np.nonzero(whole & _near_edge(blurred))
-        self._pixel = np.stack([column, row, np.ones_like(row)], -1).astype(np.float64)
+        through, bend = sight(view, camera)
+        pixel = row * view.width_px + column
+        self._pixel, self._bend = through.T[pixel], bend[pixel]
         self._measured = blurred[self._frame, row, column]
 
     def step(
@@ -203,7 +205,7 @@ class _Outline:
         wrong = np.bincount(self._frame, np.abs(self._predicted(moves) - self._measured), frames)
         canvas_from_input = np.linalg.inv(self._view.input_from_camera @ moved(self._prior, moves, self._camera))
         # The predicted share falls from 1 to 0 across the outline, so its gradients add up to the outline's length.
-        steps = [self._shares(canvas_from_input, self._pixel + np.array([*side, 0.0])) for side in _SIDES]
+        steps = [self._shares(canvas_from_input, self._pixel + self._bend @ np.array(side)) for side in _SIDES]
         gradient = np.hypot(steps[0] - steps[1], steps[2] - steps[3])
         length = np.bincount(self._frame, gradient, frames)
         scale = math.sqrt(abs(np.linalg.det(self._view.input_from_camera[:2, :2])))
@@ -218,11 +220,14 @@ class _Outline:
         self, canvas_from_input: Float[np.ndarray, "f 3 3"], pixel: Float[np.ndarray, "p 3"]
     ) -> Float[np.ndarray, " p"]:
         """Share of each footprint that lies on the canvas (`coverage`, for one rectangle that is not turned)."""
-        return _canvas_shares(canvas_from_input[self._frame], pixel, self._variance)[1]
+        return _canvas_shares(canvas_from_input[self._frame], pixel, self._bend, self._variance)[1]
 
 
 def _canvas_shares(
-    canvas_from_input: Float[np.ndarray, "p 3 3"], pixel: Float[np.ndarray, "p 3"], variance: float
+    canvas_from_input: Float[np.ndarray, "p 3 3"],
+    pixel: Float[np.ndarray, "p 3"],
+    bend: Float[np.ndarray, "p 3 2"],
+    variance: float,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Share of each footprint on the canvas, and the predicted contrast p.
 
@@ -232,7 +237,7 @@ def _canvas_shares(
     ahead = mapped[:, 2] > 1e-9
     depth = np.where(ahead, mapped[:, 2], 1.0)[:, None]
     at = mapped[:, :2] / depth
-    jacobian = (canvas_from_input[:, :2, :2] - at[:, :, None] * canvas_from_input[:, 2:, :2]) / depth[..., None]
+    jacobian = (canvas_from_input[:, :2] - at[:, :, None] * canvas_from_input[:, 2:]) @ bend / depth[..., None]
     reach = np.sqrt(variance * np.square(jacobian).sum(-1) + 1e-9)
     edges = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, SQUARES + 1)
     steps = [_tent((at - edge) / reach) for edge in edges]

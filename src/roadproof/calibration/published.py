@@ -21,12 +21,13 @@ from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError, ColourError, GeometryError
 from roadproof.geometry import (
     CANVAS_SIZE_PX,
+    CameraModel,
     CropResize,
     Homography,
-    apply_homography,
     check_image_from_canvas,
     homography_from_points,
     reprojection_errors_px,
+    sight,
 )
 from roadproof.photometry import ColourTransform, fit_affine
 from roadproof.simulators.protocol import PatternImage
@@ -84,9 +85,14 @@ def detect_points(picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "5 2
 
 
 def homographies_from_points(
-    replays: Replays, drive: Drive
+    replays: Replays, drive: Drive, camera: CameraModel
 ) -> tuple[dict[int, Homography], dict[int, str], Float[np.ndarray, " n"]]:
     """Homographies of the frames that allow one, reasons for the others, and residuals in camera px.
+
+    Args:
+        replays: replays of the recorded drives.
+        drive: the drive to replay, one of the drives.
+        camera: camera on the car, through whose lens the points are seen.
 
     Raises:
         CalibrationError: a replay goes astray.
@@ -109,17 +115,20 @@ def homographies_from_points(
     dropped: dict[int, str] = {}
     residuals: list[Float[np.ndarray, " n"]] = []
     for k, image in enumerate(seen):
-        there = np.isfinite(image).all(1)
+        straight = np.full_like(image, np.nan)
+        seen_there = np.isfinite(image).all(1)
+        straight[seen_there] = camera.straightened(image[seen_there])
+        there = np.isfinite(straight).all(1)
         if there.sum() < _LEAST_POINTS:
             dropped[k] = f"{int(there.sum())} of {POINTS} points found, {_LEAST_POINTS} needed"
             continue
         try:
-            homography = homography_from_points(points[there], image[there], outlier_px=_OUTLIER_PX)
+            homography = homography_from_points(points[there], straight[there], outlier_px=_OUTLIER_PX)
             check_image_from_canvas(homography)
         except GeometryError as error:
             dropped[k] = str(error)
             continue
-        errors = reprojection_errors_px(homography, points[there], image[there])
+        errors = reprojection_errors_px(homography, points[there], straight[there])
         found[k] = homography
         residuals.append(errors[errors < _OUTLIER_PX])
     return found, dropped, np.concatenate([np.empty(0), *residuals])
@@ -133,7 +142,8 @@ def colours_from_paints(
     Raises:
         CalibrationError: the canvas is not seen, or the colours do not determine the transform.
     """
-    inner = {k: _inner(homography, drives.settings.view) for k, homography in homographies.items()}
+    settings = drives.settings
+    inner = {k: _inner(homography, settings.view, settings.camera) for k, homography in homographies.items()}
     inner = {k: mask for k, mask in inner.items() if mask.any()}
     if not inner:
         raise CalibrationError("no frame of the clean drive shows the inside of the canvas; record nearer to it")
@@ -149,13 +159,9 @@ def colours_from_paints(
     return ColourTransform(response), residual
 
 
-def _inner(homography: Homography, view: CropResize) -> np.ndarray:
+def _inner(homography: Homography, view: CropResize, camera: CameraModel) -> np.ndarray:
     """The pixels of the controller's input that lie well inside the canvas."""
-    columns, rows = np.meshgrid(np.arange(view.width_px, dtype=np.float64), np.arange(view.height_px))
-    inverse = np.linalg.inv(view.input_from_camera @ homography)
-    pixels = np.stack([columns, rows], -1).reshape(-1, 2)
-    at = apply_homography(inverse, pixels)
-    ahead = pixels @ inverse[2, :2] + inverse[2, 2] > 0
+    at, ahead = sight(view, camera).on(np.linalg.inv(view.input_from_camera @ homography))
     with np.errstate(invalid="ignore"):
         inside = ((at >= _INNER_PX[0]) & (at <= _INNER_PX[1])).all(1) & ahead
     return inside.reshape(view.height_px, view.width_px)

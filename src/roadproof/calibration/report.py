@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, apply_homography
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, homogeneous
 from roadproof.io.records import RecordFile, Saved
 
 _GRID = 9
@@ -75,12 +75,18 @@ CalibrationReport.FILE = RecordFile(
 def stated_errors_px(
     image_from_canvas: Float[np.ndarray, "f 3 3"], stated: Float[np.ndarray, "g 3 3"], camera: CameraModel
 ) -> Float[np.ndarray, " n"]:
-    """Distances between two views of a 9×9 grid of canvas points, corners included, where they are in the picture."""
+    """Distances in the picture between two views of a 9×9 grid of canvas points, corners included, where it shows them.
+
+    Args:
+        image_from_canvas: fitted homographies, canvas px to px of the camera without its lens, (F, 3, 3).
+        stated: homographies that the simulator states, (F, 3, 3).
+        camera: camera on the car.
+    """
     side = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, _GRID)
     grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     points = np.broadcast_to(grid, (len(stated), *grid.shape))
-    there = apply_homography(stated, points)
-    depth = (points @ np.swapaxes(stated[:, 2:, :2], 1, 2))[..., 0] + stated[:, 2, 2, None]
+    mapped = homogeneous(stated, points)
+    there, depth = camera.distorted(mapped), mapped[..., 2]
     inside = (there > -0.5) & (there < np.array([camera.width_px, camera.height_px]) - 0.5)
     seen = inside.all(-1) & (depth > 0)
-    return np.linalg.norm(apply_homography(image_from_canvas, points) - there, axis=-1)[seen]
+    return np.linalg.norm(camera.distorted(homogeneous(image_from_canvas, points)) - there, axis=-1)[seen]

@@ -76,7 +76,7 @@ def look_at_paints(
     else:
         found, errors = prior, outline_errors_px(prior, contrast, camera, view)
     # What the dark frame would be without its squares: they took the known share 1 − p / s of the difference.
-    share, expected = predicted_contrast(found, view)
+    share, expected = predicted_contrast(found, view, camera)
     whole = np.where(share > 0.01, share / np.maximum(expected, 1e-6), 1.0).clip(1.0, 1.0 / (1.0 - GREY))
     black = np.clip(np.round(light - difference * whole[..., None]), 0, 255).astype(np.uint8)
     try:

@@ -24,7 +24,8 @@ def import_(
     shown = out / "preview.png"
     write_atomically(shown, preview(recordings).save)
     camera, canvas = recordings.camera, recordings.canvas
-    say(f"camera {camera.up_m:.2f} m above the ground, pitch {camera.pitch_deg:.1f}°, {camera.fov_deg:.1f}° wide")
+    lens = "" if camera.lens is None else f", behind a {camera.lens.model} lens"
+    say(f"camera {camera.up_m:.2f} m above the ground, pitch {camera.pitch_deg:.1f}°, {camera.fov_deg:.1f}° wide{lens}")
     if canvas is not None:
         say(f"canvas {canvas.width_m:.2f} m across the road, {canvas.length_m:.2f} m along it")
     for drive in recordings.recordings:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from roadproof.compositing.view import CanvasView
 from roadproof.coverage import Shape, coverage, polygon_vertices
-from roadproof.geometry import CANVAS_SIZE_PX, CropResize
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.patterns import Pattern, visibilities
 from roadproof.photometry import ColourTransform
 
@@ -124,15 +124,18 @@ def view_canvas_published(
     view: CropResize,
     colour: ColourTransform | None,
     *,
+    camera: CameraModel | None = None,
     device: torch.device | str = "cpu",
 ) -> BinaryView:
     """Prepare frames for compositing as the released code does."""
-    lookup = torch.as_tensor(nearest_canvas_pixels(image_from_canvas, view), device=device).flatten()
+    lookup = torch.as_tensor(nearest_canvas_pixels(image_from_canvas, view, camera), device=device).flatten()
     index = (lookup < _OFF_CANVAS).nonzero()[:, 0]
     return BinaryView(torch.tensor(frames, device=device).float() / 255, index, lookup[index], colour)
 
 
-def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize) -> Int[np.ndarray, "f h w"]:
+def nearest_canvas_pixels(
+    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel | None = None
+) -> Int[np.ndarray, "f h w"]:
     """The canvas pixel nearest to where every input pixel looks, row-major; CANVAS_SIZE_PX² where it is off the canvas.
 
     Convention:
@@ -143,6 +146,8 @@ def nearest_canvas_pixels(image_from_canvas: Float[np.ndarray, "f 3 3"], view: C
     sy = (view.bottom_px - view.top_px) / view.height_px
     columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
     rays = np.stack([view.left_px + columns * sx, view.top_px + rows * sy, np.ones_like(rows, float)]).reshape(3, -1)
+    if camera is not None:
+        rays = camera.undistorted(rays[:2].T)[0].T
     # float32 as in the released code: the rounding below would differ in a few pixels otherwise.
     mapped = np.linalg.inv(image_from_canvas) @ rays.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -12,7 +12,7 @@ from torch import Tensor
 from roadproof.compositing.runs import Runs
 from roadproof.coverage import Footprints, canvas_share
 from roadproof.errors import GeometryError
-from roadproof.geometry import CANVAS_SIZE_PX, CropResize
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 
 
@@ -81,6 +81,7 @@ def view_canvas(
     view: CropResize,
     colour: ColourTransform,
     *,
+    camera: CameraModel | None = None,
     maps: PixelMaps | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
@@ -92,6 +93,7 @@ def view_canvas(
         image_from_canvas: one homography per frame, canvas px to camera px.
         view: crop and resize that made the input from the camera picture.
         colour: colour transform from painted to seen.
+        camera: camera of the frames, of which only the lens counts; None for a pinhole.
         maps: gain, offset and visibility of the canvas in every pixel, for the response of `colour`; they replace its
             smooth shading. None for that shading.
         device: torch device on which frames will be composited.
@@ -100,7 +102,7 @@ def view_canvas(
     Raises:
         GeometryError: no frame shows the canvas.
     """
-    index, centre, jacobian = canvas_pixels(image_from_canvas, view)
+    index, centre, jacobian = canvas_pixels(image_from_canvas, view, camera)
     footprints = Footprints.of(centre, jacobian, view.resampling, device=device, dtype=dtype)
     levels = torch.tensor(frames, device=device).to(dtype) / 255
     place = torch.as_tensor(index, device=device)
@@ -127,13 +129,14 @@ def view_canvas(
 
 
 def canvas_pixels(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize
+    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel | None = None
 ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p 2"], Float[np.ndarray, "p 2 2"]]:
     """Pixels of the controller's input whose footprint touches the canvas, in front of the camera.
 
     Args:
         image_from_canvas: one homography per frame, canvas px to camera px.
         view: crop and resize that make the input from the camera picture.
+        camera: camera of the frames, of which only the lens counts; None for a pinhole.
 
     Returns:
         Index into the flattened (F, H, W) pixels (P,), canvas px of their centres (P, 2), and ∂canvas/∂pixel (P, 2, 2).
@@ -142,9 +145,8 @@ def canvas_pixels(
         GeometryError: no frame shows the canvas.
     """
     canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
-    columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
-    pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)])
-    mapped = np.swapaxes(canvas_from_input @ pixels, 1, 2)
+    through, bend = sight(view, camera)
+    mapped = np.swapaxes(canvas_from_input @ through, 1, 2)
     # The inverse keeps the sign: its third coordinate, too, is positive in front of the camera.
     with np.errstate(divide="ignore", invalid="ignore"):
         centre = mapped[..., :2] / mapped[..., 2:]
@@ -155,7 +157,7 @@ def canvas_pixels(
         raise GeometryError("no frame shows the canvas; check the homographies, or record nearer to it")
     frame, pixel = np.nonzero(touches)
     inverse, seen = canvas_from_input[frame], centre[frame, pixel]
-    slope = inverse[:, :2, :2] - seen[:, :, None] * inverse[:, 2:, :2]
+    slope = (inverse[:, :2] - seen[:, :, None] * inverse[:, 2:]) @ bend[pixel]
     jacobian = slope / mapped[frame, pixel, 2][:, None, None]
     return frame * (view.height_px * view.width_px) + pixel, seen, jacobian
 

@@ -246,7 +246,10 @@ _SETTINGS = RecordFile(
     name="roadproof-record",
     error=RecordingError,
     remedy="record it again",
-    forms={"trajectories": Form(_Trajectories, _stated, _meant)},
+    forms={
+        "trajectories": Form(_Trajectories, _stated, _meant),
+        "camera": Form(CameraModel, lambda camera: camera.stated, lambda camera: camera),
+    },
 )
 _DRIVE = RecordFile(
     kind=Drive,

@@ -297,7 +297,7 @@ def in_view(
         return np.zeros(0, bool)
     image_from_canvas = np.stack([homography_from_pose(camera, state, canvas) for state in states])
     try:
-        index, centre, _ = canvas_pixels(image_from_canvas, view)
+        index, centre, _ = canvas_pixels(image_from_canvas, view, camera)
     except GeometryError:
         return np.zeros(len(states), bool)
     inside = ((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(1)

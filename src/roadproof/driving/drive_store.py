@@ -178,7 +178,7 @@ def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[
     parts: dict[str, object] = {
         "version": roadproof.__version__,
         "simulator": f"{type(simulator).__module__}.{type(simulator).__qualname__}",
-        "camera": asdict(simulator.camera),
+        "camera": simulator.camera.stated,
         "input": asdict(view),
         "dt_s": simulator.dt_s,
         "driver": [driver_in_words(driver), answers],

@@ -220,7 +220,8 @@ def _drive(recordings: RecordingSet, name: str) -> Recording:
 def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) -> Bool[np.ndarray, "f h w"]:
     """Pixels of which the pattern covers at least half: a white pattern on a black road says so."""
     plain = ColourTransform(AffineResponse.identity())
-    dark = view_canvas(np.zeros_like(recorded.frames), recorded.image_from_canvas, recordings.view, plain)
+    black, camera = np.zeros_like(recorded.frames), recordings.camera
+    dark = view_canvas(black, recorded.image_from_canvas, recordings.view, plain, camera=camera)
     white = Pattern(pattern.shapes, pattern.boxes, torch.ones_like(pattern.colours))
     return composite(white, dark)[:, 0].numpy() >= 0.5
 

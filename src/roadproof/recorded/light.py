@@ -9,7 +9,7 @@ from torch import Tensor
 
 from roadproof.compositing.view import camera_points, canvas_pixels
 from roadproof.coverage import Footprints, canvas_share
-from roadproof.geometry import CropResize
+from roadproof.geometry import CameraModel, CropResize
 from roadproof.recordings import RecordingSet
 
 _SEEN = 0.02
@@ -69,7 +69,7 @@ def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"
     offset = torch.cat([each.offset for each in maps if each is not None])
     visible = torch.cat([each.visible for each in maps if each is not None])
     homographies = np.concatenate([drive.image_from_canvas for drive in recordings.recordings])
-    expected = _expected_share(homographies, recordings.view)
+    expected = _expected_share(homographies, recordings.view, recordings.camera)
     values = torch.cat([gain, offset], -1).float()
     known = (visible > _SEEN)[..., None]
     mean = (values * known).sum((1, 2)) / known.sum((1, 2)).clamp_min(1)
@@ -78,9 +78,11 @@ def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"
     return torch.cat([values, free[..., None]], -1).flatten(0, 2).to(device)
 
 
-def _expected_share(homographies: Float[np.ndarray, "f 3 3"], view: CropResize) -> Float[Tensor, "f h w"]:
+def _expected_share(
+    homographies: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel
+) -> Float[Tensor, "f h w"]:
     """Share of every pixel that would lie on the canvas if nothing stood in its way."""
-    index, centre, jacobian = canvas_pixels(homographies, view)
+    index, centre, jacobian = canvas_pixels(homographies, view, camera)
     footprints = Footprints.of(centre, jacobian, view.resampling)
     share = torch.zeros(len(homographies) * view.height_px * view.width_px)
     share[torch.as_tensor(index)] = canvas_share(footprints)

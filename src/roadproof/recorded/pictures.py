@@ -3,12 +3,14 @@
 The ground is a plane, so that between two poses it moves by a homography; what stands far off, above the horizon, by
 that of a plane at infinity. They meet at the horizon, which is one row of the picture of a level camera. What the
 nearest frame does not show, where the car has turned, comes from the nearest one that looked the same way. Gain, offset
-and visibility of the paint move with the ground; the pattern is composited for the wanted pose itself, exactly.
+and visibility of the paint move with the ground; the pattern is composited for the wanted pose itself, exactly. Behind
+a lens pixels are straightened first (`geometry.sight`), and what W gives is bent again; the horizon is a curve then.
 
     symbol   meaning                                                              shape
     G        controller's input px from ground (x, y, 1), m from the canvas       (3, 3)
     T        ground from the car's own axes                                       (3, 3)
     W        source px from target px: G G'⁻¹ below the horizon, G' = G T T'⁻¹     (R, 3, 3)
+    D        ∂(px without the lens, homogeneous)/∂(px), where there is a lens      (N, 3, 2)
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from roadproof.compositing.runs import Runs
 from roadproof.compositing.view import OwnViews, dilated
 from roadproof.coverage import Footprints
 from roadproof.errors import RecordingError
-from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
 from roadproof.recorded.light import Light
 from roadproof.recordings import RecordingSet
 
@@ -133,19 +135,12 @@ class FrameBank:
         """Set what depends on camera, crop and canvas alone."""
         camera, view = self.camera, self.view
         pitch = math.radians(camera.pitch_deg)
-        horizon = camera.focal_px * math.tan(pitch) + (camera.height_px - 1) / 2
-        row = float((view.input_from_camera @ np.array([0.0, horizon, 1.0]))[1])
-        self.horizon_row = min(max(math.ceil(row + 0.5), 0), view.height_px)
         # Seen right, up and ahead of the car, two cameras differ by a turn about the vertical alone.
         s, c = math.sin(pitch), math.cos(pitch)
         level_from_camera = np.array([[1.0, 0.0, 0.0], [0.0, -c, s], [0.0, s, c]])
-        lens = view.input_from_camera @ camera.intrinsics
-        self._level_from_input = self._exact(level_from_camera @ np.linalg.inv(lens))
-        self._input_from_level = self._exact(lens @ level_from_camera.T)
-        columns, rows = np.meshgrid(np.arange(view.width_px), np.arange(view.height_px))
-        pixels = self._exact(np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1)).float()
-        first = self.horizon_row * view.width_px
-        self._sky, self._ground = pixels[:, :first], pixels[:, first:]
+        input_from_rays = view.input_from_camera @ camera.intrinsics
+        self._level_from_input = self._exact(level_from_camera @ np.linalg.inv(input_from_rays))
+        self._input_from_level = self._exact(input_from_rays @ level_from_camera.T)
         self._halves_from_px = self._exact(
             np.array(
                 [
@@ -155,11 +150,31 @@ class FrameBank:
                 ]
             )
         )
+        self._set_horizon()
+        through, bend = sight(view, camera)
+        self._pixels, self._bend = self._exact(through).float(), self._exact(bend).float()
+        first = self.horizon_row * view.width_px
+        self._sky, self._ground = self._pixels[:, :first], self._pixels[:, first:]
+        self._rays_from_input = self._exact(np.linalg.inv(input_from_rays))
+        self._halves_from_rays = self._halves_from_px @ self._exact(input_from_rays)
         ground_from_canvas = _ground_from_canvas(self.canvas)
         low, high = -0.5, CANVAS_SIZE_PX - 0.5
         corners = np.array([[low, high, high, low], [low, low, high, high], [1.0, 1.0, 1.0, 1.0]])
         self._corners = self._exact(ground_from_canvas @ corners)
         self._canvas_from_ground = self._exact(np.linalg.inv(ground_from_canvas))
+
+    def _set_horizon(self) -> None:
+        """Set which pixels look above the horizon: whole rows of them, or those of a curve behind a lens."""
+        camera, view = self.camera, self.view
+        if camera.lens is None:
+            horizon = camera.focal_px * math.tan(math.radians(camera.pitch_deg)) + (camera.height_px - 1) / 2
+            row = float((view.input_from_camera @ np.array([0.0, horizon, 1.0]))[1])
+            self.horizon_row = min(max(math.ceil(row + 0.5), 0), view.height_px)
+            return
+        through, bend = sight(view, camera)
+        upper_edge = self._exact(through - bend[:, :, 1].T / 2)
+        self._is_sky = (self._level_from_input @ upper_edge)[1] > 0
+        self.horizon_row = int(self._is_sky.view(-1, view.width_px).all(1).cumprod(0).sum())
 
     def _recorded_views(self, recordings: RecordingSet) -> Float[Tensor, "n 3 3"]:
         """G of every recorded frame, from its own homography, so that a camera that leans is where it was."""
@@ -210,9 +225,20 @@ class FrameBank:
         c, s, o = torch.cos(gap.turned_rad), torch.sin(gap.turned_rad), torch.zeros_like(gap.turned_rad)
         turn = torch.stack([c, o, -s, o, o + 1, o, s, o, c], -1).view(-1, 3, 3)
         above = self._input_from_level @ turn @ self._level_from_input
-        above, below = ((self._halves_from_px @ part).float() for part in (above, below))
-        mapped = torch.cat([above @ self._sky, below @ self._ground], 2)
-        return wanted, ground_from_input, mapped[:, :2] / mapped[:, 2:]
+        return wanted, ground_from_input, self._seen_at(above, below)
+
+    def _seen_at(self, above: Float[Tensor, "r 3 3"], below: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r 2 n"]:
+        """The places in their recorded frames that pixels come from, by W above and below the horizon."""
+        lens = self.camera.lens
+        if lens is None:
+            above, below = ((self._halves_from_px @ part).float() for part in (above, below))
+            mapped = torch.cat([above @ self._sky, below @ self._ground], 2)
+            return mapped[:, :2] / mapped[:, 2:]
+        above, below = ((self._rays_from_input @ part).float() for part in (above, below))
+        rays = torch.where(self._is_sky, above @ self._pixels, below @ self._pixels)
+        scale, middle = self._halves_from_rays.diagonal()[:2].float(), self._halves_from_rays[:2, 2].float()
+        shown = torch.stack(lens.distort(rays[:, 0], rays[:, 1], rays[:, 2], torch), 1)
+        return shown * scale[:, None] + middle[:, None]
 
     def _sampled(self, gap: Gap, source: Float[Tensor, "r 2 n"]) -> tuple[Float[Tensor, "r 3 h w"], Tensor]:
         """Frames sampled at the source places, and how far each pixel lies beyond its frame, in halves of its size."""
@@ -261,10 +287,12 @@ class FrameBank:
         some = (counts > 0)[:, None]
         at = torch.where(some[:, None], _picked(seen, own), 1.0)
         scale = torch.where(some, depth.gather(1, own), 1.0)
-        slope = canvas_from_input[:, :2, :2, None] - at[:, :, None] * canvas_from_input[:, 2:, :2, None]
-        jacobian = (slope / scale[:, None, None]).permute(0, 3, 1, 2)
-        footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
         flat = own + first
+        straight = self.camera.lens is None
+        by = canvas_from_input[:, :, :2, None] if straight else canvas_from_input[..., None]
+        jacobian = ((by[:, :2] - at[:, :, None] * by[:, 2:]) / scale[:, None, None]).permute(0, 3, 1, 2)
+        jacobian = jacobian if straight else jacobian @ self._bend[flat]
+        footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
         gain, offset, share = self._light.at(flat, _picked(source, flat).mT, gap.frame, footprints)
         share = torch.where(some, share, 0.0)[..., None]
         clean = _picked(frames.flatten(2), flat).mT
@@ -282,6 +310,8 @@ class FrameBank:
 
     def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
         """The range of rows in which every picture has its canvas; None if no picture has one."""
+        if self.camera.lens is not None:  # Its edges are curves, which corners do not bound.
+            return slice(self.horizon_row, self.view.height_px) if self.horizon_row < self.view.height_px else None
         seen = input_from_ground @ self._corners
         ahead, row = seen[:, 2] > 0, seen[:, 1] / seen[:, 2]
         if not bool(ahead.any()):

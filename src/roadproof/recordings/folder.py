@@ -36,7 +36,8 @@ from roadproof.recordings.track import Track
 
 _UNITS = {
     "frames": "RGB uint8, the controller's input, unpainted",
-    "image_from_canvas": "homography, canvas px (x, y, 1) to camera px, pixel centres at integers, third > 0",
+    "image_from_canvas": "homography, canvas px (x, y, 1) to camera px, pixel centres at integers, third > 0; where "
+    "the camera has a lens, to those of a pinhole of its focal length",
     "speed_mps": "m/s",
     "command": "2 follow, 3 left, 4 right, 5 straight",
     "steer": "in [-1, 1], positive = right: what the recorded controller answered to the frame",
@@ -97,6 +98,7 @@ _MANIFEST = RecordFile(
     error=RecordingError,
     remedy=_AGAIN,
     forms={
+        "camera": Form(CameraModel, lambda camera: camera.stated, lambda camera: camera),
         "colour": Form(dict[str, Any], ColourTransform.to_dict, ColourTransform.from_dict),
         "canvas": Form(dict[str, float] | None, lambda canvas: canvas, _canvas),
     },

@@ -16,10 +16,11 @@ from roadproof.datatypes import Command, Control, Observation, VehicleState, Wea
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import (
     CANVAS_SIZE_PX,
+    CameraModel,
     Homography,
     apply_homography,
+    homogeneous,
     homography_from_pose,
-    homography_jacobian,
 )
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -227,13 +228,13 @@ class _Kit:
     def paint(self) -> str:
         """Painted squares are seen where the homography says."""
         bare, full = (_picture(self._at_canvas(pattern)) for pattern in (None, _opaque(255, 255, 255)))
-        homography = self._simulator.image_from_canvas()
+        homography, camera = self._simulator.image_from_canvas(), self._simulator.camera
         errors: list[float] = []
         for left, top in SQUARES:
             pattern = np.zeros((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), np.uint8)
             pattern[top : top + SQUARE_PX, left : left + SQUARE_PX] = 255
             found = _middle(_picture(self._at_canvas(pattern)), bare, full)
-            errors.append(float(np.linalg.norm(found - _expected_middle(homography, left, top))))
+            errors.append(float(np.linalg.norm(found - _expected_middle(homography, camera, left, top))))
         worst = max(errors)
         _expect(
             worst < PLACE_TOLERANCE_PX, f"squares are seen up to {worst:.2f} px from where the homography puts them"
@@ -313,10 +314,13 @@ def _middle(
     return np.array([(share * x).sum(), (share * y).sum()]) / share.sum()
 
 
-def _expected_middle(image_from_canvas: Homography, left: int, top: int) -> Float[np.ndarray, "2"]:
+def _expected_middle(image_from_canvas: Homography, camera: CameraModel, left: int, top: int) -> Float[np.ndarray, "2"]:
     """Centre of gravity in the picture of a square on the canvas."""
     inside = (np.arange(40) + 0.5) / 40 * SQUARE_PX - 0.5
     x, y = np.meshgrid(left + inside, top + inside)
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
-    area = np.abs(np.linalg.det(homography_jacobian(image_from_canvas, points)))[:, None]
-    return (apply_homography(image_from_canvas, points) * area).sum(axis=0) / area.sum()
+    seen, right, below = (
+        camera.distorted(homogeneous(image_from_canvas, points + moved)) for moved in ((0, 0), (1e-4, 0), (0, 1e-4))
+    )
+    area = np.abs(np.linalg.det(np.stack([right - seen, below - seen], axis=-1)))[:, None]
+    return (seen * area).sum(axis=0) / area.sum()

@@ -120,7 +120,7 @@ class Simulator(Protocol):
         ...
 
     def image_from_canvas(self) -> Homography:
-        """The exact homography of the current state: canvas px to camera px."""
+        """The exact homography of the current state: canvas px to px of the camera without its lens."""
         ...
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.datatypes import VehicleState
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, apply_homography
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, sight
 
 FARTHEST_M = 40.0
 MOST = 5
@@ -91,8 +91,6 @@ def _ground_seen(camera: CameraModel, view: CropResize) -> tuple[Tensor, Float[T
     """Which pixels of the input see the ground, as flat indices, and where."""
     camera_from_ground = camera.image_from_world(VehicleState(0.0, 0.0, 0.0, 0.0, 0.0))[:, [0, 1, 3]]
     ground_from_input = np.linalg.inv(view.input_from_camera @ camera_from_ground)
-    row, column = np.mgrid[: view.height_px, : view.width_px]
-    places = np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64)
-    ground = apply_homography(ground_from_input, places)
+    ground, _ = sight(view, camera).on(ground_from_input)
     seen = np.isfinite(ground).all(axis=1) & (ground[:, 0] > 0) & (ground[:, 0] < FARTHEST_M)
     return torch.from_numpy(np.flatnonzero(seen)), torch.from_numpy(ground[seen]).float()

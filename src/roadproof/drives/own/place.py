@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -117,13 +118,15 @@ def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint]) -> CameraM
         return replace(camera, up_m=up_m, pitch_deg=pitch_deg, fov_deg=fov_deg)
 
     def missed(numbers: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " m"]:
-        x, y, depth = placed_as(numbers).image_from_world(_ORIGIN) @ place.T
-        depth = np.maximum(depth, 1e-3)
-        return np.concatenate([x / depth - seen[:, 0], y / depth - seen[:, 1]])
+        tried = placed_as(numbers)
+        shown = place @ tried.image_from_world(_ORIGIN).T
+        shown[:, 2] = np.maximum(shown[:, 2], 1e-3)
+        return (tried.distorted(shown) - seen).T.ravel()
 
+    widest_deg = math.degrees(2 * math.atan2(camera.width_px / 2, camera.least_focal_px))
     begin = np.array([camera.up_m, camera.pitch_deg, camera.fov_deg])
     found = cast("Any", optimize).least_squares(
-        missed, begin, bounds=([0.1, -80.0, 5.0], [10.0, 45.0, 170.0]), x_scale=(0.1, 1.0, 1.0)
+        missed, begin, bounds=([0.1, -80.0, 5.0], [10.0, 45.0, min(170.0, widest_deg)]), x_scale=(0.1, 1.0, 1.0)
     )
     off_px = float(np.hypot(*missed(found.x).reshape(2, -1)).max())
     if off_px > _MOST_MISSED_PX:

@@ -22,7 +22,13 @@ from roadproof.drives.own.table import CORNERS, Table, read_table
 from roadproof.drives.record import in_view
 from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
-from roadproof.geometry import CANVAS_SIZE_PX, homography_from_points, homography_from_pose
+from roadproof.geometry import (
+    CANVAS_SIZE_PX,
+    apply_homography,
+    homogeneous,
+    homography_from_points,
+    homography_from_pose,
+)
 from roadproof.io.files import AnyPath, as_path, inside
 from roadproof.io.pictures import read_picture
 from roadproof.photometry import AffineResponse, ColourTransform
@@ -92,7 +98,7 @@ def _from_corners(folder: Path, own: OwnDrives, tables: Sequence[Table], given: 
         kept = table.pictured[evenly(len(table.pictured), WINDOW.frames)]
         corners = np.stack([table.numbers[name][kept] for name in CORNERS], 1).reshape(-1, 4, 2)
         try:
-            seen = np.stack([homography_from_points(_CORNERS_PX, four) for four in corners])
+            seen = np.stack([homography_from_points(_CORNERS_PX, own.camera.straightened(four)) for four in corners])
         except GeometryError as error:
             raise RecordingError(f"{table.drive.table}, corners of the canvas: {error}") from None
         drives.append(_recording(folder, own, table, kept, seen, table.needed("speed_mps")[kept]))
@@ -168,9 +174,9 @@ def _outlined(recordings: RecordingSet, drive: Recording, k: int) -> UInt8[np.nd
     zoom = max(1, round(400 / view.width_px))
     picture = Image.fromarray(drive.frames[k]).resize((zoom * view.width_px, zoom * view.height_px))
     edge = np.linspace(_CORNERS_PX, np.roll(_CORNERS_PX, -1, 0), 300).swapaxes(0, 1).reshape(-1, 2)
-    seen = np.column_stack([edge, np.ones(len(edge))]) @ (view.input_from_camera @ drive.image_from_canvas[k]).T
-    seen = seen[seen[:, 2] > 0]
+    seen = homogeneous(drive.image_from_canvas[k], edge)
+    seen = apply_homography(view.input_from_camera, recordings.camera.distorted(seen[seen[:, 2] > 0]))
     pen = ImageDraw.Draw(picture)
-    for x, y in ((seen[:, :2] / seen[:, 2:] + 0.5) * zoom).clip(-10, 10_000).tolist():
+    for x, y in ((seen + 0.5) * zoom).clip(-10, 10_000).tolist():
         pen.rectangle((x - 1, y - 1, x + 1, y + 1), fill=(255, 64, 0))
     return np.asarray(picture)

@@ -77,8 +77,13 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         """Make a simulator; nothing is connected before it is entered.
 
         Raises:
-            SimulatorError: the crop leaves the camera picture.
+            SimulatorError: the crop leaves the camera picture, or the camera has a lens.
         """
+        if camera.lens is not None:
+            raise SimulatorError(
+                f"CARLA renders through a pinhole and knows no {camera.lens.model} lens; give CarlaSimulator a camera "
+                "without one"
+            )
         super().__init__(camera, input, dt_s)
         self._host, self._port, self._patience_s, self._loading_s = host, port, patience_s, loading_s
         self._choice: PaintChoice = paint

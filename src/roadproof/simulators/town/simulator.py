@@ -47,7 +47,8 @@ class TownSimulator(RouteSimulator[_Drive]):
         dt_s: simulated seconds per step, a multiple of 0.01.
 
     Raises:
-        SimulatorError: `dt_s` is not a positive multiple of 0.01, or the crop leaves the camera picture.
+        SimulatorError: `dt_s` is not a positive multiple of 0.01, the crop leaves the camera picture, or the camera has
+            a lens.
     """
 
     def __init__(
@@ -60,6 +61,8 @@ class TownSimulator(RouteSimulator[_Drive]):
         substeps = dt_s / SUBSTEP_S
         if not (math.isfinite(dt_s) and round(substeps) >= 1 and abs(substeps - round(substeps)) < 1e-6):
             raise SimulatorError(f"dt_s is {dt_s}, expected a positive multiple of {SUBSTEP_S}")
+        if camera.lens is not None:
+            raise SimulatorError("the town is drawn as a pinhole sees it; give TownSimulator a camera without a lens")
         super().__init__(camera, replace(input, resampling="area"), dt_s)
         self._town: _Town | None = None
 
