@@ -98,7 +98,6 @@ def test_the_report_says_that_nothing_was_driven(predicted):
         "Not known: recordings have no map.",
         "Nothing here was driven for real.",
         "over the paint, predicted",
-        "--simulator recorded:RECORDINGS",
     ):
         assert words in page, words
     for words in ("penalty points a drive", "No infraction.", "happened in simulation", "driven over the paint"):
