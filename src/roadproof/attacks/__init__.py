@@ -21,6 +21,7 @@ from roadproof.attacks.methods import method_of as method_of
 from roadproof.attacks.objective import OBJECTIVES as OBJECTIVES
 from roadproof.attacks.objective import Objective as Objective
 from roadproof.attacks.objective import PathDeviation as PathDeviation
+from roadproof.attacks.objective import SpeedChange as SpeedChange
 from roadproof.attacks.objective import SteeringShift as SteeringShift
 from roadproof.attacks.result import AttackResult as AttackResult
 from roadproof.attacks.result import Candidate as Candidate

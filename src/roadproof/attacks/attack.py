@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.checks import Check, check_bounds, check_gradients, check_groups, check_search, check_world
-from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
@@ -23,6 +23,7 @@ from roadproof.attacks.methods import GradOpt, stored
 from roadproof.attacks.objective import Grouped, Measure, Objective, RecordedMeasure, SteeringShift, variation_of
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
+from roadproof.attacks.speed import SpeedMeasure
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.io.identity import require_same
@@ -55,12 +56,12 @@ def attack(
             where every pattern takes a drive, and the method has to do without gradients.
         controller: the controller that is attacked; it computes on `device`.
         space: the search space: the patterns that are allowed.
-        objective: what is made large: `SteeringShift()` by default, as published, or `PathDeviation()`, which drives
-            in the recordings and needs their tracks; or one of your own.
+        objective: what is made large: `SteeringShift()` by default, as published; `PathDeviation()` or
+            `SpeedChange()`, which drive in the recordings and need their tracks; or one of your own.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
         groups: groups of recorded drives, each attacked together. By default, for a method with gradients and drives
-            perturbed to both sides, the paper's two sides, of which the stronger is kept; otherwise one group of all
-            drives, to whichever side they give way.
+            perturbed to both sides, the paper's two sides, of which the stronger is kept, or for a speed change slower
+            and faster; otherwise one group of all drives, to whichever side they give way.
         seed: seed of everything random, 0 by default.
         device: torch device on which the search computes.
         random_patterns: number of random patterns per group for the self-check on recordings; 0 leaves that check out.
@@ -88,7 +89,7 @@ def attack(
         groups = measure.groups
     else:
         site = site_of(recordings)
-        groups = groups or method.groups(recordings)
+        groups = groups or method.groups(recordings, objective)
         measure = method.measure(objective, recordings, controller, groups, device=device)
         start = time.perf_counter()
     space = space.on(site)
@@ -99,6 +100,7 @@ def attack(
         seed=seed,
         starts=[_points(space, starts, group) for group in groups],
         checkpoint=checkpoint,
+        aim=objective.name,
         on_step=on_step,
     )
     frames = measure.frames_evaluated
@@ -121,6 +123,8 @@ def attack(
         surrogate_shift=first.surrogate_shift,
         predicted_m=first.predicted_m,
         predicted_range_m=first.predicted_range_m,
+        predicted_mps=first.predicted_mps,
+        predicted_range_mps=first.predicted_range_mps,
         driven=first.driven,
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
         candidates=candidates,
@@ -149,7 +153,7 @@ def _checks(
     checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
     if method.by_gradient:
         checks = (check_gradients(measure, space, search), *checks)
-    return checks + check_world(measure, found.pattern) if isinstance(measure, DeviationMeasure) else checks
+    return checks + check_world(measure, found.pattern) if isinstance(measure, ClosedLoopMeasure) else checks
 
 
 def kept_attack(
@@ -238,6 +242,8 @@ def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Se
         shifts, predicted = measure.readings(space, search.best_unit)
     restarts = search.best.shape[1]
     rank = search.best.cpu() if predicted is None else predicted.amin(-1)
+    if predicted is not None and isinstance(measure, SpeedMeasure):
+        rank = measure.rank(predicted)
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
     candidates: list[Candidate] = []
     for group, restart in (divmod(index, restarts) for index in order):
@@ -248,7 +254,10 @@ def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Se
         if shifts is None or predicted is None:
             candidates.append(Candidate(pattern, name, float(search.best[group, restart])))
             continue
-        shift, metres = float(shifts[group, restart]), predicted[group, restart]
-        spread = (float(metres.min()), float(metres.max()))
-        candidates.append(Candidate(pattern, name, shift, float(metres.mean()), spread))
+        shift, each = float(shifts[group, restart]), predicted[group, restart]
+        mean, spread = float(each.mean()), (float(each.min()), float(each.max()))
+        if isinstance(measure, SpeedMeasure):
+            candidates.append(Candidate(pattern, name, shift, predicted_mps=mean, predicted_range_mps=spread))
+        else:
+            candidates.append(Candidate(pattern, name, shift, mean, spread))
     return tuple(candidates)

@@ -65,8 +65,9 @@ class BlackBox(Method):
         del objective
         return self.calls
 
-    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+    def groups(self, recordings: RecordingSet, objective: Objective | None = None) -> tuple[Group, ...]:
         """One group of all drives, to whichever side each gives way."""
+        del objective
         return parse_groups("all", recordings)
 
     def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
@@ -87,6 +88,7 @@ class BlackBox(Method):
             first=torch.cat(list(given)) if sum(map(len, given)) else None,
             world=measure.fingerprint(),
             checkpoint=running.get("checkpoint"),
+            aim=running.get("aim", ""),
             on_step=running.get("on_step", lambda _calls, _best: None),
         )
         best = trials.value.topk(min(KEPT, len(trials))).indices
@@ -202,6 +204,7 @@ def blackbox_search(
     first: Float[Tensor, "f k n"] | None = None,
     world: str = "",
     checkpoint: Path | None = None,
+    aim: str = "",
     on_step: Callable[[int, float], object] = lambda _calls, _best: None,
 ) -> Trials:
     """Find the point of a search space with the largest value, without gradients.
@@ -215,10 +218,12 @@ def blackbox_search(
         first: points (F, K, N) to try first, such as those of another search; the method goes on from their values.
         world: text that identifies what computes the values, so that a checkpoint of other values is not resumed.
         checkpoint: file that keeps the trials after every call of `value`, so that an interrupted search goes on.
+        aim: name of what is made large, which the checkpoint says; a search for another is refused there.
         on_step: called after every batch with the number of points tried and the best value so far.
 
     Raises:
-        RoadproofError: `at_once` is out of range for the method, or a value is not finite.
+        RoadproofError: `at_once` is out of range for the method, a value is not finite, or the checkpoint is of another
+            objective.
     """
     if at_once < 1:
         raise RoadproofError(f"at_once is {at_once}, expected 1 or more")
@@ -231,7 +236,7 @@ def blackbox_search(
     # More calls are the same search, gone on with.
     fields = {name: each for name, each in asdict(method).items() if name != "calls"}
     identity = repr((space, method.word, fields, seed, at_once, given, world))
-    trials = _resumed(checkpoint, space, identity)
+    trials = _resumed(checkpoint, space, identity, aim)
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
     while len(trials) < method.calls:
@@ -251,13 +256,13 @@ def blackbox_search(
         )
         if checkpoint:
             state = {"unit": trials.unit, "value": trials.value, "seconds": trials.seconds}
-            save_checkpoint(checkpoint, identity, state)
+            save_checkpoint(checkpoint, identity, state, aim=aim)
         on_step(len(trials), float(trials.value.max()))
     return trials
 
 
-def _resumed(checkpoint: Path | None, space: SearchSpace, identity: str) -> Trials:
-    state = load_checkpoint(checkpoint, identity, torch.device("cpu")) if checkpoint else None
+def _resumed(checkpoint: Path | None, space: SearchSpace, identity: str, aim: str) -> Trials:
+    state = load_checkpoint(checkpoint, identity, torch.device("cpu"), aim=aim) if checkpoint else None
     if state is not None:
         return Trials(state["unit"], state["value"], state["seconds"])
     nothing = torch.empty(0, dtype=torch.float64)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.gradopt import Search, random_search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import Measure, RecordedMeasure
@@ -58,7 +58,7 @@ def check_search(
     return tuple(checks)
 
 
-def check_world(measure: DeviationMeasure, pattern: Pattern) -> tuple[Check, ...]:
+def check_world(measure: ClosedLoopMeasure, pattern: Pattern) -> tuple[Check, ...]:
     """Check whether the recorded world can be trusted, on the bare road and over the pattern found.
 
     Args:

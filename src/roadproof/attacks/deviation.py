@@ -1,7 +1,7 @@
 """How far a pattern takes the car aside in the recorded world: the measure of a search in metres, with gradients.
 
-Patterns × starts are driven side by side (`recorded.world`), in each weather that was recorded. The value of a pattern
-for a side is the mean, over weathers, starts and the instants at which the canvas is in view, of
+Patterns × starts are driven side by side (`attacks.closed_loop`), in each weather that was recorded. The value of a
+pattern for a side is the mean, over weathers, starts and the instants at which the canvas is in view, of
 
     s tanh(d / s)
 
@@ -10,29 +10,24 @@ with d the offset from the clean path to that side and s some metres: a car that
 
 from __future__ import annotations
 
-import copy
-import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.groups import Direction, Group
-from roadproof.attacks.surrogate import FIXED, Surrogate
-from roadproof.compositing.variation import Variation
+from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.groups import Group
+from roadproof.attacks.surrogate import Surrogate
+from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Start
+from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled, Start
 from roadproof.recordings import RecordingSet
-from roadproof.search_space import SearchSpace
-
-MAX_PICTURES = 800
-"""Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
 
 
-class DeviationMeasure:
+class DeviationMeasure(ClosedLoopMeasure):
     """Predicted offset of patterns in a recorded world, for every group at once.
 
     Args:
@@ -46,7 +41,7 @@ class DeviationMeasure:
         variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
-        RecordingError: the poses of a drive are not known, or the vehicle cannot be identified.
+        RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group is of the speed.
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
     """
 
@@ -62,115 +57,23 @@ class DeviationMeasure:
         device: torch.device | str = "cpu",
         variation: Variation | None = None,
     ) -> None:
-        # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
-        self._open_loop = Surrogate(recordings, controller, groups, device=device, variation=variation)
-        self.groups = tuple(groups)
-        self.controller = controller
-        self.worlds = tuple(RecordedWorld(each, device=device) for each in recordings.by_weather())
-        for world in self.worlds:
-            world.fit(controller)
-        self.device = torch.device(device)
-        self.frames_evaluated = 0
-        self._starts, self.every, self._saturation_m = starts, every, saturation_m
-        self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
-
-    def thinned(self, every: int) -> DeviationMeasure:
-        """The same measure with a picture only every n steps: cheaper, for choosing among many starts."""
-        thin = copy.copy(self)
-        thin.every, thin.frames_evaluated = every, 0
-        return thin
-
-    def of_groups(self, kept: Sequence[int]) -> DeviationMeasure:
-        """The same measure for some of its sides alone."""
-        part = copy.copy(self)
-        part.groups, part.frames_evaluated = tuple(self.groups[k] for k in kept), 0
-        vars(part)["_open_loop"] = self._open_loop.of_groups(kept)
-        return part
-
-    def redraw(self, seed: int) -> None:
-        """Take the mean over the looks of another seed from now on; does nothing without a variation."""
-        if self.variation is not None:
-            self._looks = self.variation.draw(seed, self.device)
+        super().__init__(
+            recordings, controller, groups, starts=starts, every=every, device=device, variation=variation
+        )
+        self._saturation_m = saturation_m
 
     def open_loop(self) -> Surrogate:
         """The surrogate: the steering shift on the recorded frames."""
-        return self._open_loop
+        return self._steering
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        """Mean offset to each group's side, metres, at R points per group of a search space, without gradients."""
-        with torch.no_grad():
-            return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
-
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
-        """Metres to each group's side and their gradient at R points a group of a search space.
-
-        The gradient of each point is scaled to unit length: a closed loop amplifies, and by how much says nothing about
-        how far a step should go.
-        """
-        values: list[Tensor] = []
-        gradients: list[Tensor] = []
-        for part in self._parts(unit):
-            leaf = part.detach().requires_grad_()
-            value = self._values(space, leaf)
-            (gradient,) = torch.autograd.grad(value.sum(), leaf)
-            flat = gradient.flatten(2)
-            length = flat.square().sum(2, keepdim=True).sqrt().clamp_min(1e-12)
-            values.append(value.detach())
-            gradients.append((flat / length).view_as(gradient))
-        return torch.cat(values, 1), torch.cat(gradients, 1)
-
-    def readings(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
-        """Steering shift on the recorded frames, and the paper's deviation as predicted, with small errors.
-
-        The predictions of all weathers stand one after another.
-        """
-        patterns = space.pattern(unit.flatten(0, 1))
-        looks = self.variation and self.variation.draw(FIXED, self.device, len(UNSURE))
-        self._open_loop.redraw(FIXED)
-        predicted = np.concatenate(
-            [world.deviations_m(self.controller, patterns, UNSURE, looks) for world in self.worlds], 1
-        )
-        return self._open_loop.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
-
-    def fingerprint(self) -> str:
-        """A digest of drives, calibration, controller and starts, which tells this measure from others."""
-        # The variation is in the fingerprint of the steering shift.
-        worlds = [(each.vehicle, each.recordings.obstacles) for each in self.worlds]
-        more = repr((self._starts, self.every, self._saturation_m, worlds))
-        return hashlib.sha256((more + self._open_loop.fingerprint()).encode()).hexdigest()
-
-    def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
-        pictures = len(self.groups) * sum(self._pictures(world) for world in self.worlds)
-        at_once = max(1, MAX_PICTURES // pictures)
-        yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
-
-    def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
-        patterns = space.pattern(unit.flatten(0, 1))
-        right = torch.cat([self._right(world, patterns).view(*unit.shape[:2], -1) for world in self.worlds], -1)
-        sides = [_to_side(part, group.direction) for group, part in zip(self.groups, right, strict=True)]
-        return torch.stack(sides).mean(-1).float()
-
-    def _right(self, world: RecordedWorld, patterns: Pattern) -> Float[Tensor, " r"]:
-        """The mean offset of each drive in one world, start after start, each of them once with every look."""
-        starts = tuple(start for start in self._starts for _ in range(self._times))
-        rolled = world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
-        self.frames_evaluated += len(patterns.boxes) * self._pictures(world)
+    def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
+        """The mean offset of each drive, metres, right positive, hardly more than the saturation."""
         return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
 
-    def _pictures(self, world: RecordedWorld) -> int:
-        """Number of pictures that all drives over one pattern take."""
-        return len(self._starts) * self._times * -(-world.course.count // self.every)
+    def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
+        """The paper's deviation, metres, 0 or more, of R patterns in each of S drives."""
+        return world.deviations_m(self.controller, patterns, UNSURE, looks)
 
-    @property
-    def _times(self) -> int:
-        return 1 if self._looks is None else len(self._looks)
-
-
-def _to_side(right_m: Tensor, direction: Direction) -> Tensor:
-    if direction is Direction.EITHER:
-        return right_m.abs()
-    return right_m if direction is Direction.RIGHT else -right_m
+    def told(self) -> tuple[object, ...]:
+        """What tells this measure from others on the same drives."""
+        return self._starts, self.every, self._saturation_m

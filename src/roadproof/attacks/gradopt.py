@@ -128,12 +128,14 @@ class Running(TypedDict, total=False):
         seed: seed of everything random; required.
         starts: points to begin at, one tensor (S, K, N) per group; random points fill the remaining starts.
         checkpoint: file that keeps the search after every step and from which the same search goes on; None for none.
+        aim: name of the objective, which the checkpoint says; a search for another is refused there.
         on_step: called after every step with its number and the best value so far.
     """
 
     seed: Required[int]
     starts: Sequence[Float[Tensor, "s k n"]]
     checkpoint: Path | None
+    aim: str
     on_step: Callable[[int, float], object]
 
 
@@ -150,16 +152,17 @@ def gradopt(
         **running: seed, starts, checkpoint and callback; see `Running`.
 
     Raises:
-        RoadproofError: the controller answers NaN to a composited frame.
+        RoadproofError: the controller answers NaN to a composited frame, or the checkpoint is of another objective.
 
     References:
         Eqs. tloss and composite; "Computing Adversarial Perturbations" of the paper.
     """
     seed, starts = running["seed"], running.get("starts", ())
     checkpoint, on_step = running.get("checkpoint"), running.get("on_step", lambda _iteration, _best: None)
+    aim = running.get("aim", "")
     given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
-    state = load_checkpoint(checkpoint, identity, measure.device) if checkpoint else None
+    state = load_checkpoint(checkpoint, identity, measure.device, aim=aim) if checkpoint else None
     at, behind = 0, torch.full((len(measure.groups),), torch.nan)
     if state is None:
         state = _state_at(_starts(measure, space, rungs[0].starts, seed, starts))
@@ -189,7 +192,7 @@ def gradopt(
             if checkpoint:
                 frames = measure.frames_evaluated + (0 if climbed is measure else climbed.frames_evaluated)
                 whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames), "behind": behind}
-                save_checkpoint(checkpoint, identity, whole)
+                save_checkpoint(checkpoint, identity, whole, aim=aim)
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
     best, last = state["best"], _of_groups(measure, behind)

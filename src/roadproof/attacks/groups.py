@@ -21,27 +21,39 @@ from roadproof.recordings import Recording, RecordingSet, Side
 
 
 class Direction(StrEnum):
-    """Where an attack steers: to one side, or to whichever side each drive gives way."""
+    """Where an attack takes the car: to one side, to less or more speed, or to whichever of two gives way."""
 
     RIGHT = "right"
     LEFT = "left"
+    SLOWER = "slower"
+    FASTER = "faster"
     EITHER = "either"
+
+
+STEERED = (Direction.RIGHT, Direction.LEFT, Direction.EITHER)
+"""The directions of an attack on steering and on the path."""
+
+SPEEDS = (Direction.SLOWER, Direction.FASTER, Direction.EITHER)
+"""The directions of an attack on the speed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Drives that are attacked together, and the side the attack steers to.
+    """Drives that are attacked together, and where the attack takes the car.
 
     Args:
         sides: sides of the drives that belong to the group; empty for drives in a simulator.
-        direction: "right" or "left" for the paper's Group, "either" for Group-All, Random and a single drive.
+        direction: "right" or "left" for the paper's Group, "either" for Group-All, Random and a single drive; "slower"
+            or "faster" for an attack on the speed.
     """
 
     sides: tuple[Side, ...]
     direction: Direction
 
     def __str__(self) -> str:
-        return "+".join(self.sides) if self.direction is not Direction.EITHER else "all"
+        if self.direction is Direction.EITHER:
+            return "all"
+        return str(self.direction) if self.direction in SPEEDS else "+".join(self.sides)
 
     def select(self, recordings: RecordingSet) -> tuple[Recording, ...]:
         """The drives of a set that belong to this group.
@@ -66,20 +78,54 @@ LEFT_GROUP = Group((Side.CLEAN, Side.LEFT), Direction.LEFT)
 def parse_groups(text: str, recordings: RecordingSet) -> tuple[Group, ...]:
     """Groups from words: "clean+right,clean+left" (the paper's Group), or "all" (Group-All, Random, T = 1).
 
+    "slower,faster", or one of them, are those of an attack on the speed; all drives belong to each.
+
     Raises:
         RecordingError: a word is unknown, or a group names both sides or none.
     """
+    sides = tuple(dict.fromkeys(recording.side for recording in recordings.recordings))
     if text == "all":
-        sides = tuple(dict.fromkeys(recording.side for recording in recordings.recordings))
         return (Group(sides, Direction.EITHER),)
-    return tuple(_parse_group(part) for part in text.split(","))
+    speeds = {"slower": Group(sides, Direction.SLOWER), "faster": Group(sides, Direction.FASTER)}
+    return tuple(speeds.get(part.strip()) or _parse_group(part) for part in text.split(","))
+
+
+def require_directions(groups: Sequence[Group], allowed: Sequence[Direction], objective: str) -> None:
+    """Refuse groups that an objective cannot take the car to.
+
+    Args:
+        groups: the groups that are to be attacked.
+        allowed: the directions that the objective knows.
+        objective: name of the objective in words.
+
+    Raises:
+        RecordingError: a group has another direction; the message names it.
+    """
+    for group in groups:
+        if group.direction not in allowed:
+            others = "slower, faster" if allowed is SPEEDS else "clean+right, clean+left"
+            raise RecordingError(f"the {objective} knows no group {group}; expected {others} or all")
+
+
+def to_side(values: Float[Tensor, "*b"], direction: Direction) -> Float[Tensor, "*b"]:
+    """Values that are positive to the right, or where the car is faster, as positive to a direction.
+
+    Args:
+        values: signed values, (*b).
+        direction: the direction that counts as positive; "either" takes the absolute value of each.
+    """
+    if direction is Direction.EITHER:
+        return values.abs()
+    return values if direction in (Direction.RIGHT, Direction.FASTER) else -values
 
 
 def _parse_group(text: str) -> Group:
     try:
         sides = tuple(Side(word.strip()) for word in text.split("+"))
     except ValueError:
-        raise RecordingError(f"group {text!r} is unknown; write e.g. clean+right,clean+left or all") from None
+        raise RecordingError(
+            f"group {text!r} is unknown; write e.g. clean+right,clean+left or all, and for a speed slower,faster"
+        ) from None
     steered = [side for side in sides if side in (Side.LEFT, Side.RIGHT)]
     if len(steered) != 1 or Side.RANDOM in sides:
         raise RecordingError(f"group {text!r} needs exactly one of left and right, e.g. clean+right; or write all")
@@ -101,12 +147,9 @@ def divergence(shift: Float[Tensor, "*b f"], lengths: Sequence[int], direction: 
     References:
         Eq. tloss and the paragraph below it.
     """
-    match direction:
-        case Direction.RIGHT:
-            total = shift.sum(-1)
-        case Direction.LEFT:
-            total = -shift.sum(-1)
-        case Direction.EITHER:
-            drives = cast("tuple[Tensor, ...]", shift.split(list(lengths), -1))
-            total = torch.stack([drive.sum(-1).abs() for drive in drives]).sum(0)
+    if direction is Direction.EITHER:
+        drives = cast("tuple[Tensor, ...]", shift.split(list(lengths), -1))
+        total = torch.stack([drive.sum(-1).abs() for drive in drives]).sum(0)
+    else:
+        total = to_side(shift.sum(-1), direction)
     return total / shift.shape[-1]

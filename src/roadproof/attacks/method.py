@@ -9,7 +9,7 @@ import torch
 
 from roadproof.attacks.gradopt import Running, Search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Group, parse_groups
-from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
+from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SpeedChange
 from roadproof.controllers import Controller
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -26,11 +26,18 @@ class Method:
         """How often `on_step` is called during a search for an objective."""
         raise NotImplementedError
 
-    def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
+    def groups(self, recordings: RecordingSet, objective: Objective | None = None) -> tuple[Group, ...]:
         """The groups of drives attacked together by default.
 
-        With gradients the paper's two sides, each apart, if drives were perturbed to both; otherwise all drives.
+        With gradients the paper's two sides, each apart, if drives were perturbed to both, or slower and faster for a
+        speed change; otherwise all drives.
+
+        Args:
+            recordings: the drives that are attacked.
+            objective: what the search makes large; None for one of steering or of the path.
         """
+        if isinstance(objective, SpeedChange):
+            return parse_groups("slower,faster", recordings)
         return (RIGHT_GROUP, LEFT_GROUP) if recordings.has_both_sides else parse_groups("all", recordings)
 
     def measure(

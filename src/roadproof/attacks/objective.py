@@ -1,15 +1,16 @@
-"""What a search makes large, as an object: a steering shift as published, a path deviation, or one of the user's own.
+"""What a search makes large, as an object: a steering shift as published, a path deviation, a change of the speed.
 
     attack(recordings, controller, space, objective=PathDeviation())
 
-An objective is a description; `measure` makes of it what values patterns on a set of recordings.
+An objective is a description, also one of the user's own; `measure` makes of it what values patterns on a set of
+recordings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.groups import Group
+from roadproof.attacks.speed import SpeedMeasure, require_pedals
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
@@ -26,8 +28,9 @@ from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
 Readings: TypeAlias = tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"] | None]
-"""Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is: in
-each of some drives that differ by as little as a prediction may be wrong."""
+"""Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is (for
+a `SpeedMeasure` the change of the speed in m/s): in each of some drives that differ by as little as a prediction may be
+wrong."""
 
 
 @runtime_checkable
@@ -138,7 +141,46 @@ class SteeringShift:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class PathDeviation:
+class ClosedLoop:
+    """What an objective in the recorded world, closed loop, is described by; the base class of those that drive there.
+
+    Args:
+        starts: offsets from the clean drive at which drives begin, one or more; several make the result more general.
+        every: number of steps from one picture to the next during the search; a prediction has a picture at every step.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+
+    Raises:
+        RoadproofError: `starts` is empty, or `every` is not positive.
+    """
+
+    word: ClassVar[str]
+    starts: tuple[Start, ...] = (Start(),)
+    every: int = 2
+    variation: Variation | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.starts or self.every < 1:
+            raise RoadproofError(
+                f"{self.word} with {len(self.starts)} starts, a picture every {self.every} steps; expected one start "
+                "or more, and 1 or more"
+            )
+
+    @property
+    def name(self) -> str:
+        """The name of the objective in words, for results and reports."""
+        return self.word + _over(self.variation)
+
+    def check(self, controller: Controller) -> None:
+        """Refuse a controller that this objective cannot be searched with, before any work begins.
+
+        Raises:
+            ControllerError: the recorded world does not drive it as a simulator does.
+        """
+        del controller
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PathDeviation(ClosedLoop):
     """How far aside the car goes in the recorded world, closed loop; its value is metres.
 
     Args:
@@ -151,22 +193,14 @@ class PathDeviation:
         RoadproofError: `starts` is empty, or `every` or `saturation_m` is not positive.
     """
 
-    starts: tuple[Start, ...] = (Start(),)
-    every: int = 2
+    word: ClassVar[str] = "path deviation"
     saturation_m: float = 3.0
-    variation: Variation | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if not self.starts or self.every < 1 or not self.saturation_m > 0:
-            raise RoadproofError(
-                f"path deviation with {len(self.starts)} starts, a picture every {self.every} steps, saturation "
-                f"{self.saturation_m} m; expected one start or more, 1 or more, and above 0"
-            )
-
-    @property
-    def name(self) -> str:
-        """The name of the objective in words, for results and reports."""
-        return "path deviation" + _over(self.variation)
+        # Dataclasses with slots are made anew, which super() without arguments does not know.
+        super(PathDeviation, self).__post_init__()
+        if not self.saturation_m > 0:
+            raise RoadproofError(f"path deviation with saturation {self.saturation_m} m; expected above 0")
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
@@ -184,6 +218,52 @@ class PathDeviation:
         )
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SpeedChange(ClosedLoop):
+    """How much slower, or faster, the car goes in the recorded world, closed loop; its value is m/s.
+
+    It is the mean over the passage of the speed less that of the clean drive at the same instants. The controller must
+    say throttle and brake (`PedalController`). The groups are "slower" and "faster".
+
+    Args:
+        starts: offsets from the clean drive at which drives begin, one or more; several make the result more general.
+        every: number of steps from one picture to the next during the search; a prediction has a picture at every step.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+
+    Raises:
+        RoadproofError: `starts` is empty, or `every` is not positive.
+    """
+
+    word: ClassVar[str] = "speed change"
+
+    def check(self, controller: Controller) -> None:
+        """Refuse a controller that only steers, before any work begins.
+
+        Raises:
+            ControllerError: the controller has no batched `controls`.
+        """
+        require_pedals(controller)
+
+    def measure(
+        self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
+    ) -> SpeedMeasure:
+        """The measure in the recorded world of the whole set, closed loop.
+
+        Raises:
+            ControllerError: the controller only steers.
+        """
+        self.check(controller)
+        return SpeedMeasure(
+            recordings,
+            controller,
+            groups,
+            starts=self.starts,
+            every=self.every,
+            device=device,
+            variation=self.variation,
+        )
+
+
 def _over(variation: Variation | None) -> str:
     return "" if variation is None else " over variations"
 
@@ -196,15 +276,19 @@ def varied(objective: Objective, variation: Variation | None) -> Objective:
     """
     if variation is None:
         return objective
-    if isinstance(objective, SteeringShift | PathDeviation):
+    if isinstance(objective, SteeringShift | ClosedLoop):
         return replace(objective, variation=variation)
     raise RoadproofError(f"the objective {objective.name} knows no variation; take its mean in its own measure")
 
 
 def variation_of(objective: Objective) -> Variation | None:
     """The variation of an objective; None if it has none, or is the user's own."""
-    return objective.variation if isinstance(objective, SteeringShift | PathDeviation) else None
+    return objective.variation if isinstance(objective, SteeringShift | ClosedLoop) else None
 
 
-OBJECTIVES: dict[str, Objective] = {"deviation": PathDeviation(), "steering": SteeringShift()}
+OBJECTIVES: dict[str, Objective] = {
+    "deviation": PathDeviation(),
+    "speed": SpeedChange(),
+    "steering": SteeringShift(),
+}
 """Those that a command or a plan can name."""

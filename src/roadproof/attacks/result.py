@@ -14,6 +14,7 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
+from roadproof.driving.speed import speed_in_words
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import picture, table
@@ -51,6 +52,9 @@ class Candidate:
             None if the search did not drive there.
         predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
         driven: effect in the drive that chose the pattern; None if nothing was driven in a simulator.
+        predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
+            recorded weathers and small errors of steering; None if the search was not for a change of the speed.
+        predicted_range_mps: least and largest of these predicted changes, m/s; None if there are none.
     """
 
     pattern: Pattern
@@ -59,6 +63,15 @@ class Candidate:
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
     driven: Effect | None = None
+    predicted_mps: float | None = None
+    predicted_range_mps: tuple[float, float] | None = None
+
+    @property
+    def predicted(self) -> str | None:
+        """What is predicted, in words with its unit; None if the search did not drive in the recorded world."""
+        if self.predicted_mps is not None:
+            return speed_in_words(self.predicted_mps)
+        return None if self.predicted_m is None else f"{self.predicted_m:.2f} m"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -71,17 +84,21 @@ class AttackResult:
 
     Args:
         pattern: the strongest pattern.
-        group: the group it was found for, e.g. "clean+right".
-        objective: what was made large: "steering shift", "path deviation", or the name of the user's own.
+        group: the group it was found for, e.g. "clean+right", or "slower".
+        objective: what was made large: "steering shift", "path deviation", "speed change", or the name of the user's
+            own.
         surrogate_shift: mean steering shift of the pattern per frame towards that group's side, in steer units; None
             without recorded frames.
         predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors;
-            None if the search did not drive there.
-        predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
+            None if the search did not drive there, or was for a change of the speed.
+        predicted_range_m: least and largest of these predicted deviations, metres; None if there are none.
+        predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
+            recorded weathers and small errors of steering; None if the search was not for a change of the speed.
+        predicted_range_mps: least and largest of these predicted changes, m/s; None if there are none.
         driven: effect of the strongest pattern in the drive that chose it; None if nothing was driven in a simulator.
-        by_group: best value of every group, in the objective's unit: steer units per frame, or metres; for the
+        by_group: best value of every group, in the objective's unit: steer units per frame, metres, or m/s; for the
             published method a sum over frames.
-        candidates: best pattern of every start, the strongest first, by the least predicted deviation if there is one.
+        candidates: best pattern of every start, the strongest first, by the least predicted effect if there is one.
             The steering shift ranks only coarsely, so that driving over the first few finds a stronger one than the
             first.
         history: value at every iteration after the first rungs, (iterations, groups, restarts); without gradients the
@@ -108,22 +125,34 @@ class AttackResult:
     objective: str = "steering shift"
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
+    predicted_mps: float | None = None
+    predicted_range_mps: tuple[float, float] | None = None
     driven: Effect | None = None
     conspicuousness: Conspicuousness | None = None
 
     def _repr_html_(self) -> str:
         """How a notebook shows it: the pattern, and what each kind of number says."""
-        low, high = self.predicted_range_m or (0.0, 0.0)
         known = (
             ("made large", f"{self.objective}, for {self.group}, by {self.method.word}"),
             ("surrogate", None if self.surrogate_shift is None else f"{self.surrogate_shift:+.3f} steer a frame"),
-            ("predicted", self.predicted_m and f"{self.predicted_m:.2f} m of deviation ({low:.2f} to {high:.2f})"),
+            ("predicted", self.predicted and "{} ({})".format(*self.predicted)),
             ("driven, to choose it", self.driven and f"{self.driven.deviation:.2f} m of deviation"),
             ("took", f"{self.cost.seconds:.0f} s, {self.cost.simulator_calls} simulator calls"),
             *(("look at", f"{each.name}: {each.finding}") for each in self.checks if not each.passed),
         )
         shown = picture(raster(self.pattern), "the strongest pattern", 200)
         return shown + table(("attack", ""), [(name, value) for name, value in known if value])
+
+    @property
+    def predicted(self) -> tuple[str, str] | None:
+        """What is predicted, in words with its unit, and its spread; None if nothing was driven in recordings."""
+        if self.predicted_mps is not None:
+            least, most = map(speed_in_words, self.predicted_range_mps or (self.predicted_mps, self.predicted_mps))
+            return speed_in_words(self.predicted_mps), f"{least} to {most}"
+        if self.predicted_m is None:
+            return None
+        low, high = self.predicted_range_m or (self.predicted_m, self.predicted_m)
+        return f"{self.predicted_m:.2f} m of deviation", f"{low:.2f} to {high:.2f}"
 
     def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
@@ -144,8 +173,7 @@ class AttackResult:
             self,
             made_of=made_of or {},
             candidates=[
-                [each.group, each.surrogate_shift, each.predicted_m, each.predicted_range_m, plain(each.driven)]
-                for each in self.candidates
+                [plain(getattr(each, name)) for name in _Ranked.__struct_fields__] for each in self.candidates
             ],
         )
 
@@ -177,6 +205,8 @@ class _Ranked(msgspec.Struct, array_like=True, frozen=True):
     predicted_m: float | None = None
     predicted_range_m: tuple[float, float] | None = None
     driven: Effect | None = None
+    predicted_mps: float | None = None
+    predicted_range_mps: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

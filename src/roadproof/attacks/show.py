@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from roadproof.attacks.groups import Group
+from roadproof.attacks.groups import Direction, Group
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing import composite
 from roadproof.controllers import Controller
@@ -57,7 +57,8 @@ def show_pattern(
         group: the group whose drives are shown.
         device: torch device on which frames are composited.
     """
-    surrogate = Surrogate(recordings, controller, [group], device=device)
+    # What the controller answers has no direction.
+    surrogate = Surrogate(recordings, controller, [replace(group, direction=Direction.EITHER)], device=device)
     view = surrogate.views[0]
     on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
     with torch.no_grad():

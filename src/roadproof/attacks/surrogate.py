@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.groups import Group, divergence
+from roadproof.attacks.groups import STEERED, Group, divergence, require_directions
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
@@ -46,7 +46,7 @@ class Surrogate:
 
     Raises:
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
-        RecordingError: a group names drives that the set lacks.
+        RecordingError: a group names drives that the set lacks, or is of the speed.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class Surrogate:
                 f"the controller takes frames of {wanted[1]}×{wanted[0]} (width × height), "
                 f"the recordings have {width}×{height}; use a controller for this input, or record for this controller"
             )
+        require_directions(groups, STEERED, "steering shift")
         self.groups = tuple(groups)
         self.recordings = recordings
         self.controller = controller

@@ -35,12 +35,16 @@ def attack(
     objective: Annotated[
         str | None,
         unset(
-            "deviation: metres aside, driven in the recordings; steering: shift on recorded frames, as published.",
+            "deviation: metres aside, driven in the recordings; speed: m/s slower or faster there; steering: shift on "
+            "recorded frames, as published.",
             default="deviation where the set has poses and both sides",
         ),
     ] = None,
     groups: Annotated[
-        str | None, unset("Drives attacked together: clean+right,clean+left, or all.", default="by method")
+        str | None,
+        unset(
+            "Drives attacked together: clean+right,clean+left, or all; slower,faster for a speed.", default="by method"
+        ),
     ] = None,
     method: Annotated[
         str,
@@ -50,7 +54,7 @@ def attack(
         ),
     ] = "gradopt",
     iterations: Annotated[
-        int | None, number("gradopt: last steps.", 1, MANY, default="100; 32 for a deviation")
+        int | None, number("gradopt: last steps.", 1, MANY, default="100; 32 for a deviation or a speed")
     ] = None,
     restarts: Annotated[
         int | None, number("gradopt, published: patterns of every group searched to the end.", 1, 1000, default="4")
@@ -76,13 +80,13 @@ def attack(
     from roadproof.attacks import attack as run
     from roadproof.attacks import cheapest as fewest
     from roadproof.attacks.cheapest import MOST_LEVELS, in_words
-    from roadproof.attacks.objective import varied
+    from roadproof.attacks.objective import ClosedLoop, SpeedChange, varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
-    from roadproof.errors import RecordingError
+    from roadproof.errors import RecordingError, RoadproofError
     from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
@@ -107,12 +111,16 @@ def attack(
     space = space.on(site_of(drives))
     if cheapest is not None and not drives.is_placed:
         raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
+    if cheapest is not None and isinstance(goal, SpeedChange):
+        raise RoadproofError("--cheapest is in metres of deviation, --objective speed in m/s; leave one of them out")
     attacked = load_controller(controller, device=device, dtype=dtype)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
-    chosen = searched.groups(drives) if groups is None else parse_groups(groups, drives)
+    chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     size = (drives.view.height_px, drives.view.width_px)
     require_usable(attacked, size=size, device=device, drives=False, gradients=searched.by_gradient)
+    if isinstance(goal, ClosedLoop):
+        goal.check(attacked)
     frames = sum(len(each.frames) for each in drives.recordings)
     begin(of_search(searched, OBJECTIVES[word], frames, attacked, groups=len(chosen)), out)
     checkpoint = out / "search.safetensors"
@@ -150,18 +158,19 @@ def attack(
 
 
 def _summarise(result: AttackResult, out: Path) -> None:
+    from roadproof.report.plots import in_units
+
     sides = ", ".join(f"{name} {value:+.3f}" for name, value in result.by_group.items())
     shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
-    if result.predicted_m is not None:
-        least, most = result.predicted_range_m or (result.predicted_m, result.predicted_m)
+    if result.predicted is not None:
         looks = " and variations" if result.objective.endswith("variations") else ""
+        mean, spread = result.predicted
         shift = (
-            f"{result.predicted_m:.2f} m of deviation predicted ({least:.2f} to {most:.2f} over small errors"
-            f"{looks}), nothing was driven for real; {shift}"
+            f"{mean} predicted ({spread} over small errors{looks}), nothing was driven for real; {shift}"
         )
     say(
         f"Strongest for {result.group}: {shift}",
-        f"Best {result.objective} of each group: {sides}",
+        f"Best of each group ({in_units(result.objective)}): {sides}",
         f"{result.space.figures} figures, {result.method.word}: {result.history.shape[2]} × {len(result.history)} last "
         f"steps; {result.cost.controller_frames} frames in {result.cost.seconds:.0f} s",
     )

@@ -121,21 +121,48 @@ def passage_deviation_m(clean: Episode, painted: Episode, canvas: CanvasPlacemen
     Predicted drives begin where the first frame was recorded, nearer to the canvas. The way up to there is the same for
     both, straight and at one speed, so that predicted and driven deviations are means over equal stretches.
     """
-    bare, driven = path_of(clean), path_of(painted)
+    bare, driven = in_passage(clean, painted, canvas)
+    return deviation_m(bare[:, :2], driven[:, :2])
+
+
+def in_passage(
+    clean: Episode, painted: Episode, canvas: CanvasPlacement
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
+    """World x, y and speed of two drives at the instants at which the clean one has the canvas in view.
+
+    Args:
+        clean: episode of the drive without the pattern.
+        painted: episode of the drive with it.
+        canvas: place of the canvas in the world.
+
+    Returns:
+        Metres, metres and m/s of the clean drive, (n, 3), and of the painted one, (m, 3), at the same instants; m is
+        below n where the painted drive ended before, and then at least its last instant stands.
+    """
+    bare, driven = _moved(clean), _moved(painted)
     if clean.paint.predicted:
         before = _approach(clean, HORIZON_M + canvas.length_m)
         bare, driven = np.concatenate([before, bare]), np.concatenate([before, driven])
-    seen = passage(bare, canvas)
+    seen = passage(bare[:, :2], canvas)
     if painted.ending in (Ending.STANDS, Ending.BLOCKED):
         # Whoever stands goes on standing there.
         driven = np.concatenate([driven, np.repeat(driven[-1:], max(seen.stop - len(driven), 0), 0)])
     # A painted drive that ended before has its last position left.
-    return deviation_m(bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:])
+    return bare[seen], driven[seen] if len(driven) > seen.start else driven[-1:]
 
 
-def _approach(episode: Episode, length_m: float) -> Path2D:
-    """Positions straight behind the first one, as far apart as the first speed says, in the order of driving."""
+def _moved(episode: Episode) -> Float[np.ndarray, "n 3"]:
+    """World x, y and speed at each observation of an episode."""
+    return np.column_stack([episode.x_m, episode.y_m, episode.speed_mps])
+
+
+def _approach(episode: Episode, length_m: float) -> Float[np.ndarray, "n 3"]:
+    """World x, y and speed straight behind the first position, in the order of driving.
+
+    The speed is that of the first observation; positions are as far apart as it says.
+    """
     apart_m = max(float(episode.speed_mps[0]), 1.0) * episode.dt_s
     back_m = apart_m * np.arange(math.ceil(length_m / apart_m), 0, -1)
     yaw_rad = float(episode.yaw_rad[0])
-    return path_of(episode)[0] - back_m[:, None] * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+    path = path_of(episode)[0] - back_m[:, None] * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+    return np.column_stack([path, np.full(len(path), episode.speed_mps[0])])

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch.nn import Module
 
-from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published
+from roadproof.attacks import GradOpt, Method, Objective, Published
 from roadproof.attacks.gradopt import DRAWN, Rung
+from roadproof.attacks.objective import ClosedLoop, SpeedChange
 from roadproof.calibration import Method as Calibration
 from roadproof.calibration.published import PAINTS, RUNS
 from roadproof.controllers import Controller
@@ -103,7 +104,7 @@ def of_search(
 
     Args:
         method: search method.
-        objective: objective of the search; for a path deviation the car is driven step by step.
+        objective: objective of the search; for one in the recorded world the car is driven step by step.
         frames: number of frames in a group of drives.
         controller: controller that is timed.
         groups: number of groups searched.
@@ -126,7 +127,8 @@ def of_search(
 
 def _pictures(rung: Rung, objective: Objective, frames: int) -> int:
     """What one start of a rung takes at a step."""
-    if rung.open_loop or not isinstance(objective, PathDeviation):
+    climbs_frames = rung.open_loop and not isinstance(objective, SpeedChange)
+    if climbs_frames or not isinstance(objective, ClosedLoop):
         return math.ceil(frames / rung.every)
     return math.ceil(STRETCH_STEPS / (rung.every if rung.every > 1 else objective.every))
 

@@ -5,8 +5,9 @@ pose → picture → controller → vehicle → pose, for any number of cars at 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeAlias, cast
 
 import numpy as np
 import torch
@@ -88,6 +89,10 @@ class Rolled:
     def path(self, index: int) -> Float[np.ndarray, "t 2"]:
         """World x, y of one drive."""
         return torch.stack([self.x_m[index], self.y_m[index]], 1).detach().cpu().numpy()
+
+
+Drive: TypeAlias = tuple[Rolled, int]
+"""One of the drives that were rolled together, by its number."""
 
 
 class RecordedWorld:
@@ -224,18 +229,56 @@ class RecordedWorld:
             starts: S offsets from the clean drive, from each of which every pattern is driven over.
             looks: one look per start, for the bare and the painted drive alike; None for paint and camera as recorded.
         """
+
+        def apart_m(bare: Drive, painted: Drive) -> float:
+            return deviation_m(self.whole_path(*bare), self.whole_path(*painted))
+
+        return self._compared(apart_m, controller, patterns, starts, looks)
+
+    def speed_changes_mps(
+        self,
+        controller: Controller,
+        patterns: Pattern,
+        starts: tuple[Start, ...] = (Start(),),
+        looks: Looks | None = None,
+    ) -> Float[np.ndarray, "r s"]:
+        """The mean change of the speed that each pattern of a batch is predicted to cause, from each start.
+
+        It is `driving.speed`'s, m/s, negative where the painted drive is slower: over all instants at which the canvas
+        is in view, also those before the first recorded frame, at which the two drives are one.
+
+        Args:
+            controller: the controller, on the world's device; `fit` must have been called with it.
+            patterns: batch of R patterns.
+            starts: S offsets from the clean drive, from each of which every pattern is driven over.
+            looks: one look per start, for the bare and the painted drive alike; None for paint and camera as recorded.
+        """
+        share = self.course.count / (self.course.seen.stop - self.course.seen.start)
+
+        def faster_mps(bare: Drive, painted: Drive) -> float:
+            before, after = (rolled.speed_mps[number] for rolled, number in (bare, painted))
+            return share * float((after - before).mean())
+
+        return self._compared(faster_mps, controller, patterns, starts, looks)
+
+    def _compared(
+        self,
+        compare: Callable[[Drive, Drive], float],
+        controller: Controller,
+        patterns: Pattern,
+        starts: tuple[Start, ...],
+        looks: Looks | None,
+    ) -> Float[np.ndarray, "r s"]:
+        """What a comparison says of every painted drive beside the bare one from the same start with the same look."""
         at_once = max(1, AT_ONCE // len(starts))
         with torch.no_grad():
-            rolled = self.roll(controller, starts=starts, looks=looks)
-            bare = [self.whole_path(rolled, k) for k in range(len(starts))]
+            bare = self.roll(controller, starts=starts, looks=looks)
             found: list[float] = []
             for first in range(0, len(patterns.boxes), at_once):
                 part = slice(first, first + at_once)
                 some = Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part])
                 rolled = self.roll(controller, some, starts=starts, looks=looks)
-                found += [
-                    deviation_m(bare[k % len(starts)], self.whole_path(rolled, k)) for k in range(len(rolled.x_m))
-                ]
+                found += [compare((bare, k % len(starts)), (rolled, k)) for k in range(len(rolled.x_m))]
         return np.array(found).reshape(-1, len(starts))
 
     def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:

@@ -15,7 +15,7 @@ from roadproof.io.files import write_atomically
 from roadproof.recordings import evenly
 
 LINE_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
-_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m"}
+_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m", "speed change": "predicted m/s"}
 _COLOURS = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
 _INK = "#222222"
 

@@ -1,0 +1,182 @@
+"""What measures of drives in the recorded world share: patterns driven over side by side, with gradients.
+
+Patterns × starts are driven side by side (`recorded.world`), in each weather that was recorded. A measure says what it
+reads of each drive, such as the mean offset to the right (`attacks.deviation`) or the mean change of the speed
+(`attacks.speed`), metres or m/s; the value of a pattern for a group is the mean of that over weathers, starts and looks, positive in
+the group's direction.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from roadproof.attacks.groups import Group, to_side
+from roadproof.attacks.surrogate import FIXED, Surrogate
+from roadproof.compositing.variation import Looks, Variation
+from roadproof.controllers import Controller
+from roadproof.patterns import Pattern
+from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled, Start
+from roadproof.recordings import RecordingSet
+from roadproof.search_space import SearchSpace
+
+MAX_PICTURES = 800
+"""Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
+
+
+class ClosedLoopMeasure(ABC):
+    """What patterns do to the drive in a recorded world, for every group at once.
+
+    Args:
+        recordings: recordings with canvas and tracks; the drives of each weather are a world of their own.
+        controller: the controller that drives; it computes on `device`.
+        groups: groups that state the directions; whatever group they belong to, all drives of the set are driven in.
+        starts: offsets from the clean drive at which the drives over each pattern begin.
+        every: number of steps from one picture to the next, 1 or more.
+        device: torch device on which the cars drive.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+
+    Raises:
+        RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group has a direction
+            that is not this measure's.
+        ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
+    """
+
+    def __init__(
+        self,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        starts: tuple[Start, ...] = (Start(),),
+        every: int = 2,
+        device: torch.device | str = "cpu",
+        variation: Variation | None = None,
+    ) -> None:
+        # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
+        self._steering = Surrogate(recordings, controller, self.steered(groups), device=device, variation=variation)
+        self.groups = tuple(groups)
+        self.controller = controller
+        self.worlds = tuple(RecordedWorld(each, device=device) for each in recordings.by_weather())
+        for world in self.worlds:
+            world.fit(controller)
+        self.device = torch.device(device)
+        self.frames_evaluated = 0
+        self._starts, self.every = starts, every
+        self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
+
+    def steered(self, groups: Sequence[Group]) -> tuple[Group, ...]:
+        """The groups whose steering shift stands beside a prediction: by default the same."""
+        return tuple(groups)
+
+    @abstractmethod
+    def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
+        """What is made large, of each drive in one world: signed, differentiable in the patterns."""
+
+    @abstractmethod
+    def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
+        """What is predicted of R patterns in one world, in each of the S drives with small errors."""
+
+    @abstractmethod
+    def open_loop(self) -> ClosedLoopMeasure | Surrogate:
+        """The measure from which a search begins."""
+
+    def thinned(self, every: int) -> ClosedLoopMeasure:
+        """The same measure with a picture only every n steps: cheaper, for choosing among many starts."""
+        thin = copy.copy(self)
+        thin.every, thin.frames_evaluated = every, 0
+        return thin
+
+    def of_groups(self, kept: Sequence[int]) -> ClosedLoopMeasure:
+        """The same measure for some of its groups alone."""
+        part = copy.copy(self)
+        part.groups, part.frames_evaluated = tuple(self.groups[k] for k in kept), 0
+        vars(part)["_steering"] = self._steering.of_groups(kept)
+        return part
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over the looks of another seed from now on; does nothing without a variation."""
+        if self.variation is not None:
+            self._looks = self.variation.draw(seed, self.device)
+
+    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        """Mean towards each group's direction, at R points per group, without gradients."""
+        with torch.no_grad():
+            return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
+
+    def values_and_gradients(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+        """Mean towards each group's direction and its gradient at R points a group of a search space.
+
+        The gradient of each point is scaled to unit length: a closed loop amplifies, and by how much says nothing about
+        how far a step should go.
+        """
+        values: list[Tensor] = []
+        gradients: list[Tensor] = []
+        for part in self._parts(unit):
+            leaf = part.detach().requires_grad_()
+            value = self._values(space, leaf)
+            (gradient,) = torch.autograd.grad(value.sum(), leaf)
+            flat = gradient.flatten(2)
+            length = flat.square().sum(2, keepdim=True).sqrt().clamp_min(1e-12)
+            values.append(value.detach())
+            gradients.append((flat / length).view_as(gradient))
+        return torch.cat(values, 1), torch.cat(gradients, 1)
+
+    def readings(
+        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
+    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
+        """Steering shift on the recorded frames, and what is predicted with small steering errors.
+
+        The predictions of all weathers stand one after another.
+        """
+        patterns = space.pattern(unit.flatten(0, 1))
+        looks = self.variation and self.variation.draw(FIXED, self.device, len(UNSURE))
+        self._steering.redraw(FIXED)
+        predicted = np.concatenate([self.predicted(world, patterns, looks) for world in self.worlds], 1)
+        return self._steering.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
+
+    def fingerprint(self) -> str:
+        """A digest of drives, calibration, controller and starts, which tells this measure from others."""
+        # The variation is in the fingerprint of the steering shift.
+        worlds = [(each.vehicle, each.recordings.obstacles) for each in self.worlds]
+        more = repr((*self.told(), worlds))
+        return hashlib.sha256((more + self._steering.fingerprint()).encode()).hexdigest()
+
+    def told(self) -> tuple[object, ...]:
+        """What tells this measure from others on the same drives."""
+        return self._starts, self.every
+
+    def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
+        pictures = len(self.groups) * sum(self._pictures(world) for world in self.worlds)
+        at_once = max(1, MAX_PICTURES // pictures)
+        yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
+
+    def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+        patterns = space.pattern(unit.flatten(0, 1))
+        read = torch.cat([self._read(world, patterns).view(*unit.shape[:2], -1) for world in self.worlds], -1)
+        sides = [to_side(part, group.direction) for group, part in zip(self.groups, read, strict=True)]
+        return torch.stack(sides).mean(-1).float()
+
+    def _read(self, world: RecordedWorld, patterns: Pattern) -> Float[Tensor, " r"]:
+        """The reading of each drive in one world, start after start, each of them once with every look."""
+        starts = tuple(start for start in self._starts for _ in range(self._times))
+        rolled = world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
+        self.frames_evaluated += len(patterns.boxes) * self._pictures(world)
+        return self.read(world, rolled)
+
+    def _pictures(self, world: RecordedWorld) -> int:
+        """Number of pictures that all drives over one pattern take."""
+        return len(self._starts) * self._times * -(-world.course.count // self.every)
+
+    @property
+    def _times(self) -> int:
+        return 1 if self._looks is None else len(self._looks)
