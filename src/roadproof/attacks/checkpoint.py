@@ -30,9 +30,7 @@ def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor], *, aim:
     write_tensors(path, tensors, {"identity": digest(identity), "aim": aim})
 
 
-def load_checkpoint(
-    path: Path, identity: str, device: torch.device, *, aim: str = ""
-) -> dict[str, Tensor] | None:
+def load_checkpoint(path: Path, identity: str, device: torch.device, *, aim: str = "") -> dict[str, Tensor] | None:
     """The tensors of a search; None if there is no file, it is damaged, or it belongs to another search.
 
     Args:

@@ -168,10 +168,13 @@ class ClosedLoopMeasure(ABC):
 
     def _read(self, world: RecordedWorld, patterns: Pattern) -> Float[Tensor, " r"]:
         """The reading of each drive in one world, start after start, each of them once with every look."""
+        return self.read(world, self.roll(world, patterns))
+
+    def roll(self, world: RecordedWorld, patterns: Pattern | None) -> Rolled:
+        """The drives over each pattern in one world, or over the bare road: each start once with every look."""
         starts = tuple(start for start in self._starts for _ in range(self._times))
-        rolled = world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
-        self.frames_evaluated += len(patterns.boxes) * self._pictures(world)
-        return self.read(world, rolled)
+        self.frames_evaluated += (1 if patterns is None else len(patterns.boxes)) * self._pictures(world)
+        return world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
 
     def _pictures(self, world: RecordedWorld) -> int:
         """Number of pictures that all drives over one pattern take."""

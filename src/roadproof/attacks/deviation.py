@@ -57,9 +57,7 @@ class DeviationMeasure(ClosedLoopMeasure):
         device: torch.device | str = "cpu",
         variation: Variation | None = None,
     ) -> None:
-        super().__init__(
-            recordings, controller, groups, starts=starts, every=every, device=device, variation=variation
-        )
+        super().__init__(recordings, controller, groups, starts=starts, every=every, device=device, variation=variation)
         self._saturation_m = saturation_m
 
     def open_loop(self) -> Surrogate:

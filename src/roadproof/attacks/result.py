@@ -172,9 +172,7 @@ class AttackResult:
             folder / "result.json",
             self,
             made_of=made_of or {},
-            candidates=[
-                [plain(getattr(each, name)) for name in _Ranked.__struct_fields__] for each in self.candidates
-            ],
+            candidates=[[plain(getattr(each, name)) for name in _Ranked.__struct_fields__] for each in self.candidates],
         )
 
     @staticmethod

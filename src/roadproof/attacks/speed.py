@@ -5,8 +5,9 @@ pattern for "faster" is the mean, over weathers, starts and the instants at whic
 
     v − v̄
 
-with v the car's speed and v̄ that of the recorded clean drive at the same instant; for "slower" it is the negative of
-that. So it is what the car lags behind the clean drive in the end, divided by the time that took.
+with v the car's speed and v̄ that of the drive over the bare road from the same start, in the recorded world too, at the
+same instant; for "slower" it is the negative of that. So it is how far the car comes, or stays behind, divided by the
+time of the passage.
 """
 
 from __future__ import annotations
@@ -21,18 +22,34 @@ from torch import Tensor
 
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.groups import SPEEDS, Direction, Group, require_directions, to_side
-from roadproof.compositing.variation import Looks
+from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller, PedalController
 from roadproof.errors import ControllerError
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled
+from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled, Start
+from roadproof.recordings import RecordingSet
 
 
 class SpeedMeasure(ClosedLoopMeasure):
     """Predicted change of the speed by patterns in a recorded world, for every group at once.
 
-    Its groups are "slower", "faster" or "all", whichever the car gives way to.
+    Its groups are "slower", "faster" or "all", whichever the car gives way to; its arguments and errors are those of
+    `ClosedLoopMeasure`.
     """
+
+    def __init__(
+        self,
+        recordings: RecordingSet,
+        controller: Controller,
+        groups: Sequence[Group],
+        *,
+        starts: tuple[Start, ...] = (Start(),),
+        every: int = 2,
+        device: torch.device | str = "cpu",
+        variation: Variation | None = None,
+    ) -> None:
+        super().__init__(recordings, controller, groups, starts=starts, every=every, device=device, variation=variation)
+        self._bare_mps: dict[tuple[int, int], Tensor] = {}
 
     def steered(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """All drives, steered to either side: how far paint that changes the speed also turns the wheel."""
@@ -45,12 +62,23 @@ class SpeedMeasure(ClosedLoopMeasure):
 
     def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
         """The mean change of the speed in each drive, m/s, positive where the car is faster."""
-        course = world.course
-        return (rolled.speed_mps - course.speed_mps[course.first : course.first + course.count]).mean(1)
+        key = (id(world), self.every)
+        if key not in self._bare_mps:
+            with torch.no_grad():
+                self._bare_mps[key] = self.roll(world, None).speed_mps
+        bare_mps = self._bare_mps[key]
+        return (rolled.speed_mps - bare_mps.repeat(len(rolled.speed_mps) // len(bare_mps), 1)).mean(1)
+
+    def redraw(self, seed: int) -> None:
+        """Take the mean over the looks of another seed from now on; does nothing without a variation."""
+        super().redraw(seed)
+        if self.variation is not None:
+            # Not cleared: a copy of this measure may have these drives with looks of its own.
+            self._bare_mps = {}
 
     def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The mean change of the speed, m/s, negative where the car is slower, of R patterns in each of S drives."""
-        return world.speed_changes_mps(self.controller, patterns, UNSURE, looks)
+        return world.foretold(self.controller, patterns, UNSURE, looks).speed_change_mps
 
     def rank(self, predicted: Float[Tensor, "g r s"]) -> Float[Tensor, "g r"]:
         """The least change over small errors of steering in each group's direction, m/s."""

@@ -178,11 +178,14 @@ def _check_recorded(
 def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, compared: bool) -> None:
     from roadproof.report.formatting import UNKNOWN, mean_in_words
 
-    columns, title = ("drives", "deviation m", "aside m", "left lane", "points", "clean"), None
+    columns, title = ("drives", "deviation m", "aside m", "speed m/s", "left lane", "points", "clean"), None
     if evaluation.predicted:
-        columns = ("drives", "predicted m", "aside m", "left lane", "infractions")
+        columns = ("drives", "predicted m", "aside m", "predicted m/s", "left lane", "infractions")
         title = "Predicted: composited into recorded frames, nothing was driven for real"
-    note = "deviation: median (least–most); aside: furthest; clean: points on the bare road"
+    note = (
+        "deviation: median (least–most); aside: furthest; m/s: mean change of speed, negative = slower; clean: points "
+        "on the bare road"
+    )
     rows = evaluation.rows()
     several = len({row.pattern for row in rows}) > 1
     shown = table((*(["pattern"] if several else []), "weather", "with"), columns, title=title, note=note)
@@ -198,6 +201,7 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
             str(row.count),
             row.metres,
             mean_in_words(row.lateral_m, 2),
+            UNKNOWN if row.speed_change_mps is None else mean_in_words(row.speed_change_mps, 2),
             f"{row.left_lane:.0%}",
             *([UNKNOWN] if row.failed is None else points),
         )

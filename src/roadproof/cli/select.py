@@ -35,7 +35,7 @@ def select(
     from roadproof.errors import RoadproofError
     from roadproof.io.locks import hold
     from roadproof.patterns import save_pattern
-    from roadproof.pipeline.selection import select_by_driving
+    from roadproof.pipeline.selection import UNITS, chosen_by, select_by_driving
 
     recorded = load_drives(run / "record").settings
     place = run / "attack"
@@ -48,10 +48,10 @@ def select(
     hold(run)
     inside = recorded_in(simulator)
     who = load_controller(controller, device=device)
-    total = 1 + min(best, len(found.candidates))
+    total, unit = 1 + min(best, len(found.candidates)), UNITS[chosen_by(found.candidates)]
     with (
         open_world(simulator, device) as world,
-        progress(f"Driving {recorded.scenario.name}", total, "drives, {:.2f} m") as show,
+        progress(f"Driving {recorded.scenario.name}", total, f"drives, {{:.2f}} {unit}") as show,
     ):
         selection = select_by_driving(
             world,
@@ -70,23 +70,28 @@ def select(
 
 
 def _summarise(selection: Selection, found: AttackResult, run: Path) -> None:
+    from roadproof.driving.speed import speed_in_words
+    from roadproof.pipeline.selection import SPEED
+
     driven = "predicted drive" if selection.predicted else "driven"
     for k, each in enumerate(selection.driven):
         points = "points not known" if each.trial.points is None else f"{each.trial.points:g} points"
+        change_mps = each.trial.speed_change_mps
+        faster = "" if selection.chosen_by != SPEED or change_mps is None else f"{speed_in_words(change_mps)}, "
         say(
-            f"  {each.rank:2} {each.group:12} {_expected(found.candidates[each.rank - 1])}{driven}: deviation "
-            f"{each.trial.deviation_m:.2f} m, {abs(each.trial.lateral_m):.2f} m aside, {points}"
+            f"  {each.rank:2} {each.group:12} {_expected(found.candidates[each.rank - 1])}{driven}: {faster}"
+            f"deviation {each.trial.deviation_m:.2f} m, {abs(each.trial.lateral_m):.2f} m aside, {points}"
             f"{'  <- kept' if k == selection.chosen else ''}"
         )
     pattern = run / "pattern.json"
     drives = "nothing was driven for real" if selection.predicted else f"{selection.simulator_calls} drives"
-    say(f"{drives}; the strongest is {pattern}; next: roadproof evaluate {pattern} ...")
+    say(f"{drives}; the strongest is {pattern}, by {selection.chosen_by}; next: roadproof evaluate {pattern} ...")
 
 
 def _expected(candidate: Candidate) -> str:
-    """What the search says of a candidate: metres where it drove in recordings, else how steering shifts there."""
-    if candidate.predicted_m is not None:
-        return f"predicted {candidate.predicted_m:.2f} m, "
+    """What the search says of a candidate: metres or m/s where it drove in recordings, else how steering shifts."""
+    if candidate.predicted is not None:
+        return f"predicted {candidate.predicted}, "
     if candidate.surrogate_shift is not None:
         return f"steering shift {candidate.surrogate_shift:+.3f} a frame, "
     return ""

@@ -36,6 +36,8 @@ from roadproof.simulators.protocol import PaintKind, PatternImage
 ATTACK = "attack"
 _UNITS = {
     "deviation_m": "metres, the paper's equation, from the clean drive of the same weather, traffic and seed",
+    "speed_change_mps": "m/s, mean over the passage of the speed less that of the clean drive, negative = slower",
+    "most_speed_change_mps": "m/s, that difference at the instant at which it was largest",
     "lateral_m": "metres beside the clean path where the car was furthest from it, left positive",
     "points": "sum of the 2019 CARLA challenge's points, as clean_points without paint",
     "leaderboard": "product of today's CARLA Leaderboard's factors, 1 = no infraction, as clean_leaderboard",
@@ -54,6 +56,8 @@ class Row:
         deviation_m: mean of the paper's deviation, metres.
         lateral_m: mean of the largest offset from the clean path, to whichever side, metres.
         count: number of trials.
+        speed_change_mps: mean change of the speed, m/s, negative where the drives are slower; None if a trial of an
+            earlier version does not know its own.
         median_m: median of the deviation, metres.
         least_m: smallest deviation, metres; most_m is the largest.
         left_lane: share of the drives that leave their lane (`Trial.leaves_lane`): the success rate.
@@ -69,6 +73,7 @@ class Row:
     traffic: bool
     deviation_m: Mean
     lateral_m: Mean
+    speed_change_mps: Mean | None
     count: int
     median_m: float
     least_m: float
@@ -238,6 +243,7 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
         most_m=max(deviations),
         left_lane=sum(trial.leaves_lane for trial in trials) / len(trials),
         lateral_m=mean([abs(trial.lateral_m) for trial in trials]),
+        speed_change_mps=known(lambda trial: trial.speed_change_mps),
         points=points,
         clean_points=known(lambda trial: trial.clean_points),
         leaderboard=known(lambda trial: trial.leaderboard),

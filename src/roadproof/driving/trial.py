@@ -10,6 +10,7 @@ from roadproof.datatypes import Event, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, passage_deviation_m, path_of
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
+from roadproof.driving.speed import speed_difference
 from roadproof.driving.starts import NOMINAL, StartOffset
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
@@ -28,6 +29,9 @@ class Trial:
         clean: file name of the drive without paint, in the episodes' folder; empty if it was not kept.
         painted: file name of the drive over paint, in the episodes' folder; empty if it was not kept.
         deviation_m: the paper's deviation between the two drives, metres (`driving.deviation`).
+        speed_change_mps: mean change of the speed while the canvas is in view, m/s, negative where the painted drive
+            is slower (`driving.speed`); None in files of earlier versions, as in the next.
+        most_speed_change_mps: change of the speed at the instant at which it was largest, m/s.
         lateral_m: largest offset of the painted drive from the clean path, metres, left positive.
         points: infraction points with paint; None, as in the next three, if infractions are not known.
         clean_points: infraction points without paint.
@@ -62,6 +66,8 @@ class Trial:
     events: tuple[Event, ...] = ()
     clean_events: tuple[Event, ...] = ()
     start: StartOffset = NOMINAL
+    speed_change_mps: float | None = None
+    most_speed_change_mps: float | None = None
 
     @property
     def leaves_lane(self) -> bool:
@@ -86,10 +92,11 @@ def judge(
 ) -> Trial:
     """The trial of two drives that differ in the paint alone.
 
-    Deviation is taken over the instants at which the clean drive has the canvas in view, the largest offset over the
+    Deviation and change of the speed are taken over the instants at which the clean drive has the canvas in view, the largest offset over the
     whole painted drive.
     """
     beside = lateral_m(path_of(clean), path_of(painted))
+    faster = speed_difference(clean, painted, canvas)
     known = not painted.paint.predicted
     return Trial(
         pattern=pattern,
@@ -110,4 +117,6 @@ def judge(
         events=counted(painted.events),
         clean_events=counted(clean.events),
         start=start,
+        speed_change_mps=faster.mean_mps,
+        most_speed_change_mps=faster.most_mps,
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published, SteeringShift
+from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published, SpeedChange, SteeringShift
+from roadproof.attacks.objective import ClosedLoop
 from roadproof.calibration import Method as Calibration
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
@@ -19,7 +20,8 @@ class Budget:
 
     Args:
         method: search method: by gradient, improved or published, or without gradients.
-        objective: what the search makes large: a path deviation in the recorded world, or a steering shift.
+        objective: what the search makes large: a path deviation or a speed change in the recorded world, or a steering
+            shift.
         trajectories: trajectories that are recorded. For a path deviation the default has a pair to the sides and a
             pair that weaves, so that frames look where an attacked car looks.
         window: which frames of each drive are kept; by default at most 40 that show at least 8 pixels of the canvas.
@@ -65,6 +67,8 @@ class Budget:
             self._check_published()
         if self.rounds and not self.select:
             raise RoadproofError(f"{self.rounds} rounds begin from candidates that were driven; select 1 or more")
+        if self.rounds and isinstance(self.objective, SpeedChange):
+            raise RoadproofError(f"{self.rounds} rounds follow the path that was driven; a speed change has 0 rounds")
         if len(set(self.recorded_in)) < len(self.recorded_in):
             raise RoadproofError(f"attack_weathers are {', '.join(self.recorded_in)}; expected each once")
         if len(self.recorded_in) > 1 and self.calibration is Calibration.PUBLISHED:
@@ -75,7 +79,7 @@ class Budget:
         at_random = self.trajectories.scheme is Scheme.RANDOM
         if self.is_predicted and (self.pooled or at_random):
             raise RoadproofError(
-                "a path deviation is searched for each side apart; attack drives pooled or perturbed at random by "
+                f"a {self.objective.name} is searched for each side apart; attack drives pooled or perturbed at random by "
                 "their steering shift: objective=SteeringShift()"
             )
 
@@ -98,7 +102,7 @@ class Budget:
     @property
     def is_predicted(self) -> bool:
         """Whether the search drives in the recorded world."""
-        return isinstance(self.objective, PathDeviation)
+        return isinstance(self.objective, ClosedLoop)
 
     @property
     def recorded_in(self) -> tuple[Weather, ...]:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from roadproof.controllers import Controller
 from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.episode import Episode
+from roadproof.driving.speed import speed_difference
 from roadproof.errors import EpisodeError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
@@ -28,6 +29,11 @@ class Prediction(Saved):
         least_m: least predicted deviation over those errors, metres.
         most_m: largest predicted deviation over those errors, metres.
         driven_m: the paper's deviation of the drive in the simulator, metres.
+        predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
+            small errors of steering; None in files of earlier versions, as in the next three.
+        least_mps: lowest predicted change over those errors, m/s.
+        most_mps: highest predicted change over those errors, m/s.
+        driven_mps: mean change of the speed of the drive in the simulator, m/s.
         path_error_m: mean distance between predicted and driven positions at the same instants, metres.
         gap_m: largest distance of the predicted path across the heading from the recorded poses shown, metres.
         gap_rad: largest difference of heading from the recorded poses shown, radians.
@@ -46,6 +52,10 @@ class Prediction(Saved):
     clean_xy: Float[np.ndarray, "t 2"]
     predicted_xy: Float[np.ndarray, "t 2"]
     driven_xy: Float[np.ndarray, "u 2"]
+    predicted_mps: float | None = None
+    least_mps: float | None = None
+    most_mps: float | None = None
+    driven_mps: float | None = None
 
     @property
     def error_m(self) -> float:
@@ -89,7 +99,8 @@ def predict(
     on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
     with torch.no_grad():
         rolled = world.roll(controller, on_device)
-    deviations = world.deviations_m(controller, on_device, UNSURE)
+    foretold = world.foretold(controller, on_device, UNSURE)
+    deviations, changes = foretold.deviation_m, foretold.speed_change_mps
     predicted, canvas = world.whole_path(rolled, 0), world.course.canvas
     seen = passage(path_of(clean), canvas)
     driven = path_of(painted)[seen]
@@ -105,4 +116,8 @@ def predict(
         clean_xy=path_of(clean)[seen],
         predicted_xy=predicted,
         driven_xy=driven,
+        predicted_mps=float(changes.mean()),
+        least_mps=float(changes.min()),
+        most_mps=float(changes.max()),
+        driven_mps=speed_difference(clean, painted, canvas).mean_mps,
     )

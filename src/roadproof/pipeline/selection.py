@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
-from roadproof.attacks import Candidate
+from roadproof.attacks import Candidate, PathDeviation, SpeedChange
+from roadproof.attacks.groups import Direction
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes
@@ -25,6 +26,17 @@ from roadproof.io.records import RecordFile, plain
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
+
+
+DEVIATION, SPEED = PathDeviation.word, SpeedChange.word
+
+UNITS = {DEVIATION: "m", SPEED: "m/s"}
+"""What candidates are chosen by when they are driven, and its unit."""
+
+
+def chosen_by(candidates: Sequence[Candidate]) -> str:
+    """What a choice among candidates is made by: the speed where they were searched for it, else the deviation."""
+    return SPEED if any(each.predicted_mps is not None for each in candidates) else DEVIATION
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,10 +53,17 @@ class Driven:
     rank: int
     trial: Trial
 
+    def effect(self, chosen_by: str) -> float:
+        """What the choice is made by: metres of deviation, or m/s of speed in the direction of the group."""
+        if chosen_by == DEVIATION:
+            return self.trial.deviation_m
+        change_mps = self.trial.speed_change_mps or 0.0
+        return {Direction.SLOWER: -change_mps, Direction.FASTER: change_mps}.get(self.group, abs(change_mps))
+
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Selection:
-    """The candidate that deviated most when driven.
+    """The candidate that deviated most when driven, or whose speed changed most.
 
     Args:
         pattern: pattern of the chosen candidate.
@@ -52,10 +71,11 @@ class Selection:
         chosen: index of the chosen candidate in `driven`.
         simulator_calls: number of drives, the clean one included if it was made for this; 0 if they are predicted.
         predicted: whether the drives are predicted, and nothing was driven for real.
+        chosen_by: what the drives were compared by, "path deviation" in metres or "speed change" in m/s.
         made_of: identity of the selection, by name (`io.identity`); empty in files of earlier versions.
 
     Raises:
-        RoadproofError: `chosen` is not an index of the candidates.
+        RoadproofError: `chosen` is not an index of the candidates, or `chosen_by` is another word.
     """
 
     pattern: Pattern
@@ -63,11 +83,14 @@ class Selection:
     chosen: int
     simulator_calls: int
     predicted: bool = False
+    chosen_by: str = DEVIATION
     made_of: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def __post_init__(self) -> None:
         if not 0 <= self.chosen < len(self.driven):
             raise RoadproofError(f"it has chosen {self.chosen} of {len(self.driven)} candidates")
+        if self.chosen_by not in UNITS:
+            raise RoadproofError(f"it was chosen by {self.chosen_by!r:.60}, expected {' or '.join(UNITS)}")
 
     @property
     def deviation_m(self) -> float:
@@ -118,10 +141,11 @@ def select_by_driving(
     weather: Weather = Weather.CLEAR_NOON,
     folder: Path,
     clean: Episode | None = None,
-    on_drive: Callable[[int, float], object] = lambda _done, _deviation_m: None,
+    on_drive: Callable[[int, float], object] = lambda _done, _effect: None,
 ) -> Selection:
     """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
 
+    Candidates of a search for a speed change are compared by how much the speed changed in their group's direction.
     Deviation rather than infraction points, which jump: what grazes a post at noon may touch nothing in the rain.
 
     Args:
@@ -133,7 +157,8 @@ def select_by_driving(
         weather: weather of the drives, clear noon by default.
         folder: folder that keeps every drive and the choice; what it holds is not done again.
         clean: drive over the bare road; None to make it here.
-        on_drive: called after each drive with the number done, the clean one included, and the largest deviation, m.
+        on_drive: called after each drive with the number done, the clean one included, and the largest deviation, m,
+            or change of the speed, m/s.
 
     Raises:
         RoadproofError: there is nothing to drive, the folder is damaged, or it holds a choice among others.
@@ -144,6 +169,7 @@ def select_by_driving(
     if not chosen:
         raise RoadproofError(f"{len(candidates)} candidates and {best} of them to drive; expected at least one")
     paints = {f"candidate-{rank}": raster(candidate.pattern) for rank, candidate in chosen}
+    by = chosen_by(candidates)
     episodes = Episodes.of(simulator, controller, scenario, paints, folder)
     bare = Conditions(paint=CLEAN, weather=weather)
     over = [replace(bare, paint=name) for name in paints]
@@ -153,6 +179,7 @@ def select_by_driving(
         "candidates": len(over),
         "patterns": [episodes.digests[name][:16] for name in paints],
         "drives": [episodes.file(drive) for drive in over],
+        "chosen_by": by,
     }
     if (folder / "selection.json").exists():
         kept = Selection.load(folder)
@@ -168,14 +195,15 @@ def select_by_driving(
     for (rank, candidate), drive in zip(chosen, over, strict=True):
         episodes.make(simulator, drive)
         driven.append(Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, drive)))
-        on_drive(1 + len(driven), max(each.trial.deviation_m for each in driven))
-    winner = max(range(len(driven)), key=lambda index: driven[index].trial.deviation_m)
+        on_drive(1 + len(driven), max(each.effect(by) for each in driven))
+    winner = max(range(len(driven)), key=lambda index: driven[index].effect(by))
     selection = Selection(
         pattern=chosen[winner][1].pattern,
         driven=tuple(driven),
         chosen=winner,
         simulator_calls=0 if simulator.paint.predicted else calls + len(driven),
         predicted=simulator.paint.predicted,
+        chosen_by=by,
         made_of=cast("dict[str, Any]", plain(made_of)),
     )
     selection.save(folder)

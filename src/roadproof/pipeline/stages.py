@@ -26,7 +26,7 @@ from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
 from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
-from roadproof.pipeline.selection import Selection, select_by_driving
+from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
@@ -121,7 +121,8 @@ class Stages:
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
         """The groups to attack: the method's own, or all drives pooled if the budget says so."""
-        return parse_groups("all", recordings) if self.budget.pooled else self.budget.method.groups(recordings)
+        budget = self.budget
+        return parse_groups("all", recordings) if budget.pooled else budget.method.groups(recordings, budget.objective)
 
     def attack(self, recordings: RecordingSet) -> AttackResult:
         """Search for patterns on the recordings."""
@@ -142,7 +143,7 @@ class Stages:
 
     def select(self, found: AttackResult, drives: Drives) -> Selection:
         """Drive over the strongest candidates once each, and choose one."""
-        total = 1 + min(self.budget.select, len(found.candidates))
+        total, unit = 1 + min(self.budget.select, len(found.candidates)), UNITS[chosen_by(found.candidates)]
         return select_by_driving(
             self.simulator,
             self.controller,
@@ -153,7 +154,7 @@ class Stages:
             folder=self.folder / "selection",
             # The simulator repeats itself, so the recorded clean drive is the one to compare with.
             clean=drives.drives[0].episode,
-            on_drive=lambda done, best: self.on_progress("Verifying by driving", done, total, f"{best:.2f} m"),
+            on_drive=lambda done, best: self.on_progress("Verifying by driving", done, total, f"{best:.2f} {unit}"),
         )
 
     def search_on(self, drives: Drives, recordings: RecordingSet, found: AttackResult, selection: Selection) -> Rounds:

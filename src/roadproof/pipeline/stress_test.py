@@ -21,8 +21,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from roadproof.attacks import AttackResult, Cheapest
+from roadproof.attacks import AttackResult, Cheapest, PathDeviation
 from roadproof.attacks.cheapest import check_wanted
+from roadproof.attacks.objective import ClosedLoop
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
@@ -152,12 +153,14 @@ def stress_test(
     stages.check_paint()
     if cheapest_m is not None:
         check_wanted(cheapest_m)
-        if not budget.is_predicted:
+        if not isinstance(budget.objective, PathDeviation):
             raise RoadproofError("the cheapest pattern is looked for in the recorded world; search a path deviation")
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
     require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
+    if isinstance(budget.objective, ClosedLoop):
+        budget.objective.check(controller)
     with working_in(folder):
         return _all_of(stages, film=film, cheapest_m=cheapest_m)
 

@@ -5,9 +5,8 @@ pose → picture → controller → vehicle → pose, for any number of cars at 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -91,8 +90,18 @@ class Rolled:
         return torch.stack([self.x_m[index], self.y_m[index]], 1).detach().cpu().numpy()
 
 
-Drive: TypeAlias = tuple[Rolled, int]
-"""One of the drives that were rolled together, by its number."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Foretold:
+    """What R patterns are predicted to do in each of S drives.
+
+    Args:
+        deviation_m: the paper's deviation from the bare drive from the same start, metres, (R, S).
+        speed_change_mps: mean change of the speed from that drive (`driving.speed`), m/s, negative where the car is
+            slower, (R, S).
+    """
+
+    deviation_m: Float[np.ndarray, "r s"]
+    speed_change_mps: Float[np.ndarray, "r s"]
 
 
 class RecordedWorld:
@@ -221,31 +230,17 @@ class RecordedWorld:
         starts: tuple[Start, ...] = (Start(),),
         looks: Looks | None = None,
     ) -> Float[np.ndarray, "r s"]:
-        """The paper's deviation that each pattern of a batch is predicted to cause, from each start.
+        """The paper's deviation that each pattern of a batch is predicted to cause, from each start; see `foretold`."""
+        return self.foretold(controller, patterns, starts, looks).deviation_m
 
-        Args:
-            controller: the controller, on the world's device; `fit` must have been called with it.
-            patterns: batch of R patterns.
-            starts: S offsets from the clean drive, from each of which every pattern is driven over.
-            looks: one look per start, for the bare and the painted drive alike; None for paint and camera as recorded.
-        """
-
-        def apart_m(bare: Drive, painted: Drive) -> float:
-            return deviation_m(self.whole_path(*bare), self.whole_path(*painted))
-
-        return self._compared(apart_m, controller, patterns, starts, looks)
-
-    def speed_changes_mps(
+    def foretold(
         self,
         controller: Controller,
         patterns: Pattern,
         starts: tuple[Start, ...] = (Start(),),
         looks: Looks | None = None,
-    ) -> Float[np.ndarray, "r s"]:
-        """The mean change of the speed that each pattern of a batch is predicted to cause, from each start.
-
-        It is `driving.speed`'s, m/s, negative where the painted drive is slower: over all instants at which the canvas
-        is in view, also those before the first recorded frame, at which the two drives are one.
+    ) -> Foretold:
+        """What each pattern of a batch is predicted to do to the path and to the speed, from each start.
 
         Args:
             controller: the controller, on the world's device; `fit` must have been called with it.
@@ -253,33 +248,23 @@ class RecordedWorld:
             starts: S offsets from the clean drive, from each of which every pattern is driven over.
             looks: one look per start, for the bare and the painted drive alike; None for paint and camera as recorded.
         """
-        share = self.course.count / (self.course.seen.stop - self.course.seen.start)
-
-        def faster_mps(bare: Drive, painted: Drive) -> float:
-            before, after = (rolled.speed_mps[number] for rolled, number in (bare, painted))
-            return share * float((after - before).mean())
-
-        return self._compared(faster_mps, controller, patterns, starts, looks)
-
-    def _compared(
-        self,
-        compare: Callable[[Drive, Drive], float],
-        controller: Controller,
-        patterns: Pattern,
-        starts: tuple[Start, ...],
-        looks: Looks | None,
-    ) -> Float[np.ndarray, "r s"]:
-        """What a comparison says of every painted drive beside the bare one from the same start with the same look."""
         at_once = max(1, AT_ONCE // len(starts))
+        # Before the first recorded frame the two drives are one.
+        share = self.course.count / (self.course.seen.stop - self.course.seen.start)
+        deviations: list[float] = []
+        changes: list[Tensor] = []
         with torch.no_grad():
             bare = self.roll(controller, starts=starts, looks=looks)
-            found: list[float] = []
+            paths = [self.whole_path(bare, k) for k in range(len(starts))]
             for first in range(0, len(patterns.boxes), at_once):
                 part = slice(first, first + at_once)
                 some = Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part])
                 rolled = self.roll(controller, some, starts=starts, looks=looks)
-                found += [compare((bare, k % len(starts)), (rolled, k)) for k in range(len(rolled.x_m))]
-        return np.array(found).reshape(-1, len(starts))
+                count = len(rolled.x_m)
+                deviations += [deviation_m(paths[k % len(starts)], self.whole_path(rolled, k)) for k in range(count)]
+                change = rolled.speed_mps - bare.speed_mps.repeat(count // len(starts), 1)
+                changes.append(share * change.mean(1).view(-1, len(starts)))
+        return Foretold(np.array(deviations).reshape(-1, len(starts)), torch.cat(changes).cpu().numpy())
 
     def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:
         """Cars at the first recorded frame of the clean drive, one for each start, repeated `repeats` times."""

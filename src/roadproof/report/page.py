@@ -33,7 +33,10 @@ FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
 SHOWN_COMPOSITES = 3
 PRINTED_MOMENTS = 6
-FORETOLD = ("predicted_m", "least_m", "most_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad")
+FORETOLD = (
+    *("predicted_m", "least_m", "most_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad"),
+    *("predicted_mps", "least_mps", "most_mps", "driven_mps"),
+)
 
 PAINTED = {
     PaintKind.RENDERED: "It is part of the simulator’s world, rendered with the road.",

@@ -10,6 +10,7 @@ import numpy as np
 from roadproof.datatypes import Ending
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.intervals import mean_95
+from roadproof.driving.speed import speed_in_words
 from roadproof.report.formatting import UNKNOWN, in_words, mean_in_words
 from roadproof.report.run import Run
 
@@ -47,6 +48,13 @@ def verdict(run: Run) -> Verdict:
         return _foreseen(evaluation) if evaluation.predicted else _driven(evaluation)
     if run.attack is not None:
         attack = run.attack
+        if attack.predicted_mps is not None:
+            return Verdict(
+                "predicted",
+                "Predicted, not driven",
+                f"Driven in the recorded frames, the pattern makes the car {speed_in_words(attack.predicted_mps)} on "
+                "average while the canvas is in view; nobody has driven over it for real yet.",
+            )
         if attack.predicted_m is not None:
             return Verdict(
                 "predicted",
