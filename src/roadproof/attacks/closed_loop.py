@@ -1,9 +1,9 @@
 """What measures of drives in the recorded world share: patterns driven over side by side, with gradients.
 
 Patterns × starts are driven side by side (`recorded.world`), in each weather that was recorded. A measure says what it
-reads of each drive, such as the mean offset to the right (`attacks.deviation`) or the mean change of the speed
-(`attacks.speed`), metres or m/s; the value of a pattern for a group is the mean of that over weathers, starts and looks, positive in
-the group's direction.
+reads of each drive, such as the mean offset to the right in metres (`attacks.deviation`) or the mean change of the
+speed in m/s (`attacks.speed`); the value of a pattern for a group is the mean of that over weathers, starts and looks,
+positive in the group's direction.
 """
 
 from __future__ import annotations

@@ -41,7 +41,8 @@ class DeviationMeasure(ClosedLoopMeasure):
         variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
 
     Raises:
-        RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group is of the speed.
+        RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group is one of the
+            speed.
         ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
     """
 
@@ -66,6 +67,7 @@ class DeviationMeasure(ClosedLoopMeasure):
 
     def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
         """The mean offset of each drive, metres, right positive, hardly more than the saturation."""
+        del world
         return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
 
     def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:

@@ -32,8 +32,8 @@ class GradOpt(Method):
     """Exact gradients, and starts that compete (successive halving) before the best of them are searched to the end.
 
     Args:
-        iterations: number of steps of the full search; by default 100 for a steering shift and 32 for a path deviation or
-            a speed change.
+        iterations: number of steps of the full search; by default 100 for a steering shift and 32 for a path deviation
+            or a speed change.
         restarts: number of starts per group that are searched to the end.
         halving: whether many starts compete for these places (successive halving); otherwise the starts are random.
 

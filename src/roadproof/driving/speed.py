@@ -30,8 +30,8 @@ def speed_difference(clean: Episode, painted: Episode, canvas: CanvasPlacement) 
         mean = 1/T ∑_{t=1}^{T} (ṽ_t − v_t)
 
     with v the speed without and ṽ that with the pattern, at the same instants, so that T dt mean is how many metres
-    further the painted drive came. A car that stands goes on standing; where the painted drive ended before, the mean is
-    over the instants there are. Predicted drives, which begin nearer to the canvas, count as equal before they begin.
+    further the painted drive came. A car that stands goes on standing; where the painted drive ended before, the mean
+    is over the instants there are. Predicted drives, which begin nearer to the canvas, count as equal until then.
 
     Args:
         clean: episode of the drive without the pattern.

@@ -92,8 +92,8 @@ def judge(
 ) -> Trial:
     """The trial of two drives that differ in the paint alone.
 
-    Deviation and change of the speed are taken over the instants at which the clean drive has the canvas in view, the largest offset over the
-    whole painted drive.
+    Deviation and change of the speed are taken over the instants at which the clean drive has the canvas in view, the
+    largest offset over the whole painted drive.
     """
     beside = lateral_m(path_of(clean), path_of(painted))
     faster = speed_difference(clean, painted, canvas)

@@ -79,8 +79,8 @@ class Budget:
         at_random = self.trajectories.scheme is Scheme.RANDOM
         if self.is_predicted and (self.pooled or at_random):
             raise RoadproofError(
-                f"a {self.objective.name} is searched for each side apart; attack drives pooled or perturbed at random by "
-                "their steering shift: objective=SteeringShift()"
+                f"a {self.objective.name} is searched for each side apart; attack drives pooled or perturbed at random "
+                "by their steering shift: objective=SteeringShift()"
             )
 
     def _check_published(self) -> None:

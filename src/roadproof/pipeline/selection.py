@@ -27,7 +27,6 @@ from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
-
 DEVIATION, SPEED = PathDeviation.word, SpeedChange.word
 
 UNITS = {DEVIATION: "m", SPEED: "m/s"}
@@ -58,7 +57,9 @@ class Driven:
         if chosen_by == DEVIATION:
             return self.trial.deviation_m
         change_mps = self.trial.speed_change_mps or 0.0
-        return {Direction.SLOWER: -change_mps, Direction.FASTER: change_mps}.get(self.group, abs(change_mps))
+        if self.group == Direction.SLOWER:
+            return -change_mps
+        return change_mps if self.group == Direction.FASTER else abs(change_mps)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
