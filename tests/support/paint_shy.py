@@ -58,3 +58,21 @@ def along_a_street(folder, time_limit_s=4.0):
         canvas=CanvasPlacement(x_m=32.0, y_m=0.0, width_m=6.6),
         time_limit_s=time_limit_s,
     )
+
+
+class BrakeShy(PaintShy):
+    """Goes straight on, and takes its foot off the throttle before magenta paint, the more of it there is."""
+
+    def controls(self, frames, speed_mps, command):
+        fear = self.steer(frames, speed_mps, command)
+        steady = 0.3 + 0.1 * (6.0 - speed_mps)
+        return torch.stack([torch.zeros_like(fear), (steady - 4.0 * fear).clamp(0.0, 1.0), fear.clamp(0.0, 1.0)], 1)
+
+    def act(self, frame, speed_mps, command):
+        frames = torch.tensor(frame).permute(2, 0, 1)[None].float() / 255
+        controls = self.controls(frames, torch.tensor([speed_mps]), torch.tensor([command]))
+        return Control(*map(float, controls[0]))
+
+
+def brake_shy():
+    return BrakeShy()

@@ -134,7 +134,7 @@ class ClosedLoopMeasure(ABC):
     def readings(
         self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
     ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
-        """Steering shift on the recorded frames, and what is predicted with small steering errors.
+        """Steering shift on the recorded frames, and what is predicted with small errors.
 
         The predictions of all weathers stand one after another.
         """

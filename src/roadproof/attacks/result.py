@@ -53,7 +53,7 @@ class Candidate:
         predicted_range_m: least and largest of these predicted deviations, metres; None if nothing was driven there.
         driven: effect in the drive that chose the pattern; None if nothing was driven in a simulator.
         predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
-            recorded weathers and small errors of steering; None if the search was not for a change of the speed.
+            recorded weathers and small errors; None if the search was not for a change of the speed.
         predicted_range_mps: least and largest of these predicted changes, m/s; None if there are none.
     """
 
@@ -93,7 +93,7 @@ class AttackResult:
             None if the search did not drive there, or was for a change of the speed.
         predicted_range_m: least and largest of these predicted deviations, metres; None if there are none.
         predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
-            recorded weathers and small errors of steering; None if the search was not for a change of the speed.
+            recorded weathers and small errors; None if the search was not for a change of the speed.
         predicted_range_mps: least and largest of these predicted changes, m/s; None if there are none.
         driven: effect of the strongest pattern in the drive that chose it; None if nothing was driven in a simulator.
         by_group: best value of every group, in the objective's unit: steer units per frame, metres, or m/s; for the

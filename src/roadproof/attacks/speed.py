@@ -81,7 +81,7 @@ class SpeedMeasure(ClosedLoopMeasure):
         return world.foretold(self.controller, patterns, UNSURE, looks).speed_change_mps
 
     def rank(self, predicted: Float[Tensor, "g r s"]) -> Float[Tensor, "g r"]:
-        """The least change over small errors of steering in each group's direction, m/s."""
+        """The least change over small errors in each group's direction, m/s."""
         sides = [to_side(part, group.direction) for group, part in zip(self.groups, predicted, strict=True)]
         return torch.stack(sides).amin(-1)
 

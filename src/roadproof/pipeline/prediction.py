@@ -30,7 +30,7 @@ class Prediction(Saved):
         most_m: largest predicted deviation over those errors, metres.
         driven_m: the paper's deviation of the drive in the simulator, metres.
         predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
-            small errors of steering; None in files of earlier versions, as in the next three.
+            small errors; None in files of earlier versions, as in the next three.
         least_mps: lowest predicted change over those errors, m/s.
         most_mps: highest predicted change over those errors, m/s.
         driven_mps: mean change of the speed of the drive in the simulator, m/s.
