@@ -107,8 +107,48 @@ def test_what_a_search_predicted_is_said_in_metres(tmp_path, invoke):
     assert printed.out.startswith("   1 clean+left   predicted 1.25 m, predicted drive: deviation ")
 
 
+def test_what_a_search_for_the_speed_predicted_is_said_in_metres_a_second(tmp_path, invoke):
+    write_recorded(tmp_path)
+    write_attack(tmp_path / "attack")
+    found = AttackResult.load(tmp_path / "attack")
+    seen = dataclasses.replace(found.candidates[0], group="slower", predicted_mps=-1.25)
+    dataclasses.replace(found, candidates=(seen,)).save(tmp_path / "attack")
+    where = ["--simulator", f"recorded:{tmp_path}", "--controller", "team_folder:magenta_shy"]
+    code, printed = invoke("select", tmp_path, *where)
+    assert code == 0, printed.err
+    assert printed.out.startswith("   1 slower       predicted 1.25 m/s slower, predicted drive: ")
+    trial = stored(tmp_path / "selection" / "selection.json")["driven"][0]["trial"]
+    assert f"predicted drive: {abs(trial['speed_change_mps']):.2f} m/s " in printed.out
+    assert "by speed change" in printed.out
+
+
+SPEED = ["--objective", "speed", "--figures", "1", "--random-patterns", "0"]
+
+
+def test_the_command_searches_what_changes_the_speed(workplace, tmp_path, invoke, monkeypatch):
+    monkeypatch.chdir(workplace)
+    brakes = ["--controller", "paint_shy:brake_shy", "--out", tmp_path, "--method", "random", "--calls", "2"]
+    code, printed = invoke("attack", "run/recordings", *SPEED, *brakes, "--groups", "slower")
+    assert code == 0, printed.err
+    assert "Strongest for slower: " in printed.out
+    assert "Best of each group (speed change, predicted m/s): slower" in printed.out
+    found = stored(tmp_path / "result.json")
+    assert (found["objective"], found["group"], found["predicted_m"]) == ("speed change", "slower", None)
+    assert f"{abs(found['predicted_mps']):.2f} m/s " in printed.out
+    options = ["--simulator", "recorded:run", "--no-film", "--starts", "0"]
+    code, printed = invoke("evaluate", tmp_path / "pattern.json", *options, *brakes[:2], "--out", tmp_path / "judged")
+    assert code == 0, printed.err
+    (trial,) = stored(tmp_path / "judged" / "evaluation.json")["trials"]
+    assert f"{trial['speed_change_mps']:.2f}" in printed.out
+
+
 EVALUATE = ["evaluate", "pattern.json", "--controller", "pilotnet", "--simulator", "recorded:run"]
+ATTACK = ["attack", "run/recordings", "--controller"]
 MISTAKES = {
+    "speed without pedals": ([*ATTACK, "paint_shy:paint_shy", *SPEED], "the controller only steers"),
+    "speed, dry run": ([*ATTACK, "paint_shy:paint_shy", *SPEED, "--dry-run"], "the controller only steers"),
+    "speed to a side": ([*ATTACK, "pilotnet", *SPEED, "--groups", "clean+right"], "knows no group clean+right"),
+    "cheapest in m/s": ([*ATTACK, "pilotnet", *SPEED, "--cheapest", "0.5"], "in metres of deviation, --objective speed"),
     "runs": ([*EVALUATE, "--runs", "2"], "--runs is 2, but recordings hold no others"),
     "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),
     "another scenario": ([*EVALUATE, "--scenario", "left-03"], "the scenario's canvas has y_m"),

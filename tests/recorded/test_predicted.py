@@ -7,17 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from paint_shy import PaintShy, magenta
-from recorded_drives import drivable_set
+from paint_shy import BrakeShy, PaintShy, magenta
+from recorded_drives import CANVAS, drivable_set
 from roadproof.attacks import Candidate
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.driving.deviation import passage, passage_deviation_m, path_of
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
-from roadproof.patterns import raster
+from roadproof.driving.rollout import rollout
+from roadproof.driving.speed import speed_difference
+from roadproof.errors import RoadproofError
+from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.film import film_trial
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recorded.simulator import RecordedSimulator
+from roadproof.recorded.world import RecordedWorld
 from roadproof.report.page import write_report
 from roadproof.scenarios import find_scenario
 from roadproof.simulators.protocol import PaintKind
@@ -122,3 +126,39 @@ def test_a_selection_in_recordings_is_called_predicted(recordings, tmp_path):
     assert (chosen.chosen, chosen.predicted, chosen.simulator_calls) == (1, True, 0)
     assert json.loads((tmp_path / "selection.json").read_text())["kind"] == "predicted"
     assert Selection.load(tmp_path).predicted
+
+
+def test_the_speed_foretold_in_a_batch_is_that_of_a_drive_step_by_step(recordings):
+    with RecordedSimulator(recordings) as simulator:
+        clean, painted = (
+            rollout(simulator, BrakeShy(), simulator.scenario, pattern=pattern) for pattern in (None, BAR)
+        )
+    driven = speed_difference(clean, painted, CANVAS)
+    world = RecordedWorld(recordings)
+    world.fit(BrakeShy())
+    foretold = world.foretold(BrakeShy(), Pattern(BAR.shapes, BAR.boxes[None], BAR.colours[None]))
+    assert driven.most_mps < driven.mean_mps < -0.1
+    assert foretold.speed_change_mps[0, 0] == pytest.approx(driven.mean_mps, abs=0.03)
+
+
+def test_what_was_searched_to_change_the_speed_is_chosen_by_it(recordings, tmp_path):
+    faint = dataclasses.replace(BAR, colours=torch.full((1, 3), 0.4))
+    aside = [Candidate(each, "all", 0.3) for each in (faint, BAR)]
+    slower = [Candidate(each.pattern, "slower", 0.3, predicted_mps=-0.5) for each in aside]
+    faster = [Candidate(each.pattern, "faster", 0.3, predicted_mps=0.5) for each in aside]
+    told = []
+    with RecordedSimulator(recordings) as world:
+
+        def chosen(candidates, folder):
+            given = {"best": 2, "folder": folder, "on_drive": lambda *progress: told.append(progress)}
+            return select_by_driving(world, BrakeShy(), world.scenario, candidates, **given)
+
+        found = chosen(slower, tmp_path / "one")
+        changes = [each.trial.speed_change_mps for each in found.driven]
+        assert (found.chosen, found.chosen_by) == (1, "speed change")
+        assert changes[1] < changes[0] - 0.1
+        assert told[-1] == (3, -changes[1])
+        assert chosen(faster, tmp_path / "two").chosen == 0, "what brakes least is the fastest"
+        assert Selection.load(tmp_path / "one").chosen_by == "speed change"
+        with pytest.raises(RoadproofError, match="a choice with chosen_by 'speed change', now it is 'path deviation'"):
+            chosen(aside, tmp_path / "one")
