@@ -148,7 +148,10 @@ MISTAKES = {
     "speed without pedals": ([*ATTACK, "paint_shy:paint_shy", *SPEED], "the controller only steers"),
     "speed, dry run": ([*ATTACK, "paint_shy:paint_shy", *SPEED, "--dry-run"], "the controller only steers"),
     "speed to a side": ([*ATTACK, "pilotnet", *SPEED, "--groups", "clean+right"], "knows no group clean+right"),
-    "cheapest in m/s": ([*ATTACK, "pilotnet", *SPEED, "--cheapest", "0.5"], "in metres of deviation, --objective speed"),
+    "cheapest in m/s": (
+        [*ATTACK, "pilotnet", *SPEED, "--cheapest", "0.5"],
+        "in metres of deviation, --objective speed",
+    ),
     "runs": ([*EVALUATE, "--runs", "2"], "--runs is 2, but recordings hold no others"),
     "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),
     "another scenario": ([*EVALUATE, "--scenario", "left-03"], "the scenario's canvas has y_m"),

@@ -7,7 +7,7 @@ import pytest
 
 from roadproof.datatypes import Ending, VehicleState
 from roadproof.driving.deviation import passage, path_of
-from roadproof.driving.speed import speed_difference, speed_in_words
+from roadproof.driving.speed import speed_difference, speed_in_words, speeds_in_words
 from roadproof.scenarios import find_scenario
 from roadproof.simulators.protocol import PaintKind
 from runs import driven
@@ -63,3 +63,5 @@ def test_predicted_drives_count_as_equal_before_they_begin():
 
 def test_words_say_the_unit_and_the_side():
     assert (speed_in_words(-0.851), speed_in_words(0.2)) == ("0.85 m/s slower", "0.20 m/s faster")
+    assert speeds_in_words(-0.78, -0.74) == "0.74 to 0.78 m/s slower"
+    assert speeds_in_words(-0.3, 0.1) == "0.10 m/s faster to 0.30 m/s slower"

@@ -14,7 +14,7 @@ from roadproof.attacks.checks import Check
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, method_of, stored
-from roadproof.driving.speed import speed_in_words
+from roadproof.driving.speed import speed_in_words, speeds_in_words
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import picture, table
@@ -147,8 +147,8 @@ class AttackResult:
     def predicted(self) -> tuple[str, str] | None:
         """What is predicted, in words with its unit, and its spread; None if nothing was driven in recordings."""
         if self.predicted_mps is not None:
-            least, most = map(speed_in_words, self.predicted_range_mps or (self.predicted_mps, self.predicted_mps))
-            return speed_in_words(self.predicted_mps), f"{least} to {most}"
+            spread = self.predicted_range_mps or (self.predicted_mps, self.predicted_mps)
+            return speed_in_words(self.predicted_mps), speeds_in_words(*spread)
         if self.predicted_m is None:
             return None
         low, high = self.predicted_range_m or (self.predicted_m, self.predicted_m)

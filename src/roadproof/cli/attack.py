@@ -165,9 +165,7 @@ def _summarise(result: AttackResult, out: Path) -> None:
     if result.predicted is not None:
         looks = " and variations" if result.objective.endswith("variations") else ""
         mean, spread = result.predicted
-        shift = (
-            f"{mean} predicted ({spread} over small errors{looks}), nothing was driven for real; {shift}"
-        )
+        shift = f"{mean} predicted ({spread} over small errors{looks}), nothing was driven for real; {shift}"
     say(
         f"Strongest for {result.group}: {shift}",
         f"Best of each group ({in_units(result.objective)}): {sides}",

@@ -50,3 +50,10 @@ def speed_difference(clean: Episode, painted: Episode, canvas: CanvasPlacement) 
 def speed_in_words(change_mps: float) -> str:
     """A change of the speed as people say it, such as "0.85 m/s slower"."""
     return f"{abs(change_mps):.2f} m/s {'slower' if change_mps < 0 else 'faster'}"
+
+
+def speeds_in_words(least_mps: float, most_mps: float) -> str:
+    """A range of changes of the speed as people say it, such as "0.74 to 0.78 m/s slower"."""
+    small, large = sorted((least_mps, most_mps), key=abs)
+    first = f"{abs(small):.2f}" if small * large > 0 else speed_in_words(small)
+    return f"{first} to {speed_in_words(large)}"
