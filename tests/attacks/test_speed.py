@@ -65,14 +65,14 @@ def whole(road):
     return search(road)
 
 
-def foretold(road, patterns, starts=(Start(),)):
+def foretold(road, patterns, starts):
     world = RecordedWorld(road)
     world.fit(Careful())
     return world.foretold(Careful(), patterns, starts)
 
 
 def test_a_search_for_the_speed_beats_chance_and_says_how_much_in_metres_a_second(road, whole, tmp_path):
-    by_chance = foretold(road, SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9))))
+    by_chance = foretold(road, SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9))), UNSURE[:1])
     assert abs(whole.predicted_mps) > 1.2 * np.abs(by_chance.speed_change_mps).mean()
     assert (whole.history[-1] >= whole.history[0] - 1e-3).all()
     assert list(whole.by_group) == ["slower", "faster"]
@@ -169,9 +169,9 @@ def test_what_makes_no_sense_is_one_clear_line(road, whole):
         SpeedChange(starts=())
     with pytest.raises(ControllerError, match="only steers, so in recordings it has the clean drive's speed"):
         attack(road, RampFollower(), SPACE, objective=SpeedChange(), method=SHORT)
-    with pytest.raises(RecordingError, match="the speed change knows no group clean.right; expected slower, faster"):
+    with pytest.raises(RecordingError, match="the speed change knows no group clean"):
         search(road, groups=(RIGHT_GROUP, LEFT_GROUP))
-    with pytest.raises(RecordingError, match="the steering shift knows no group slower; expected clean.right"):
+    with pytest.raises(RecordingError, match="the steering shift knows no group slower"):
         search(road, groups=parse_groups("slower", road), objective=PathDeviation())
     with pytest.raises(RoadproofError, match="the search before was for the speed change"):
         cheapest(road, Careful(), whole, 0.1, groups=parse_groups("slower,faster", road))

@@ -150,7 +150,7 @@ MISTAKES = {
     "speed to a side": ([*ATTACK, "pilotnet", *SPEED, "--groups", "clean+right"], "knows no group clean+right"),
     "cheapest in m/s": (
         [*ATTACK, "pilotnet", *SPEED, "--cheapest", "0.5"],
-        "in metres of deviation, --objective speed",
+        "in metres of deviation, --objective",
     ),
     "runs": ([*EVALUATE, "--runs", "2"], "--runs is 2, but recordings hold no others"),
     "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),
