@@ -222,7 +222,7 @@ class PathDeviation(ClosedLoop):
 class SpeedChange(ClosedLoop):
     """How much slower, or faster, the car goes in the recorded world, closed loop; its value is m/s.
 
-    It is the mean over the passage of the speed less that of the clean drive at the same instants. The controller must
+    It is the mean over the passage of the speed less that of the drive over the bare road there. The controller must
     say throttle and brake (`PedalController`). The groups are "slower" and "faster".
 
     Args:
