@@ -61,12 +61,12 @@ def along_a_street(folder, time_limit_s=4.0):
 
 
 class BrakeShy(PaintShy):
-    """Goes straight on, and takes its foot off the throttle before magenta paint, the more of it there is."""
+    """Goes straight on as recorded, and brakes for magenta paint, the more of it there is; a grainy road is none."""
 
     def controls(self, frames, speed_mps, command):
-        fear = self.steer(frames, speed_mps, command)
-        steady = 0.3 + 0.1 * (6.0 - speed_mps)
-        return torch.stack([torch.zeros_like(fear), (steady - 4.0 * fear).clamp(0.0, 1.0), fear.clamp(0.0, 1.0)], 1)
+        red, green, blue = frames.unbind(1)
+        fear = self.gain * (torch.minimum(red, blue) - green - 0.5).clamp_min(0).mean((1, 2))
+        return torch.stack([torch.zeros_like(fear), torch.full_like(fear, 0.05), fear.clamp(0.0, 1.0)], 1)
 
     def act(self, frame, speed_mps, command):
         frames = torch.tensor(frame).permute(2, 0, 1)[None].float() / 255
