@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,7 +16,10 @@ from roadproof.cli.verbs import begin, keep_command
 from roadproof.limits import MANY
 
 if TYPE_CHECKING:
-    from roadproof.attacks import AttackResult
+    from roadproof.attacks import AttackResult, Method, Objective
+    from roadproof.attacks.groups import Group
+    from roadproof.controllers import Controller
+    from roadproof.recordings import RecordingSet
 
 
 @with_paint
@@ -76,20 +80,15 @@ def attack(
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
-    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern, site_of
+    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, site_of
     from roadproof.attacks import attack as run
-    from roadproof.attacks import cheapest as fewest
-    from roadproof.attacks.cheapest import MOST_LEVELS, in_words
-    from roadproof.attacks.objective import ClosedLoop, SpeedChange, varied
+    from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
-    from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
-    from roadproof.errors import RecordingError, RoadproofError
     from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
-    from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
 
     space = SearchSpace(
@@ -109,20 +108,15 @@ def attack(
     word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
     goal = varied(OBJECTIVES[word], paint.variation)
     space = space.on(site_of(drives))
-    if cheapest is not None and not drives.is_placed:
-        raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
-    if cheapest is not None and isinstance(goal, SpeedChange):
-        raise RoadproofError("--cheapest is in metres of deviation, --objective speed in m/s; leave one of them out")
+    if cheapest is not None:
+        _check_cheapest(drives, word)
     attacked = load_controller(controller, device=device, dtype=dtype)
+    _check_attacked(attacked, drives, searched, goal, device=device)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
-    size = (drives.view.height_px, drives.view.width_px)
-    require_usable(attacked, size=size, device=device, drives=False, gradients=searched.by_gradient)
-    if isinstance(goal, ClosedLoop):
-        goal.check(attacked)
     frames = sum(len(each.frames) for each in drives.recordings)
-    begin(of_search(searched, OBJECTIVES[word], frames, attacked, groups=len(chosen)), out)
+    begin(of_search(searched, goal, frames, attacked, groups=len(chosen)), out)
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(goal)) as on_step:
         result = run(
@@ -140,21 +134,81 @@ def attack(
         )
     result.save(out)
     keep_command(out)
-    winner = next(group for group in chosen if str(group) == result.group)
-    draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
+    _draw(result, drives, attacked, chosen, device, out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, out)
     found = stored(out / "result.json")
     if cheapest is not None:
-        with progress("Looking for less paint", MOST_LEVELS) as on_step:
-            less = fewest(
-                drives, attacked, result, cheapest, groups=chosen, objective=goal, device=device, on_level=on_step
-            )
-        if less is not None:
-            less.save(out / "cheapest")
-        found["cheapest"] = None if less is None else stored(out / "cheapest" / "cheapest.json")
-        say(in_words(less, cheapest))
+        found["cheapest"] = _less_paint(drives, attacked, result, cheapest, chosen, goal, device, out / "cheapest")
     answer(found)
+
+
+def _check_attacked(
+    attacked: Controller, drives: RecordingSet, method: Method, objective: Objective, *, device: str
+) -> None:
+    """Refuse a controller that the search cannot work on, before it begins.
+
+    Raises:
+        ControllerError: the controller fails on frames like the recorded ones, or lacks what the objective needs.
+    """
+    from roadproof.attacks.objective import ClosedLoop
+    from roadproof.controllers.checks import require_usable
+
+    size = (drives.view.height_px, drives.view.width_px)
+    require_usable(attacked, size=size, device=device, drives=False, gradients=method.by_gradient)
+    if isinstance(objective, ClosedLoop):
+        objective.check(attacked)
+
+
+def _check_cheapest(drives: RecordingSet, objective: str) -> None:
+    """Refuse to look for the least paint where it cannot be told.
+
+    Raises:
+        RecordingError: the recordings cannot be driven in.
+        RoadproofError: the search before it is not in metres.
+    """
+    from roadproof.errors import RecordingError, RoadproofError
+
+    if not drives.is_placed:
+        raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
+    if objective == "speed":
+        raise RoadproofError("--cheapest is in metres of deviation, --objective speed in m/s; leave one of them out")
+
+
+def _draw(
+    result: AttackResult, drives: RecordingSet, attacked: Controller, groups: Sequence[Group], device: str, out: Path
+) -> None:
+    from roadproof.attacks import show_pattern
+    from roadproof.report.plots import draw_attack
+
+    winner = next(group for group in groups if str(group) == result.group)
+    draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
+
+
+def _less_paint(
+    drives: RecordingSet,
+    attacked: Controller,
+    strongest: AttackResult,
+    wanted_m: float,
+    groups: Sequence[Group],
+    objective: Objective,
+    device: str,
+    folder: Path,
+) -> dict[str, Any] | None:
+    """The least paint for a deviation, which the folder keeps, as its file has it; None if there is none."""
+    from roadproof.attacks import cheapest
+    from roadproof.attacks.cheapest import MOST_LEVELS, in_words
+    from roadproof.cli.progress import progress
+
+    with progress("Looking for less paint", MOST_LEVELS) as show:
+        less = cheapest(
+            drives, attacked, strongest, wanted_m, groups=groups, objective=objective, device=device, on_level=show
+        )
+    say(in_words(less, wanted_m))
+    if less is None:
+        return None
+    less.save(folder)
+    return stored(folder / "cheapest.json")
 
 
 def _summarise(result: AttackResult, out: Path) -> None:
