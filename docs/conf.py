@@ -71,7 +71,7 @@ def _help(words: tuple[str, ...]) -> str:
 def read_source(_app: object, name: str, source: list[str]) -> None:
     """README before the index; links to what is no page of the site become words."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8") if name == "index" else ""
-    source[0] = _linked(readme, ROOT) + _linked(source[0], DOCS)
+    source[0] = _linked(readme, ROOT) + _linked(source[0], (DOCS / name).parent)
 
 
 def _linked(text: str, folder: Path) -> str:
@@ -82,7 +82,7 @@ def _linked(text: str, folder: Path) -> str:
             return found[0]
         whole = (folder / path).resolve()
         page = whole.is_relative_to(DOCS) and not whole.is_relative_to(DOCS / "results") and whole.is_file()
-        return f"{mark}[{words}]({whole.relative_to(DOCS)}{'#' * bool(anchor)}{anchor})" if page else words
+        return f"{mark}[{words}](/{whole.relative_to(DOCS)}{'#' * bool(anchor)}{anchor})" if page else words
 
     return re.sub(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", link, text)
 

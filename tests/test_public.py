@@ -12,7 +12,7 @@ import roadproof
 TYPED = re.findall(r"^from \S+ import (\w+) as \1$", Path(roadproof.__file__).with_suffix(".pyi").read_text(), re.M)
 TEXTS = [
     path
-    for folder in ("README.md", "docs", "examples")
+    for folder in ("README.md", "docs", "docs/tutorials", "examples")
     for place in [Path(__file__).parents[1] / folder]
     for path in ([place] if place.is_file() else [*place.glob("*.md"), *place.glob("*.py")])
     if path.name != "conf.py"  # builds the docs, and is none of them

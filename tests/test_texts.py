@@ -12,7 +12,7 @@ import typer
 from roadproof.cli import app
 
 ROOT = Path(__file__).parents[1]
-TEXTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+TEXTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")]
 FILE = re.compile(r"\b(?:tests|benchmarks|studies|examples|docs)/[\w/.-]+\.(?:py|toml|md|json|png|jpg|parquet)\b")
 
 
