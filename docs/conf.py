@@ -81,7 +81,7 @@ def _linked(text: str, folder: Path) -> str:
         if "://" in target or not path:
             return found[0]
         whole = (folder / path).resolve()
-        page = whole.is_relative_to(DOCS) and not whole.is_relative_to(DOCS / "results") and whole.is_file()
+        page = whole.is_relative_to(DOCS) and whole.is_file() and (mark or not whole.is_relative_to(DOCS / "results"))
         return f"{mark}[{words}](/{whole.relative_to(DOCS)}{'#' * bool(anchor)}{anchor})" if page else words
 
     return re.sub(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", link, text)

@@ -82,5 +82,3 @@ def test_files_are_saved_python_is_run_and_numbers_may_differ(tmp_path):
     )
     folder = run(page(tmp_path, text), tmp_path)
     assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} == {"own/a.py", "b.txt"}
-
-

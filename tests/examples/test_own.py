@@ -1,4 +1,4 @@
-"""The examples that the README shows, run as they are."""
+"""The examples, run as they are."""
 
 from __future__ import annotations
 

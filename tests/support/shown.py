@@ -2,7 +2,7 @@
 
     python tests/support/shown.py README.md .venv/bin
 
-runs a page with the programs of that folder. It needs nothing but Python. A comment before a block says how it is taken:
+runs a page with the programs of that folder. It needs nothing but Python. Comments before blocks say how they are taken:
 
     <!-- file: NAME -->        the block is what the page has its reader save under this name
     <!-- dry run: REASON -->   commands that have `--dry-run` only estimate; the others only have their words read
@@ -172,7 +172,13 @@ class _Reader:
         log = self.folder / "serving.log"
         with log.open("w") as out:
             self.server = subprocess.Popen(
-                words, cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, stdout=out, stderr=out, text=True
+                words,
+                cwd=self.folder,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+                text=True,
             )
         until = time.monotonic() + LIMIT_S
         while not (said := re.search(r"Serving .*:(\d+) and \d+;", log.read_text())):
