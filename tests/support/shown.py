@@ -2,7 +2,8 @@
 
     python tests/support/shown.py README.md .venv/bin
 
-runs a page with the programs of that folder. It needs nothing but Python. Comments before blocks say how they are taken:
+runs a page with the programs of that folder, and needs nothing but Python. Comments before blocks say how they are
+taken:
 
     <!-- file: NAME -->        the block is what the page has its reader save under this name
     <!-- dry run: REASON -->   commands that have `--dry-run` only estimate; the others only have their words read
