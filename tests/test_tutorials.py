@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sysconfig
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,8 @@ def test_a_page_shows_something_and_says_why_it_is_not_run(path):
     assert any(block.language == "sh" and not block.mark for block in found)
     assert all(len(block.said) > 10 for block in found if block.mark in ("dry run", "not run"))
     assert len(found) == path.read_text(encoding="utf-8").count("\n```") / 2
+    offered = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert shown.extras(path) <= set(offered)
     assert not re.search(r"<!--(?! (?:file|dry run|not run): .+ -->)", path.read_text(encoding="utf-8"))
 
 

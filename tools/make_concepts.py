@@ -17,12 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw, ImageFont
 
-from roadproof import RecordedSimulator, SearchSpace, TownSimulator, calibrate, composite, find_scenario, record
+from roadproof import SearchSpace, TownSimulator, calibrate, composite, find_scenario, record
 from roadproof.calibration import Method
 from roadproof.compositing import view_canvas
 from roadproof.datatypes import VehicleState
 from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.patterns import raster
+from roadproof.recorded import RecordedWorld
+from roadproof.recorded.pictures import Poses
 from roadproof.training.expert import expert
 
 SCENARIO = find_scenario("straight-10")
@@ -134,12 +136,16 @@ def main() -> None:
     ]
     page(tiles, 3).save(folder / "concepts-composite.jpg", quality=88, optimize=True)
 
-    with RecordedSimulator(recordings) as world:
-        made = world.reset(replace(world.scenario, start=moved)).frame
+    bank, canvas_at = RecordedWorld(recordings).bank, SCENARIO.canvas
+    wanted = (moved.x_m - canvas_at.x_m, moved.y_m - canvas_at.y_m, moved.yaw_rad)
+    poses = Poses(*(torch.tensor([value], dtype=torch.float64) for value in wanted))
+    nearest = bank.nearest(poses)
+    made = (255 * bank.show(poses, nearest).frames[0]).round().byte().permute(1, 2, 0).numpy()
+    recorded = np.concatenate([each.frames for each in recordings.recordings])[int(nearest.frame)]
     tiles = [
-        ("the nearest recorded frame is moved", shown(clean.frames[at])),
-        (f"to a pose {ASIDE_M} m to the right, turned", shown(made)),
-        ("the simulator at that pose, for comparison", shown(real)),
+        ("the nearest recorded frame", shown(recorded)),
+        (f"moved to where the car is: {ASIDE_M} m to the right, turned", shown(made)),
+        ("the simulator there, for comparison", shown(real)),
     ]
     page(tiles, 3).save(folder / "concepts-recorded-world.jpg", quality=88, optimize=True)
 
