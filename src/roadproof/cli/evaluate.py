@@ -17,6 +17,9 @@ from roadproof.cli.worlds import Recorded, open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD
 
+TOLD_MPS = 0.1
+"""A mean change of the speed that is worth a column."""
+
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
     from roadproof.driving.evaluation import Evaluation
@@ -178,16 +181,18 @@ def _check_recorded(
 def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, compared: bool) -> None:
     from roadproof.report.formatting import UNKNOWN, mean_in_words
 
-    columns, title = ("drives", "deviation m", "aside m", "speed m/s", "left lane", "points", "clean"), None
-    if evaluation.predicted:
-        columns = ("drives", "predicted m", "aside m", "predicted m/s", "left lane", "infractions")
-        title = "Predicted: composited into recorded frames, nothing was driven for real"
-    note = (
-        "deviation: median (least–most); aside: furthest; m/s: mean change of speed, negative = slower; clean: points "
-        "on the bare road"
-    )
     rows = evaluation.rows()
     several = len({row.pattern for row in rows}) > 1
+    # Most paint turns a car and leaves its speed alone: then there is nothing to say of it.
+    faster = any(abs(row.speed_change_mps.value) > TOLD_MPS for row in rows if row.speed_change_mps is not None)
+    columns, title = ("drives", "deviation m", "aside m", "left lane", "points", "clean"), None
+    if evaluation.predicted:
+        columns = ("drives", "predicted m", "aside m", "left lane", "infractions")
+        title = "Predicted: composited into recorded frames, nothing was driven for real"
+    note = "deviation: median (least–most); aside: furthest; clean: points on the bare road"
+    if faster:
+        speed = "predicted m/s" if evaluation.predicted else "speed m/s"
+        columns, note = (*columns[:3], speed, *columns[3:]), f"{note}; m/s: mean change of speed, negative = slower"
     shown = table((*(["pattern"] if several else []), "weather", "with"), columns, title=title, note=note)
     for row in rows:
         points = [
@@ -201,7 +206,7 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
             str(row.count),
             row.metres,
             mean_in_words(row.lateral_m, 2),
-            UNKNOWN if row.speed_change_mps is None else mean_in_words(row.speed_change_mps, 2),
+            *([mean_in_words(row.speed_change_mps, 2)] if faster else []),
             f"{row.left_lane:.0%}",
             *([UNKNOWN] if row.failed is None else points),
         )
