@@ -190,7 +190,7 @@ def test_a_full_disk_is_named_and_leaves_nothing_half_written(here, tmp_path, in
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("roadproof.io.files.json.dumps", full)
+    monkeypatch.setattr("pathlib.Path.write_text", full)
     code, printed = invoke(*command("--out", str(tmp_path / "out")))
     assert code == 2
     assert "No space left" in printed.err
