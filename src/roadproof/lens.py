@@ -1,20 +1,19 @@
 """Lenses that bend straight lines: from where a point lies to where the picture shows it, and back.
 
-    symbol     meaning                                                                          shape
-    X, Y, Z    direction to a point in camera axes: right, down, forward                        (…)
-    u          (X, Y) / |(X, Y)|                                                                (…, 2)
-    m          how far off the axis the point is: |(X, Y)| / Z (Brown–Conrady), or the angle    (…)
-               between direction and axis in radians (fisheye)
-    d          where the picture shows it, in focal lengths from its middle                     (…, 2)
+    symbol     meaning                                                               shape
+    X, Y, Z    direction to a point in camera axes: right, down, forward             (…)
+    u          (X, Y) / ‖X, Y‖                                                       (…, 2)
+    m          how far off the axis it is: ‖X, Y‖ / Z, in a fisheye the angle, rad   (…)
+    d          where the picture shows it, in focal lengths from its middle          (…, 2)
 
 With q = m u = (x, y), both lenses are a radial part and a part t that only Brown–Conrady has,
 
     d = R(m) u + t(q),    R(m) = m (1 + k1 m² + k2 m⁴ + k3 m⁶ + k4 m⁸)
     t = (2 p1 x y + p2 (m² + 2 x²),  p1 (m² + 2 y²) + 2 p2 x y),
 
-    ∂d/∂q = R′ u uᵀ + (R / m) (1 − u uᵀ) + ∂t/∂q,    |∂t/∂q| ≤ 6 |p| m,    |t| ≤ 3 |p| m².
+    ∂d/∂q = R′ u uᵀ + (R / m) (1 − u uᵀ) + ∂t/∂q,    ‖∂t/∂q‖ ≤ 6 ‖p‖ m,    ‖t‖ ≤ 3 ‖p‖ m².
 
-∂d/∂q is symmetric. As long as 12 |p| m is less than R′ and R / m it is positive definite, so that no two points are
+∂d/∂q is symmetric. As long as 12 ‖p‖ m is less than R′ and R / m it is positive definite, so that no two points are
 shown in one place, and q ← R⁻¹(d − t(q)) comes at least twice as near with every step. The least m at which that ends
 is the lens's `limit`; beyond, R goes on with slope 1 and t stays, so that what is outside the picture stays there.
 
