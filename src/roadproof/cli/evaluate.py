@@ -17,8 +17,8 @@ from roadproof.cli.worlds import Recorded, open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD
 
-TOLD_MPS = 0.1
-"""A mean change of the speed that is worth a column."""
+TOLD_MPS = 0.3
+"""A mean change of the speed, m/s, that is worth a column: one kilometre an hour."""
 
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
