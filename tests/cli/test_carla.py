@@ -93,7 +93,8 @@ def test_record_calibrate_attack_evaluate_drive_and_report(call, tmp_path, impat
     assert Episode.load(tmp_path / "driven" / "episode.npz").paint is PaintKind.INJECT
     page = (run / "report.html").read_text()
     assert "(paint: inject)" in page
-    assert "carla://HOST:PORT?paint=inject" in page
+    assert "--simulator carla://HOST:PORT" in page
+    assert "127.0.0.1" not in page
     # What was recorded elsewhere is calibrated there: the command does not go on in the town.
     (run / "recordings").rename(run / "before")
     port = free_port()
