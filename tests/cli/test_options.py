@@ -57,7 +57,7 @@ def test_the_help_states_ranges_and_defaults_and_no_type_beside_flags(invoke, mo
         assert "<bool>" not in printed.out
         if words == ("attack",):
             assert "[1 to 64] [default: 5]" in printed.out
-            assert "[default: (100; 32 for a deviation)]" in printed.out
+            assert "[default: (100; 32 for a deviation or a speed)]" in printed.out
 
 
 def test_the_help_is_shown_as_it_is_written():
