@@ -6,29 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from painted_ground import RampFollower, recorded_road
+from painted_ground import RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack, methods
 from roadproof.attacks.gradopt import BEHIND, DRAWN, MUTATION, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
-from roadproof.recorded import RecordedWorld, Start, Vehicle
+from roadproof.recorded import RecordedWorld, Start
 from roadproof.recorded.world import UNSURE
 from roadproof.recordings import pooled
 from roadproof.search_space import SearchSpace, derived_seed
 
 SPACE = SearchSpace(figures=1)
 SHORT = GradOpt(iterations=8, restarts=2, halving=False)
-VEHICLE = dataclasses.replace(
-    Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
-)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def known_vehicle():
-    """The straight drives of the set say nothing of the steering."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+def vehicle():
+    with known_vehicle():
         yield
 
 

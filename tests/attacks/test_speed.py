@@ -1,28 +1,24 @@
 """Searching what changes the car's speed: what is found brakes it more than chance, and every number says its unit."""
 
-import dataclasses
 import json
 
 import numpy as np
 import pytest
 import torch
 
-from painted_ground import MIDDLE, RampFollower, recorded_road
+from painted_ground import MIDDLE, RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import GradOpt, PathDeviation, RandomSearch, SpeedChange, attack, cheapest, kept_attack
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.result import AttackResult
 from roadproof.compositing import Variation
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError, RecordingError, RoadproofError
-from roadproof.recorded import RecordedWorld, Start, Vehicle
+from roadproof.recorded import RecordedWorld, Start
 from roadproof.recorded.world import UNSURE
 from roadproof.search_space import SearchSpace
 
 SPACE = SearchSpace(figures=1)
 SHORT = GradOpt(iterations=4, restarts=2, halving=False)
-VEHICLE = dataclasses.replace(
-    Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
-)
 
 
 class Careful(RampFollower):
@@ -39,10 +35,8 @@ class Careful(RampFollower):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def known_vehicle():
-    """The straight drives of the set say nothing of the vehicle."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+def vehicle():
+    with known_vehicle():
         yield
 
 

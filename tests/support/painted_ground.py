@@ -1,12 +1,15 @@
 """A road whose picture from any pose is known: smooth colours on the ground, a smooth sky, a straight clean drive."""
 
 import dataclasses
+from contextlib import contextmanager
 
 import numpy as np
+import pytest
 import torch
 
 from roadproof.datatypes import Control, VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose, sight
+from roadproof.recorded import Vehicle
 from roadproof.recordings import Recording, RecordingSet, Side, Track
 from scenes import PLAIN
 
@@ -14,6 +17,17 @@ CANVAS = CanvasPlacement(x_m=120.0, y_m=-40.0, yaw_rad=0.0)
 VIEW = dataclasses.replace(CIL_INPUT, resampling="area")
 DT_S = 0.1
 SPEED_MPS = 6.0
+VEHICLE = dataclasses.replace(
+    Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=DT_S), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
+)
+
+
+@contextmanager
+def known_vehicle():
+    """The straight drives of the set say nothing of the steering."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
+        yield
 
 
 def pose(ahead_m, left_m=0.0, yaw_rad=0.0):

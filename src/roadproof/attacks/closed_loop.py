@@ -12,6 +12,7 @@ import copy
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from typing import TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -31,6 +32,22 @@ MAX_PICTURES = 800
 """Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
 
 
+class Rolling(TypedDict, total=False):
+    """How patterns are driven over, beside what drives over them where.
+
+    Args:
+        starts: offsets from the clean drive at which the drives over each pattern begin; by default one, with none.
+        every: number of steps from one picture to the next, 1 or more; 2 by default.
+        device: torch device on which the cars drive, the CPU by default.
+        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+    """
+
+    starts: tuple[Start, ...]
+    every: int
+    device: torch.device | str
+    variation: Variation | None
+
+
 class ClosedLoopMeasure(ABC):
     """What patterns do to the drive in a recorded world, for every group at once.
 
@@ -38,10 +55,7 @@ class ClosedLoopMeasure(ABC):
         recordings: recordings with canvas and tracks; the drives of each weather are a world of their own.
         controller: the controller that drives; it computes on `device`.
         groups: groups that state the directions; whatever group they belong to, all drives of the set are driven in.
-        starts: offsets from the clean drive at which the drives over each pattern begin.
-        every: number of steps from one picture to the next, 1 or more.
-        device: torch device on which the cars drive.
-        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+        **rolling: starts, every, device and variation; see `Rolling`.
 
     Raises:
         RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group has a direction
@@ -54,12 +68,9 @@ class ClosedLoopMeasure(ABC):
         recordings: RecordingSet,
         controller: Controller,
         groups: Sequence[Group],
-        *,
-        starts: tuple[Start, ...] = (Start(),),
-        every: int = 2,
-        device: torch.device | str = "cpu",
-        variation: Variation | None = None,
+        **rolling: Unpack[Rolling],
     ) -> None:
+        device, variation = rolling.get("device", "cpu"), rolling.get("variation")
         # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
         self._steering = Surrogate(recordings, controller, self.steered(groups), device=device, variation=variation)
         self.groups = tuple(groups)
@@ -69,8 +80,9 @@ class ClosedLoopMeasure(ABC):
             world.fit(controller)
         self.device = torch.device(device)
         self.frames_evaluated = 0
-        self._starts, self.every = starts, every
+        self._starts, self.every = rolling.get("starts", (Start(),)), rolling.get("every", 2)
         self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
+        self._bare: dict[tuple[int, int], Rolled] = {}
 
     def steered(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """The groups whose steering shift stands beside a prediction: by default the same."""
@@ -105,6 +117,8 @@ class ClosedLoopMeasure(ABC):
         """Take the mean over the looks of another seed from now on; does nothing without a variation."""
         if self.variation is not None:
             self._looks = self.variation.draw(seed, self.device)
+            # Not cleared: a copy of this measure may have these drives with looks of its own.
+            self._bare = {}
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         """Mean towards each group's direction, at R points per group, without gradients."""
@@ -162,19 +176,24 @@ class ClosedLoopMeasure(ABC):
 
     def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         patterns = space.pattern(unit.flatten(0, 1))
-        read = torch.cat([self._read(world, patterns).view(*unit.shape[:2], -1) for world in self.worlds], -1)
+        each = [self.read(world, self.roll(world, patterns)) for world in self.worlds]
+        read = torch.cat([part.view(*unit.shape[:2], -1) for part in each], -1)
         sides = [to_side(part, group.direction) for group, part in zip(self.groups, read, strict=True)]
         return torch.stack(sides).mean(-1).float()
-
-    def _read(self, world: RecordedWorld, patterns: Pattern) -> Float[Tensor, " r"]:
-        """The reading of each drive in one world, start after start, each of them once with every look."""
-        return self.read(world, self.roll(world, patterns))
 
     def roll(self, world: RecordedWorld, patterns: Pattern | None) -> Rolled:
         """The drives over each pattern in one world, or over the bare road: each start once with every look."""
         starts = tuple(start for start in self._starts for _ in range(self._times))
         self.frames_evaluated += (1 if patterns is None else len(patterns.boxes)) * self._pictures(world)
         return world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
+
+    def bare(self, world: RecordedWorld) -> Rolled:
+        """The drives over the bare road in one world, from each start with every look; made once."""
+        key = (id(world), self.every)
+        if key not in self._bare:
+            with torch.no_grad():
+                self._bare[key] = self.roll(world, None)
+        return self._bare[key]
 
     def _pictures(self, world: RecordedWorld) -> int:
         """Number of pictures that all drives over one pattern take."""

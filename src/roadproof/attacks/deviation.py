@@ -11,19 +11,20 @@ with d the offset from the clean path to that side and s some metres: a car that
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.closed_loop import ClosedLoopMeasure, Rolling
 from roadproof.attacks.groups import Group
 from roadproof.attacks.surrogate import Surrogate
-from roadproof.compositing.variation import Looks, Variation
+from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled, Start
+from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled
 from roadproof.recordings import RecordingSet
 
 
@@ -34,11 +35,8 @@ class DeviationMeasure(ClosedLoopMeasure):
         recordings: recordings with canvas and tracks; the drives of each weather are a world of their own.
         controller: the controller that drives; it computes on `device`.
         groups: groups that state the sides; whatever group they belong to, all drives of the set are driven in.
-        starts: offsets from the clean drive at which the drives over each pattern begin.
-        every: number of steps from one picture to the next, 1 or more.
         saturation_m: the s of the formula above, metres.
-        device: torch device on which the cars drive.
-        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+        **rolling: starts, every, device and variation; see `closed_loop.Rolling`.
 
     Raises:
         RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group is one of the
@@ -52,13 +50,10 @@ class DeviationMeasure(ClosedLoopMeasure):
         controller: Controller,
         groups: Sequence[Group],
         *,
-        starts: tuple[Start, ...] = (Start(),),
-        every: int = 2,
         saturation_m: float = 3.0,
-        device: torch.device | str = "cpu",
-        variation: Variation | None = None,
+        **rolling: Unpack[Rolling],
     ) -> None:
-        super().__init__(recordings, controller, groups, starts=starts, every=every, device=device, variation=variation)
+        super().__init__(recordings, controller, groups, **rolling)
         self._saturation_m = saturation_m
 
     def open_loop(self) -> Surrogate:

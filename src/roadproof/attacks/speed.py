@@ -22,12 +22,11 @@ from torch import Tensor
 
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.groups import SPEEDS, Direction, Group, require_directions, to_side
-from roadproof.compositing.variation import Looks, Variation
+from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller, PedalController
 from roadproof.errors import ControllerError
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled, Start
-from roadproof.recordings import RecordingSet
+from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled
 
 
 class SpeedMeasure(ClosedLoopMeasure):
@@ -36,20 +35,6 @@ class SpeedMeasure(ClosedLoopMeasure):
     Its groups are "slower", "faster" or "all", whichever the car gives way to; its arguments and errors are those of
     `ClosedLoopMeasure`.
     """
-
-    def __init__(
-        self,
-        recordings: RecordingSet,
-        controller: Controller,
-        groups: Sequence[Group],
-        *,
-        starts: tuple[Start, ...] = (Start(),),
-        every: int = 2,
-        device: torch.device | str = "cpu",
-        variation: Variation | None = None,
-    ) -> None:
-        super().__init__(recordings, controller, groups, starts=starts, every=every, device=device, variation=variation)
-        self._bare_mps: dict[tuple[int, int], Tensor] = {}
 
     def steered(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """All drives, steered to either side: how far paint that changes the speed also turns the wheel."""
@@ -62,19 +47,8 @@ class SpeedMeasure(ClosedLoopMeasure):
 
     def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
         """The mean change of the speed in each drive, m/s, positive where the car is faster."""
-        key = (id(world), self.every)
-        if key not in self._bare_mps:
-            with torch.no_grad():
-                self._bare_mps[key] = self.roll(world, None).speed_mps
-        bare_mps = self._bare_mps[key]
+        bare_mps = self.bare(world).speed_mps
         return (rolled.speed_mps - bare_mps.repeat(len(rolled.speed_mps) // len(bare_mps), 1)).mean(1)
-
-    def redraw(self, seed: int) -> None:
-        """Take the mean over the looks of another seed from now on; does nothing without a variation."""
-        super().redraw(seed)
-        if self.variation is not None:
-            # Not cleared: a copy of this measure may have these drives with looks of its own.
-            self._bare_mps = {}
 
     def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The mean change of the speed, m/s, negative where the car is slower, of R patterns in each of S drives."""
