@@ -12,9 +12,10 @@ import needs
 from command import answered, stored
 from roadproof.cli import verbs
 from roadproof.drives import load_drives
+from roadproof.io import commands
 from roadproof.pipeline.selection import Selection
 from roadproof.recordings import load_recordings
-from roadproof.report.run import COMMANDS, read_run
+from roadproof.report.run import read_run
 
 needs.town()
 
@@ -108,7 +109,7 @@ def test_a_kept_command_does_not_say_where_a_server_stood_or_how_much_was_said(t
     words = ("roadproof", "evaluate", "a b.json", "--simulator", "carla://10.0.0.7:2001?paint=native", "--json")
     monkeypatch.setattr(verbs, "words_given", lambda: words)
     verbs.keep_command(tmp_path)
-    line = (tmp_path / COMMANDS).read_text()
+    line = (tmp_path / commands.FILE).read_text()
     assert line == "roadproof evaluate 'a b.json' --simulator 'carla://HOST:PORT?paint=native'\n"
 
 

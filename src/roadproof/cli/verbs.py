@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -19,7 +18,7 @@ from roadproof.cli.group import words_given
 from roadproof.cli.output import answer, in_json, say
 from roadproof.cli.progress import Loudness, in_words, is_quiet, speak
 from roadproof.errors import RoadproofError
-from roadproof.io.files import write_text
+from roadproof.io.commands import write_command
 from roadproof.io.locks import hold
 
 if TYPE_CHECKING:
@@ -124,10 +123,5 @@ def keep_command(folder: Path) -> None:
 
     How much it said is left out, and so is where a server stood, which is nobody's to keep.
     """
-    from roadproof.report.run import COMMANDS
-
     kept = [re.sub(r"^carla://[^?]*", "carla://HOST:PORT", word) for word in words_given() if word not in _LOUD]
-    line = shlex.join(kept) + "\n"
-    place = folder / COMMANDS
-    if not place.exists() or place.read_text(encoding="utf-8") != line:
-        write_text(place, line)
+    write_command(folder, kept)

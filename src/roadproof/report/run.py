@@ -34,6 +34,7 @@ from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.arrays import read_archive
+from roadproof.io.commands import read_commands
 from roadproof.io.files import check_closed
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.fidelity import Fidelity
@@ -45,7 +46,6 @@ from roadproof.pipeline.stages import CHEAPEST
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.simulators.protocol import PatternImage
 
-COMMANDS = "commands.txt"
 _STAGES = ("record", "calibration", "attack", "selection", "evaluation")
 
 
@@ -204,20 +204,11 @@ def _cheapest(folder: Path) -> Cheapest | None:
 
 def _commands(folder: Path) -> tuple[str, ...]:
     """The commands kept in a run, or else those kept in the folders of its stages."""
-    if whole := _lines(folder / COMMANDS):
+    if whole := read_commands(folder):
         return whole
     # What a stage made for several runs at once stands in each of them.
-    stages = tuple(chain.from_iterable(_lines(folder / stage / COMMANDS) for stage in _STAGES))
+    stages = tuple(chain.from_iterable(read_commands(folder / stage) for stage in _STAGES))
     return (*stages, shlex.join(["roadproof", "report", str(folder)])) if stages else ()
-
-
-def _lines(path: Path) -> tuple[str, ...]:
-    try:
-        return tuple(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
-    except FileNotFoundError:
-        return ()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RoadproofError(f"{path} cannot be read ({error}); remove it") from None
 
 
 def _judged(folder: Path) -> Judged:
