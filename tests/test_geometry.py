@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from references import homography_jacobian
 from roadproof.datatypes import VehicleState
 from roadproof.errors import GeometryError
 from roadproof.geometry import (
@@ -21,7 +22,6 @@ from roadproof.geometry import (
     check_image_from_canvas,
     homography_from_points,
     homography_from_pose,
-    homography_jacobian,
     reprojection_errors_px,
 )
 

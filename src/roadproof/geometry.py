@@ -327,13 +327,6 @@ def apply_homography(b_from_a: Float[np.ndarray, "*b 3 3"], points: Float[np.nda
         return mapped[..., :2] / mapped[..., 2:]
 
 
-def homography_jacobian(b_from_a: Homography, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
-    """Derivative of the mapped points: entry [n, i, j] is ∂b_i/∂a_j at point n."""
-    w = points @ b_from_a[2, :2] + b_from_a[2, 2]
-    mapped = apply_homography(b_from_a, points)
-    return (b_from_a[:2, :2] - mapped[:, :, None] * b_from_a[2, :2]) / w[:, None, None]
-
-
 def homography_from_points(
     canvas: Float[np.ndarray, "n 2"],
     image: Float[np.ndarray, "m 2"],

@@ -6,25 +6,13 @@ from dataclasses import replace
 import pytest
 
 from lenses import ACTION, BARREL, behind
-from roadproof.datatypes import Weather
-from roadproof.drives import Trajectories
-from roadproof.drives.folder import Settings, write_settings
-from roadproof.drives.trajectories import Window
+from roadproof.drives.folder import write_settings
 from roadproof.errors import RecordingError
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT
+from roadproof.geometry import CIL_CAMERA
 from roadproof.scenarios import find_scenario
+from runs import settings_of
 
-SETTINGS = Settings(
-    scenario=find_scenario("left-03"),
-    weather=Weather.CLEAR_NOON,
-    trajectories=Trajectories(),
-    window=Window(),
-    seed=0,
-    driver="nobody",
-    camera=CIL_CAMERA,
-    view=CIL_INPUT,
-    dt_s=0.05,
-)
+SETTINGS = settings_of(find_scenario("left-03"))
 
 
 def test_a_recording_goes_on_with_its_own_lens_only(tmp_path):

@@ -8,6 +8,13 @@ from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, apply_homography, homography_from_pose
 
 
+def homography_jacobian(b_from_a, points):
+    """Derivative of the mapped points: entry [n, i, j] is ∂b_i/∂a_j at point n."""
+    w = points @ b_from_a[2, :2] + b_from_a[2, 2]
+    mapped = apply_homography(b_from_a, points)
+    return (b_from_a[:2, :2] - mapped[:, :, None] * b_from_a[2, :2]) / w[:, None, None]
+
+
 def approach(count=8, first_m=14.0, last_m=4.0, lateral_m=0.0):
     """Homographies of a straight drive towards a canvas at the origin."""
     canvas = CanvasPlacement(x_m=0.0, y_m=0.0)

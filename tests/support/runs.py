@@ -191,9 +191,9 @@ def write_calibration(folder):
     )
 
 
-def write_record(folder, scenario):
-    """Three recorded drives, of which one had to be tried twice."""
-    settings = Settings(
+def settings_of(scenario):
+    """How a scenario is recorded where nothing is asked for."""
+    return Settings(
         scenario=scenario,
         weather=WEATHERS[0],
         trajectories=Trajectories(),
@@ -204,7 +204,11 @@ def write_record(folder, scenario):
         view=CIL_INPUT,
         dt_s=DT_S,
     )
-    write_settings(settings, folder)
+
+
+def write_record(folder, scenario):
+    """Three recorded drives, of which one had to be tried twice."""
+    write_settings(settings_of(scenario), folder)
     steps = np.arange(40, 60, 5)
     for name, right_m, calls in (("clean", 0.0, 1), ("right", 1.5, 2), ("left", -1.4, 1)):
         write_drive(

@@ -17,14 +17,14 @@ from roadproof.cli.worlds import Recorded, open_world, world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD
 
-TOLD_MPS = 0.3
-"""A mean change of the speed, m/s, that is worth a column: one kilometre an hour."""
-
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
     from roadproof.driving.evaluation import Evaluation
     from roadproof.patterns import Pattern
     from roadproof.pipeline.fidelity import Fidelity
+
+_TOLD_MPS = 0.3
+"""A mean change of the speed, m/s, that is worth a column: one kilometre an hour."""
 
 
 def evaluate(
@@ -184,7 +184,7 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
     rows = evaluation.rows()
     several = len({row.pattern for row in rows}) > 1
     # Most paint turns a car and leaves its speed alone: then there is nothing to say of it.
-    faster = any(abs(row.speed_change_mps.value) > TOLD_MPS for row in rows if row.speed_change_mps is not None)
+    faster = any(abs(row.speed_change_mps.value) > _TOLD_MPS for row in rows if row.speed_change_mps is not None)
     columns, title = ("drives", "deviation m", "aside m", "left lane", "points", "clean"), None
     if evaluation.predicted:
         columns = ("drives", "predicted m", "aside m", "left lane", "infractions")

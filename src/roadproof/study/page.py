@@ -59,10 +59,10 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     # A list of what was missing does not outlive the gaps.
     (out / f"{GAPS}.tex").unlink(missing_ok=True)
     for table in tables:
-        _write(out / f"{table.name}.tex", in_latex(table))
+        write_text(out / f"{table.name}.tex", in_latex(table))
     name, sentence = folder.resolve().name, _sentence(results, jobs.values())
-    _write(out / "tables.md", _markdown(name, sentence, results, tables, pictures))
-    _write(out / "tables.html", _page(name, sentence, results, tables, pictures, out))
+    write_text(out / "tables.md", _markdown(name, sentence, results, tables, pictures))
+    write_text(out / "tables.html", _page(name, sentence, results, tables, pictures, out))
     return out / "tables.html"
 
 
@@ -123,7 +123,3 @@ def _sentence(results: Results, jobs: Iterable[KeptJob]) -> str:
     traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
     scenarios = counted(len(results.kinds), "scenario")
     return f"Patterns{against} on {scenarios}, {seeds}, found at {home}{also}, driven{traffic}."
-
-
-def _write(path: Path, text: str) -> None:
-    write_text(path, text)

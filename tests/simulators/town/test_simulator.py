@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import needs
+from references import homography_jacobian
 from roadproof.datatypes import Command, Control, VehicleState, Weather
 from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.geometry import (
@@ -18,7 +19,6 @@ from roadproof.geometry import (
     CropResize,
     apply_homography,
     homography_from_pose,
-    homography_jacobian,
 )
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from town_driving import drive, fingerprint
