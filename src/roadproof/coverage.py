@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.constants import constant
 from roadproof.geometry import CANVAS_SIZE_PX, Resampling
 
 FOOTPRINT_VARIANCE: dict[Resampling, float] = {"antialiased-bilinear": 1.0, "area": 0.5}
@@ -196,7 +197,7 @@ def polygon_vertices(shape: Shape, box: Float[Tensor, "*b 5"]) -> Float[Tensor, 
         turn = torch.arange(128, device=box.device, dtype=box.dtype) * (2 * torch.pi / 128)
         unit = torch.stack([torch.cos(turn), torch.sin(turn)], -1) / 2
     else:
-        unit = torch.tensor(_CORNERS[shape], device=box.device, dtype=box.dtype)
+        unit = constant(_CORNERS[shape], box)
     angle = torch.deg2rad(box[..., 4:5])
     c, s = torch.cos(angle), torch.sin(angle)
     du, dv = unit[:, 0] * box[..., 2:3], unit[:, 1] * box[..., 3:4]

@@ -18,6 +18,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from roadproof.constants import constant
 from roadproof.coverage import Footprints, Shape, coverage
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
@@ -60,7 +61,7 @@ class Pattern:
     @property
     def painted_share(self) -> Float[Tensor, "*b"]:
         """Sum of the figures' areas over the canvas' area: an upper bound of what is painted."""
-        fill = torch.tensor([_FILL[shape] for shape in self.shapes], device=self.boxes.device, dtype=self.boxes.dtype)
+        fill = constant(tuple(_FILL[shape] for shape in self.shapes), self.boxes)
         return (fill * self.boxes[..., 2] * self.boxes[..., 3]).sum(-1) / CANVAS_SIZE_PX**2
 
     def _repr_png_(self) -> bytes | None:

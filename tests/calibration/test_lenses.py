@@ -12,7 +12,8 @@ from roadproof.calibration.published import RUNS, calibration_points, homographi
 from roadproof.calibration.replays import Replays
 from roadproof.calibration.report import stated_errors_px
 from roadproof.drives import Drive
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, apply_homography, homogeneous
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT
+from roadproof.homographies import apply_homography, homogeneous
 
 VIEW = dataclasses.replace(CIL_INPUT, resampling="area")
 OFF = np.array([0.004, 0.008, 0.002, 0.08, -0.02, 0.1])

@@ -11,7 +11,8 @@ from lenses import LENSES, behind
 from references import approach
 from roadproof.compositing import composite, view_canvas
 from roadproof.compositing.published import nearest_canvas_pixels
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, apply_homography
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize
+from roadproof.homographies import apply_homography
 from roadproof.lens import Lens
 from roadproof.search_space import SearchSpace
 from scenes import PLAIN, road_frames

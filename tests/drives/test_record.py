@@ -11,7 +11,8 @@ from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
 from roadproof.drives.folder import write_settings
 from roadproof.errors import OutputError, RecordingError, ScenarioError
-from roadproof.geometry import CIL_CAMERA, apply_homography, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, homography_from_pose
+from roadproof.homographies import apply_homography
 from roadproof.recordings import Side
 from roadproof.scenarios import find_scenario
 from roadproof.training.expert import expert

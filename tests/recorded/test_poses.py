@@ -8,14 +8,8 @@ import pytest
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import RecordingError
-from roadproof.geometry import (
-    CIL_CAMERA,
-    CameraModel,
-    CanvasPlacement,
-    CropResize,
-    apply_homography,
-    homography_from_pose,
-)
+from roadproof.geometry import CIL_CAMERA, CameraModel, CanvasPlacement, CropResize, homography_from_pose
+from roadproof.homographies import apply_homography
 from roadproof.recorded.poses import placed
 from roadproof.recordings import Recording, RecordingSet, Side
 from scenes import PLAIN

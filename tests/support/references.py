@@ -5,7 +5,8 @@ import torch
 
 from roadproof.coverage import Shape, polygon_vertices
 from roadproof.datatypes import VehicleState
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, apply_homography, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.homographies import apply_homography
 
 
 def homography_jacobian(b_from_a, points):

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from roadproof.datatypes import VehicleState
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, apply_homography, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.homographies import apply_homography
 from roadproof.training.pasting import FARTHEST_M, PastedPaint, _covered, _ground_seen
 
 

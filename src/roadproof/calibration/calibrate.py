@@ -18,7 +18,8 @@ from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
-from roadproof.geometry import Homography, homography_from_pose
+from roadproof.geometry import homography_from_pose
+from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps

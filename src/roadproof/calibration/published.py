@@ -19,16 +19,8 @@ from roadproof.calibration.replays import Replays, uniform
 from roadproof.datatypes import Observation
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError, ColourError, GeometryError
-from roadproof.geometry import (
-    CANVAS_SIZE_PX,
-    CameraModel,
-    CropResize,
-    Homography,
-    check_image_from_canvas,
-    homography_from_points,
-    reprojection_errors_px,
-    sight,
-)
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
+from roadproof.homographies import Homography, check_image_from_canvas, homography_from_points, reprojection_errors_px
 from roadproof.photometry import ColourTransform, fit_affine
 from roadproof.simulators.protocol import PatternImage
 

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, homogeneous
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel
+from roadproof.homographies import homogeneous
 from roadproof.io.records import RecordFile, Saved
 
 _GRID = 9

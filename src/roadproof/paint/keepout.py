@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from roadproof.constants import constant
 from roadproof.errors import PatternError
 from roadproof.paint.site import Site, half_edges_m, metres_per_px
 
@@ -49,7 +50,7 @@ class KeepOut:
 
     def __call__(self, boxes: Float[Tensor, "*b k 5"]) -> Float[Tensor, "*b k 5"]:
         """Every figure's box, moved and shrunk where it has to be."""
-        scale = boxes.new_tensor(metres_per_px(self.size_m))
+        scale = constant(metres_per_px(self.size_m), boxes)
         boxes = torch.cat([self._moved(boxes, scale), boxes[..., 2:]], -1)
         share = self._share(boxes) * _INSIDE
         share = torch.where(share < 1, share, 1.0)[..., None]

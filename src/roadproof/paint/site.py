@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.constants import constant
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
 
@@ -106,7 +107,7 @@ def half_edges_m(
 ) -> tuple[Float[Tensor, "*b k 2"], Float[Tensor, "*b k 2"], Float[Tensor, "*b k 2"]]:
     """Middle of every box, and half of its edges across and along, which span a parallelogram in canvas metres."""
     x, y, width, length, rotation_deg = boxes.unbind(-1)
-    scale = boxes.new_tensor(metres_per_px(size_m))
+    scale = constant(metres_per_px(size_m), boxes)
     angle = torch.deg2rad(rotation_deg)
     c, s = torch.cos(angle), torch.sin(angle)
     across = torch.stack([c, s], -1) * (width / 2)[..., None]

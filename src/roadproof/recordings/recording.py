@@ -11,7 +11,8 @@ from jaxtyping import Float, Int, UInt8
 
 from roadproof.datatypes import Command, Obstacle
 from roadproof.errors import GeometryError, RecordingError
-from roadproof.geometry import CameraModel, CanvasPlacement, CropResize, check_image_from_canvas
+from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
+from roadproof.homographies import check_image_from_canvas
 from roadproof.io.files import check_name
 from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps

@@ -14,14 +14,8 @@ from jaxtyping import Float, UInt8
 
 from roadproof.datatypes import Command, Control, Observation, VehicleState, Weather
 from roadproof.errors import RoadproofError, SimulatorError
-from roadproof.geometry import (
-    CANVAS_SIZE_PX,
-    CameraModel,
-    Homography,
-    apply_homography,
-    homogeneous,
-    homography_from_pose,
-)
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, homography_from_pose
+from roadproof.homographies import Homography, apply_homography, homogeneous
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, Obstacle, Weather
-from roadproof.geometry import CameraModel, CropResize, Homography
+from roadproof.geometry import CameraModel, CropResize
+from roadproof.homographies import Homography
 from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
 from roadproof.traffic.agents import Agents

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from roadproof.datatypes import VehicleState
-from roadproof.geometry import CameraModel, CanvasPlacement, apply_homography, homography_from_pose
+from roadproof.geometry import CameraModel, CanvasPlacement, homography_from_pose
+from roadproof.homographies import apply_homography
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL, Paint, Scene
 
 CAMERA = CameraModel(width_px=160, height_px=120, fov_deg=100.0, forward_m=2.0, up_m=1.4, pitch_deg=-15.0)

@@ -11,15 +11,8 @@ import needs
 from references import homography_jacobian
 from roadproof.datatypes import Command, Control, VehicleState, Weather
 from roadproof.errors import ScenarioError, SimulatorError
-from roadproof.geometry import (
-    CIL_CAMERA,
-    CIL_INPUT,
-    CameraModel,
-    CanvasPlacement,
-    CropResize,
-    apply_homography,
-    homography_from_pose,
-)
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, homography_from_pose
+from roadproof.homographies import apply_homography
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from town_driving import drive, fingerprint
 

@@ -52,7 +52,7 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
     else:
         raise RecordingError(
             f"{table.drive.table} does not say where the car was: expected columns x_m, y_m and yaw_rad, or speed_mps "
-            "and yaw_rate_rad_s, or the canvas' corners"
+            "and yaw_rate_rad_s, or the canvas' corners, or none of them and one drive whose pictures show its motion"
         )
     try:
         return Track(

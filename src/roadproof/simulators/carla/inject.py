@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from roadproof.geometry import CANVAS_SIZE_PX, Homography
+from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.homographies import Homography
 from roadproof.simulators.protocol import PatternImage
 
 ASPHALT_LEVEL = 0.42

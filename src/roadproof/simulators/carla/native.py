@@ -22,7 +22,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, apply_homography
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement
+from roadproof.homographies import apply_homography
 from roadproof.simulators.carla.cameras import Camera
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL
 from roadproof.simulators.carla.session import Session

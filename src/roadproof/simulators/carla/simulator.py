@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from roadproof.datatypes import Control, Observation, Obstacle
 from roadproof.errors import RoadproofError, SimulatorError
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, Homography
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize
+from roadproof.homographies import Homography
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.actors import Collisions, Crowd, place_driven, spawn_driven, vehicle_state

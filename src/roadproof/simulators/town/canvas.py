@@ -22,7 +22,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
 from roadproof.datatypes import VehicleState
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, Homography
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
+from roadproof.homographies import Homography
 from roadproof.simulators.town.ground import COARSE_M, FINE_M, LitGround, paved_damp
 from roadproof.simulators.town.meshes import Mesh
 from roadproof.simulators.town.textures import GRAIN_MEAN

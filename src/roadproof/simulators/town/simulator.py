@@ -9,7 +9,8 @@ import numpy as np
 
 from roadproof.datatypes import Control, Observation, Obstacle
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, Homography, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, homography_from_pose
+from roadproof.homographies import Homography
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
