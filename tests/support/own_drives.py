@@ -6,7 +6,8 @@ import numpy as np
 from PIL import Image
 
 from recorded_drives import CANVAS, track
-from roadproof.geometry import CIL_CAMERA, homogeneous, homography_from_pose
+from roadproof.geometry import CIL_CAMERA, homography_from_pose
+from roadproof.homographies import homogeneous
 
 PLAN = """
 dt_s = 0.05

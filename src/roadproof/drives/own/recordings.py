@@ -16,19 +16,15 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 
+from roadproof.drives.own.motion import motion_of
 from roadproof.drives.own.place import canvas_on, fitted_camera, track_of
 from roadproof.drives.own.plan import PLAN, OwnColour, OwnDrives, read_plan
 from roadproof.drives.own.table import CORNERS, Table, read_table
 from roadproof.drives.record import in_view
 from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
-from roadproof.geometry import (
-    CANVAS_SIZE_PX,
-    apply_homography,
-    homogeneous,
-    homography_from_points,
-    homography_from_pose,
-)
+from roadproof.geometry import CANVAS_SIZE_PX, homography_from_pose
+from roadproof.homographies import apply_homography, homogeneous, homography_from_points
 from roadproof.io.files import AnyPath, as_path, inside
 from roadproof.io.pictures import read_picture
 from roadproof.photometry import AffineResponse, ColourTransform
@@ -45,7 +41,8 @@ def import_drives(folder: AnyPath) -> RecordingSet:
     """Recordings from pictures and tables of your own; see docs/recordings.md for what is in the folder.
 
     Poses come from the table; or from speed and yaw rate, for one drive alone, whose first row is then the world's
-    origin; or from the canvas' corners in each picture. Of each drive at most `WINDOW.frames` frames are kept.
+    origin; or, for one drive alone too, from how the ground moves in its pictures (`own.motion`); or from the canvas'
+    corners in each picture. Of each drive at most `WINDOW.frames` frames are kept.
 
     Args:
         folder: path of a folder with drives.toml, the tables and the pictures.
@@ -61,15 +58,39 @@ def import_drives(folder: AnyPath) -> RecordingSet:
     own = read_plan(folder)
     own = replace(own, camera=fitted_camera(own.camera, own.ground))
     tables = [read_table(folder, drive) for drive in own.drive]
-    given = {
+    given: dict[str, Any] = {
         "camera": own.camera,
         "view": own.input,
         "colour": _colour(own.colour),
         "origin": own.origin or f"imported from {folder.name}",
     }
+    if len(tables) == 1 and tables[0].tells_no_place:
+        tables, agreed = _with_motion(folder, own, tables[0])
+        given["origin"] += f"; speed and yaw rate seen in {agreed}"
     if all(name in table.numbers for table in tables for name in CORNERS):
         return _from_corners(folder, own, tables, given)
     return _from_poses(folder, own, tables, given)
+
+
+def _with_motion(folder: Path, own: OwnDrives, table: Table) -> tuple[list[Table], str]:
+    table.needed("steer")
+    if len(table.pictured) < len(table.pictures):
+        raise RecordingError(
+            f"{table.drive.table} has {len(table.pictured)} pictures in {len(table.pictures)} rows, expected one in "
+            "each to see the vehicle's motion in them; or give poses, or speed_mps and yaw_rate_rad_s"
+        )
+    names = table.pictures
+    try:
+        seen = motion_of(own.camera, own.input, lambda k: _picture(folder, own, names[k]), len(names), own.dt_s)
+    except RecordingError as error:
+        raise RecordingError(f"{table.drive.table}: {error}") from None
+    found = {"speed_mps": seen.speed_mps, "yaw_rate_rad_s": seen.yaw_rate_rad_s}
+    low, median = np.percentile(seen.correlation, [5, 50])
+    agreed = (
+        f"the ground of {len(names)} pictures, which agrees from one to the next with a correlation of {median:.2f} "
+        f"(95 % of them {low:.2f} or more)"
+    )
+    return [replace(table, numbers={**found, **table.numbers})], agreed
 
 
 def _from_poses(folder: Path, own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
@@ -134,7 +155,7 @@ def _recording(
     )
 
 
-def _frame(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
+def _picture(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
     path = folder
     for part in PurePosixPath(name).parts:
         path = inside(path, part, f"picture {name!r:.80}", RecordingError)
@@ -145,6 +166,11 @@ def _frame(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"
             f"{path} has {picture.shape[1]}×{picture.shape[0]} pixels, expected {camera.width_px}×{camera.height_px} "
             f"as the camera in {PLAN}"
         )
+    return picture
+
+
+def _frame(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
+    picture = _picture(folder, own, name)
     try:
         return own.input(picture)
     except GeometryError as error:

@@ -4,8 +4,8 @@ column                    meaning                                               
 picture                   file of the camera's picture, relative to the folder; may be empty  yes
 x_m, y_m, yaw_rad         pose of the vehicle's origin on the ground, yaw left positive     one
 yaw_rate_rad_s            odometry with speed_mps, instead of poses                         of these
-far_left_x … near_left_y  the canvas' four corners in the picture, px, instead of both      three
-speed_mps                 forward                                                           without poses
+far_left_x … near_left_y  the canvas' four corners in the picture, px, instead of both      three, or none
+speed_mps                 forward                                                           with the last two
 steer                     in [−1, 1], positive to the right                                 yes
 throttle, brake           in [0, 1]                                                         no: 0
 command                   CARLA's codes                                                     no: 2, follow
@@ -49,6 +49,11 @@ class Table:
     def pictured(self) -> Int[np.ndarray, " f"]:
         """Indices of the steps that have a picture."""
         return np.flatnonzero([bool(name) for name in self.pictures])
+
+    @property
+    def tells_no_place(self) -> bool:
+        """Whether no column says where the car was, nor how it turned."""
+        return not any(name in self.numbers for name in (*POSE, "yaw_rate_rad_s", *CORNERS))
 
     def column(self, name: str, usual: float = 0.0) -> Float[np.ndarray, " n"]:
         """The column of a name, or the `usual` value for every step if the table has no such column."""
