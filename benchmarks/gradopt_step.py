@@ -8,6 +8,10 @@ controller's forward and backward pass to the same frames is the physical limit:
 the clock stands processor time, which others on the machine disturb less; with one thread its ratio is the one to trust
 where the machine is busy.
 
+On a GPU the whole step of a search, as a CUDA graph that is recorded once and replayed, is measured beside the bare
+controller's passes as a graph of their own: the physical limit there, where starting operations one by one takes most
+of the time (goal: 1.3 with --frames 400).
+
 A set of recordings that can be driven in has a second part, with shipped weights: one step of the search in the
 recorded world (three starts a side, a picture every second step), against the bare controller's passes to as many
 pictures, those of an instant at a time as a closed loop must and all of them in one batch; and how long drives over
@@ -28,8 +32,10 @@ import torch
 
 import roadproof
 from roadproof.attacks import PathDeviation, Surrogate
+from roadproof.attacks.captured import Replay, cuda_graph, replay_of
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.published import PublishedMeasure
+from roadproof.attacks.step import state_at
 from roadproof.controllers import CIL, pilotnet_controller
 from roadproof.controllers.asking import controls_of
 from roadproof.datatypes import VehicleState
@@ -104,7 +110,17 @@ def measure(
     if published:
         authors = PublishedMeasure(recordings, controller, groups, device=device).on_grid(10.0)
         runs["published"] = lambda: authors.values_and_gradients(space, unit)
+    reason = None
     if device != "cpu":
+        replay = replay_of(
+            surrogate, space, learning_rate=0.1, momentum=0.9, iterations=repeats + 2, state=state_at(unit)
+        )
+        bare()
+        runs["bare_graph"] = cuda_graph(bare, lambda: None, surrogate.device)
+        if isinstance(replay, Replay):
+            runs["step_graph"] = replay.again
+        else:
+            reason = replay
         torch.cuda.reset_peak_memory_stats()
     times: dict[str, list[float]] = {key: [] for key in runs}
     cpu_times: dict[str, list[float]] = {key: [] for key in runs}
@@ -131,6 +147,12 @@ def measure(
         "bare_ms_range": [round(min(times["bare"]), 2), round(max(times["bare"]), 2)],
         "ratio": _median_ratio(times),
         "cpu_ratio": _median_ratio(cpu_times) if device == "cpu" else None,
+        "graph_step_ms": round(median["step_graph"], 2) if "step_graph" in median else None,
+        "graph_bare_ms": round(median["bare_graph"], 2) if "bare_graph" in median else None,
+        "graph_ratio": _median_ratio({"step": times["step_graph"], "bare": times["bare_graph"]})
+        if "step_graph" in times
+        else None,
+        "not_a_graph": reason,
         "published_step_ms": round(median["published"], 1) if published else None,
         "published_over_ours": round(median["published"] / median["step"], 2) if published else None,
         "peak_mb": round(peak),

@@ -44,7 +44,7 @@ ASK_CONTROLLER = (
 
 @pytest.mark.skipif(sys.platform != "linux", reason="torch's threads are not those of GNU OpenMP")
 @pytest.mark.parametrize(
-    ("asked", "spins"), [({}, "20000"), ({"OMP_WAIT_POLICY": "PASSIVE"}, "0"), ({"GOMP_SPINCOUNT": "7"}, "7")]
+    ("asked", "spins"), [({}, "5000"), ({"OMP_WAIT_POLICY": "PASSIVE"}, "0"), ({"GOMP_SPINCOUNT": "7"}, "7")]
 )
 def test_threads_of_a_command_sleep_soon_while_they_wait_unless_the_user_says_otherwise(asked, spins) -> None:
     # A command that was called in this process has left its choice here.

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.constants import constant
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
@@ -172,12 +173,12 @@ class SearchSpace:
     def pattern(self, unit: Float[Tensor, "*b k n"]) -> Pattern:
         """The pattern at a point of the space, differentiable in it."""
         parameters = self._shape_parameters
-        low = unit.new_tensor([p.low for p in parameters])
-        natural = low + unit[..., : len(parameters)] * unit.new_tensor(self.shape_ranges)
+        low = constant(tuple(p.low for p in parameters), unit)
+        natural = low + unit[..., : len(parameters)] * constant(self.shape_ranges, unit)
         boxes = natural if self.family == "free" else self._published_boxes(natural)
         if self.shape is Shape.TRIANGLE:
             # A triangle looks the same only after a full turn.
-            boxes = boxes / boxes.new_tensor(_HALF_TURN)
+            boxes = boxes / constant(_HALF_TURN, boxes)
         darkest, brightest = self.albedo
         shares = unit[..., len(parameters) :] if self.colour else torch.zeros_like(unit[..., :3])
         pattern = Pattern((self.shape,) * self.figures, boxes, darkest + shares * (brightest - darkest))

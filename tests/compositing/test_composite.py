@@ -6,7 +6,7 @@ import torch
 
 from references import approach
 from roadproof.compositing import Compositor, composite, view_canvas
-from roadproof.compositing.composite import blend, canvas_colours
+from roadproof.compositing.composite import blend, canvas_colours, dense_colours
 from roadproof.coverage import Shape
 from roadproof.errors import GeometryError
 from roadproof.geometry import CIL_INPUT
@@ -46,6 +46,20 @@ def test_the_hand_written_gradient_is_that_of_plain_tensor_operations():
     (by_hand,) = torch.autograd.grad((fast * weight).sum(), unit)
     (reference,) = torch.autograd.grad((plain * weight).sum(), unit)
     torch.testing.assert_close(by_hand, reference, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", list(Shape))
+def test_dense_painting_and_its_gradient_are_those_of_sparse_painting(shape):
+    view = make_view()
+    space, unit = random_patterns(family="free", shape=shape)
+    weight = torch.randn(2, len(view.clean), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = []
+    for paint in (dense_colours, canvas_colours):
+        leaf = unit.clone().requires_grad_()
+        colours = paint(space.pattern(leaf), view)
+        found.append((colours, torch.autograd.grad((colours * weight).sum(), leaf)[0]))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("shape", list(Shape))

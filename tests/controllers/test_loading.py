@@ -34,7 +34,7 @@ def cil() -> CIL:
 
 
 def test_cil_is_saved_and_loaded_folded_and_frozen(cil, tmp_path):
-    save_controller(cil, tmp_path / "new" / "cil.safetensors")
+    save_controller(cil, str(tmp_path / "new" / "cil.safetensors"))
     loaded = load_controller(tmp_path / "new" / "cil.safetensors")
     assert isinstance(loaded, CIL)
     assert (loaded.width, loaded.is_folded, loaded.training) == (0.1, True, False)

@@ -13,7 +13,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.checks import Check, check_bounds, check_gradients, check_groups, check_search, check_world
+from roadproof.attacks.checks import (
+    Check,
+    check_bounds,
+    check_gradients,
+    check_groups,
+    check_search,
+    check_steps,
+    check_world,
+)
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Search
@@ -26,6 +34,7 @@ from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.io.records import plain
 from roadproof.paint import conspicuousness
@@ -46,7 +55,7 @@ def attack(
     device: torch.device | str = "cpu",
     random_patterns: int = 0,
     starts: Sequence[Candidate] = (),
-    checkpoint: Path | None = None,
+    checkpoint: AnyPath | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
     """Find the pattern that moves a controller most, on recorded drives or in a simulator.
@@ -79,27 +88,20 @@ def attack(
     method.check_space(space)
     start = time.perf_counter()
     if isinstance(recordings, InSimulator):
-        if method.by_gradient:
-            raise RoadproofError(
-                f"method {method.word} needs gradients, and a drive in a simulator has none; record and calibrate the "
-                "stretch and attack the recordings, or give a method without gradients, as CMAES(calls=140)"
-            )
         site = site_at(recordings.simulator, recordings.scenario)
-        measure = DrivenMeasure(recordings, controller, objective)
-        groups = measure.groups
+        measure = _driven(recordings, controller, objective, method)
     else:
-        site = site_of(recordings)
-        groups = groups or method.groups(recordings, objective)
+        site, groups = site_of(recordings), groups or method.groups(recordings, objective)
         measure = method.measure(objective, recordings, controller, groups, device=device)
         start = time.perf_counter()
-    space = space.on(site)
+    groups, space = measure.groups, space.on(site)
     search = method.search(
         measure,
         space,
         objective,
         seed=seed,
         starts=[_points(space, starts, group) for group in groups],
-        checkpoint=checkpoint,
+        checkpoint=None if checkpoint is None else as_path(checkpoint),
         aim=objective.name,
         on_step=on_step,
     )
@@ -114,7 +116,7 @@ def attack(
         simulator_calls=measure.calls if isinstance(measure, DrivenMeasure) else 0,
     )
     checks = _checks(measure, method, space, search, candidates[0], random_patterns, seed)
-    checks += check_groups(told, search)
+    checks += (*check_groups(told, search), *check_steps(search))
     first = candidates[0]
     return AttackResult(
         pattern=first.pattern,
@@ -136,6 +138,16 @@ def attack(
         seed=seed,
         conspicuousness=conspicuousness(first.pattern, space.site or site),
     )
+
+
+def _driven(recordings: InSimulator, controller: Controller, objective: Objective, method: Method) -> DrivenMeasure:
+    """The measure of drives in a simulator, for a method that needs no gradients."""
+    if method.by_gradient:
+        raise RoadproofError(
+            f"method {method.word} needs gradients, and a drive in a simulator has none; record and calibrate the "
+            "stretch and attack the recordings, or give a method without gradients, as CMAES(calls=140)"
+        )
+    return DrivenMeasure(recordings, controller, objective)
 
 
 def _checks(

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -27,6 +26,7 @@ from roadproof.attacks.result import AttackResult, Candidate
 from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import RecordFile
 from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
 from roadproof.paint.limits import area_m2
@@ -82,22 +82,24 @@ class Cheapest:
         """The pattern as a candidate, so that it can be driven over."""
         return Candidate(self.pattern, self.group, 0.0, self.predicted_m)
 
-    def save(self, folder: Path, made_of: object = None) -> None:
+    def save(self, folder: AnyPath, made_of: object = None) -> None:
         """Write pattern.json, pattern.png and cheapest.json.
 
         Raises:
             OutputError: the folder cannot be written.
         """
+        folder = as_path(folder)
         save_pattern(self.pattern, folder / "pattern.json")
         FILE.write(folder / "cheapest.json", self, made_of=made_of or {})
 
     @staticmethod
-    def load(folder: Path) -> Cheapest:
+    def load(folder: AnyPath) -> Cheapest:
         """Read the pattern that `save` wrote.
 
         Raises:
             RoadproofError: a file is missing or damaged.
         """
+        folder = as_path(folder)
         return FILE.read(folder / "cheapest.json", pattern=load_pattern(folder / "pattern.json"))
 
 

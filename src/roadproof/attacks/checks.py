@@ -152,6 +152,11 @@ def check_groups(groups: Sequence[Group], search: Search) -> tuple[Check, ...]:
     return (Check("places given to the better side", True, finding),)
 
 
+def check_steps(search: Search) -> tuple[Check, ...]:
+    """Say how steps were run on a GPU; nothing on a CPU."""
+    return (Check("steps on the GPU", True, search.steps),) if search.steps else ()
+
+
 def _check_against_random(measure: Measure, space: SearchSpace, search: Search, patterns: int, seed: int) -> Check:
     _, by_chance = random_search(measure, space, patterns=patterns, seed=seed + 1)
     found, chance = float(search.best.max()), float(by_chance.max())

@@ -12,6 +12,7 @@ import copy
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from threading import Lock
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -30,6 +31,9 @@ from roadproof.search_space import SearchSpace
 
 MAX_PICTURES = 800
 """Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
+
+
+_ONCE = Lock()
 
 
 class Rolling(TypedDict, total=False):
@@ -190,9 +194,10 @@ class ClosedLoopMeasure(ABC):
     def bare(self, world: RecordedWorld) -> Rolled:
         """The drives over the bare road in one world, from each start with every look; made once."""
         key = (id(world), self.every)
-        if key not in self._bare:
-            with torch.no_grad():
-                self._bare[key] = self.roll(world, None)
+        with _ONCE:  # groups are valued side by side
+            if key not in self._bare:
+                with torch.no_grad():
+                    self._bare[key] = self.roll(world, None)
         return self._bare[key]
 
     def _pictures(self, world: RecordedWorld) -> int:

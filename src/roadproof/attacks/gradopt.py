@@ -13,6 +13,7 @@ paper. A group that is far behind by then gives its places to the others: some c
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,8 +23,11 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from roadproof.attacks.captured import Replay, in_words, replay_of
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
 from roadproof.attacks.objective import Grouped, Measure, RecordedMeasure, Varied
+from roadproof.attacks.side_by_side import Beside, side_by_side
+from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
 from roadproof.attacks.surrogate import FIXED
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
@@ -113,12 +117,14 @@ class Search:
             g, c); without gradients the best value so far, (calls, 1, 1).
         gave_way: best value of each group that gave its places to the others, by its number; the G groups above are
             the rest, in their order.
+        steps: how steps were run on a GPU, in words; empty on a CPU.
     """
 
     best_unit: Float[Tensor, "g r k n"]
     best: Float[Tensor, "g r"]
     history: Float[Tensor, "i g c"]
     gave_way: dict[int, float] = field(default_factory=dict[int, float])
+    steps: str = ""
 
 
 class Running(TypedDict, total=False):
@@ -129,7 +135,8 @@ class Running(TypedDict, total=False):
         starts: points to begin at, one tensor (S, K, N) per group; random points fill the remaining starts.
         checkpoint: file that keeps the search after every step and from which the same search goes on; None for none.
         aim: name of the objective, which the checkpoint says; a search for another is refused there.
-        on_step: called after every step with its number and the best value so far.
+        on_step: called after every step with its number and the best value so far. On a GPU some steps are taken
+            together (`captured.LOOK_S`); then the file is written, and this called, after the last of them.
     """
 
     seed: Required[int]
@@ -163,9 +170,9 @@ def gradopt(
     given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
     state = load_checkpoint(checkpoint, identity, measure.device, aim=aim) if checkpoint else None
-    at, behind = 0, torch.full((len(measure.groups),), torch.nan)
+    at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
     if state is None:
-        state = _state_at(_starts(measure, space, rungs[0].starts, seed, starts))
+        state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
         at, behind = int(state.pop("rung")), state.pop("behind").cpu()
         measure.frames_evaluated += int(state.pop("frames"))
@@ -174,25 +181,31 @@ def gradopt(
         if number > at and rung.groups_compete and isinstance(measure, Grouped):
             state, behind = _without_those_behind(state, behind)
         climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
+        beside = side_by_side(climbed)
         if number > at:
             if rung.offspring:
-                state = _with_offspring(climbed, space, state, rung.offspring, derived_seed(seed, 2 * 10**6 + number))
+                state = _with_offspring(beside, space, state, rung.offspring, derived_seed(seed, 2 * 10**6 + number))
             places = rung.starts * len(measure.groups) // len(state["best"])
             state = _next_rung(state, space, rungs[number - 1], rung, places, derived_seed(seed, number))
         free = rung.starts - (0 if number else max(map(len, starts), default=0))
         if min(rung.screened, free) > 0 and not int(state["done"]):
             # Far from the numbers of other draws.
             own = derived_seed(seed, 10**6 + number)
-            state["unit"] = _screened(climbed, space, state["unit"], min(rung.screened, free), own)
+            state["unit"] = _screened(beside, space, state["unit"], min(rung.screened, free), own)
+        adam = {"learning_rate": rung.learning_rate, "momentum": momentum}
+        replay = replay_of(climbed, space, iterations=rung.iterations, state=state, **adam)
+        run["" if isinstance(replay, Replay) else replay] += rung.iterations - int(state["done"])
         while int(state["done"]) < rung.iterations:
             if isinstance(climbed, Varied):
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
-            state = _step(climbed, space, rung.learning_rate, momentum, state)
+            state = replay.go_on() if isinstance(replay, Replay) else _step(beside, space, state, **adam)
             on_step(done + int(state["done"]), float(state["best"].max()))
             if checkpoint:
                 frames = measure.frames_evaluated + (0 if climbed is measure else climbed.frames_evaluated)
                 whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames), "behind": behind}
                 save_checkpoint(checkpoint, identity, whole, aim=aim)
+        # The memory of a graph is free before the next is recorded.
+        del replay
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
     best, last = state["best"], _of_groups(measure, behind)
@@ -201,7 +214,7 @@ def gradopt(
         last.redraw(FIXED)
         best = last.values(space, state["best_unit"])
     gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
-    return Search(state["best_unit"], best, state["history"].cpu(), gave_way)
+    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, in_words(run))
 
 
 def _starts(
@@ -219,7 +232,7 @@ def _starts(
 
 
 def _screened(
-    measure: RecordedMeasure, space: SearchSpace, unit: Float[Tensor, "g r k n"], count: int, seed: int
+    measure: RecordedMeasure | Beside, space: SearchSpace, unit: Float[Tensor, "g r k n"], count: int, seed: int
 ) -> Float[Tensor, "g r k n"]:
     """The starts, the last of which are the best of many random points by a measure."""
     drawn = space.random((len(unit), DRAWN), torch.Generator().manual_seed(seed)).to(unit)
@@ -232,21 +245,13 @@ def _at(unit: Float[Tensor, "g r k n"], index: Int64[Tensor, "g i"]) -> Float[Te
     return unit[torch.arange(len(unit), device=index.device)[:, None], index]
 
 
-def _state_at(unit: Float[Tensor, "g r k n"]) -> dict[str, Tensor]:
-    best = torch.full(unit.shape[:2], -torch.inf, device=unit.device)
-    history = best.new_empty(0, *best.shape)
-    return {"unit": unit, "best_unit": unit.clone(), "best": best, "history": history, "done": torch.tensor(0)}
-
-
 def _of_groups(measure: RecordedMeasure, behind: Float[Tensor, " g"]) -> RecordedMeasure:
     """The measure of the groups that have not given way."""
     kept = cast("list[int]", behind.isnan().nonzero()[:, 0].tolist())
     return measure.of_groups(kept) if len(kept) < len(behind) and isinstance(measure, Grouped) else measure
 
 
-def _without_those_behind(
-    state: dict[str, Tensor], behind: Float[Tensor, " g"]
-) -> tuple[dict[str, Tensor], Float[Tensor, " g"]]:
+def _without_those_behind(state: State, behind: Float[Tensor, " g"]) -> tuple[State, Float[Tensor, " g"]]:
     """The state without groups that are far behind, and the best value of each group that has given way, else NaN."""
     best = state["best"].amax(1)
     ahead = best >= BEHIND * best.max()
@@ -258,8 +263,8 @@ def _without_those_behind(
 
 
 def _with_offspring(
-    measure: RecordedMeasure, space: SearchSpace, state: dict[str, Tensor], count: int, seed: int
-) -> dict[str, Tensor]:
+    measure: RecordedMeasure | Beside, space: SearchSpace, state: State, count: int, seed: int
+) -> State:
     """The best points of every group and their offspring, each with every figure of one of two parents, a little moved.
 
     All are valued by the measure of the rung to come.
@@ -275,40 +280,23 @@ def _with_offspring(
     return {"best_unit": unit, "best": measure.values(space, unit)}
 
 
-def _next_rung(
-    state: dict[str, Tensor], space: SearchSpace, before: Rung, rung: Rung, places: int, seed: int
-) -> dict[str, Tensor]:
+def _next_rung(state: State, space: SearchSpace, before: Rung, rung: Rung, places: int, seed: int) -> State:
     """State of the next rung, begun at the best points of every group; random points fill the remaining places."""
     if rung.goes_on(before):
-        kept = ("best_unit", "best", "history")
-        return {name: state[name] for name in kept} | {"unit": state["best_unit"], "done": torch.tensor(0)}
+        return {name: state[name] for name in ("best_unit", "best", "history")} | begun(state["best_unit"])
     unit = _at(state["best_unit"], state["best"].topk(min(places, state["best"].shape[1]), 1).indices)
     drawn = space.random((len(unit), places - unit.shape[1]), torch.Generator().manual_seed(seed))
-    return _state_at(torch.cat([unit, drawn.to(unit)], 1))
+    return state_at(torch.cat([unit, drawn.to(unit)], 1))
 
 
 def _step(
-    measure: RecordedMeasure, space: SearchSpace, learning_rate: float, momentum: float, state: dict[str, Tensor]
-) -> dict[str, Tensor]:
-    unit = state["unit"]
-    value, gradient = measure.values_and_gradients(space, unit)
-    if not bool(value.isfinite().all() and gradient.isfinite().all()):
-        raise RoadproofError("the controller's answer or gradient is NaN on a painted frame; try --dtype float32")
-    better = value > state["best"]
-    leaf = torch.nn.Parameter(unit.clone())
-    adam = torch.optim.Adam([leaf], lr=learning_rate, betas=(momentum, 0.999))
-    if int(state["done"]):
-        adam.state[leaf] = {name: state[name].clone() for name in ("step", "exp_avg", "exp_avg_sq")}
-    leaf.grad = -gradient
-    adam.step()
-    return {
-        "unit": space.project(leaf.detach()),
-        "best_unit": torch.where(better[..., None, None], unit, state["best_unit"]),
-        "best": torch.where(better, value, state["best"]),
-        "history": torch.cat([state["history"], value[None]]),
-        "done": state["done"] + 1,
-        **{name: adam.state[leaf][name] for name in ("step", "exp_avg", "exp_avg_sq")},
-    }
+    measure: RecordedMeasure | Beside, space: SearchSpace, state: State, *, learning_rate: float, momentum: float
+) -> State:
+    """A step, one operation at a time."""
+    rate, root = corrected(learning_rate, momentum, 1 + int(state["done"]))
+    changed, value, finite = stepped(measure, space, momentum, rate, root, state)
+    require_finite_step(finite)
+    return changed | {"history": torch.cat([state["history"], value[None]]), "done": state["done"] + 1}
 
 
 def random_search(

@@ -20,7 +20,7 @@ from roadproof.attacks.groups import STEERED, Group, divergence, require_directi
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import steer_of
+from roadproof.controllers.asking import answer_of, require_gradient, steer_of
 from roadproof.errors import ControllerError
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
@@ -72,7 +72,8 @@ class Surrogate:
         self.frames_evaluated = 0
         self.variation = variation
         self._looks: Looks | None = None
-        self._kept: tuple[int, Compositor] | None = None
+        self._kept: dict[int, Compositor] = {}
+        self._replayed = False
         drives = [group.select(recordings) for group in groups]
         self.lengths = [[len(drive.frames) for drive in members] for members in drives]
         self.views = [_view(recordings, members, device) for members in drives]
@@ -101,9 +102,21 @@ class Surrogate:
         """The surrogate of some of its groups alone."""
         part = copy.copy(self)
         of_each = ("lengths", "views", "_speed", "_command", "clean_steer", "_clean_looked")
-        vars(part).update({name: [vars(self)[name][k] for k in kept] for name in of_each}, _kept=None)
+        vars(part).update({name: [vars(self)[name][k] for k in kept] for name in of_each}, _kept={})
         part.groups, part.frames_evaluated = tuple(self.groups[k] for k in kept), 0
         return part
+
+    def replayable(self) -> Surrogate | None:
+        """The surrogate with the same operations on tensors of the same shapes in every step; None with a variation.
+
+        It paints densely, and does not look whether the controller's answers are finite: whoever asks it for values
+        has to. Its frames are counted from nought.
+        """
+        if self.variation is not None:
+            return None
+        same = copy.copy(self)
+        vars(same).update(_kept={}, _replayed=True, frames_evaluated=0)
+        return same
 
     def redraw(self, seed: int) -> None:
         """Take the mean over the looks of another seed from now on; does nothing without a variation."""
@@ -198,10 +211,13 @@ class Surrogate:
         return unit.chunk(-(-unit.shape[1] // at_once), dim=1)
 
     def _compositor(self, copies: int) -> Compositor:
-        # Batches of a search are of one size, or two: the frames are kept until another size comes.
-        if self._kept is None or self._kept[0] != copies:
-            self._kept = (copies, Compositor(self.views, copies))
-        return self._kept[1]
+        # Batches of a search are of one size, or two: the frames are kept until another size comes, and for good where
+        # steps are replayed, which write to where they wrote before.
+        if copies not in self._kept:
+            if not self._replayed:
+                self._kept.clear()
+            self._kept[copies] = Compositor(self.views, copies, dense=self._replayed)
+        return self._kept[copies]
 
     def steer_of(self, frames: Float[Tensor, "f 3 h w"], group: int) -> Float[Tensor, " f"]:
         """The controller's answers to a group's frames, in whatever way they were painted."""
@@ -209,6 +225,10 @@ class Surrogate:
 
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
         self.frames_evaluated += len(frames)
+        if self._replayed:
+            answer = answer_of(self.controller, "steer", frames, speed, command)
+            require_gradient(answer, frames, "steer")
+            return answer.float()
         return steer_of(self.controller, frames, speed, command).float()
 
 

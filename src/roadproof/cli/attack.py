@@ -85,7 +85,6 @@ def attack(
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
-    from roadproof.controllers.precision import multiplies_bfloat16
     from roadproof.coverage import Shape
     from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
@@ -111,9 +110,7 @@ def attack(
     if cheapest is not None:
         _check_cheapest(drives, word)
     attacked = load_controller(controller, device=device, dtype=dtype)
-    _check_attacked(attacked, drives, searched, goal, device=device)
-    if dtype == "bfloat16" and not multiplies_bfloat16(device):
-        typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
+    _check_attacked(attacked, drives, searched, goal, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     frames = sum(len(each.frames) for each in drives.recordings)
     begin(of_search(searched, goal, frames, attacked, groups=len(chosen)), out)
@@ -144,20 +141,23 @@ def attack(
 
 
 def _check_attacked(
-    attacked: Controller, drives: RecordingSet, method: Method, objective: Objective, *, device: str
+    attacked: Controller, drives: RecordingSet, method: Method, objective: Objective, *, device: str, dtype: str
 ) -> None:
-    """Refuse a controller that the search cannot work on, before it begins.
+    """Refuse a controller that the search cannot work on, before it begins; say where its arithmetic is slow.
 
     Raises:
         ControllerError: the controller fails on frames like the recorded ones, or lacks what the objective needs.
     """
     from roadproof.attacks.objective import ClosedLoop
     from roadproof.controllers.checks import require_usable
+    from roadproof.controllers.precision import multiplies_bfloat16
 
     size = (drives.view.height_px, drives.view.width_px)
     require_usable(attacked, size=size, device=device, drives=False, gradients=method.by_gradient)
     if isinstance(objective, ClosedLoop):
         objective.check(attacked)
+    if dtype == "bfloat16" and not multiplies_bfloat16(device):
+        typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
 
 
 def _check_cheapest(drives: RecordingSet, objective: str) -> None:

@@ -52,10 +52,12 @@ class Compositor:
     Args:
         views: sets of frames with their view of the canvas, all frames of one size.
         copies: number of patterns painted into each view.
+        dense: whether to paint by plain tensor operations alone, whose shapes do not depend on where figures are.
     """
 
-    def __init__(self, views: Sequence[CanvasView], copies: int) -> None:
+    def __init__(self, views: Sequence[CanvasView], copies: int, *, dense: bool = False) -> None:
         self._views = tuple(views)
+        self._dense = dense
         self._copies = copies
         self._frames = torch.cat([view.frames.repeat(copies, 1, 1, 1) for view in views])
 
@@ -66,7 +68,8 @@ class Compositor:
             patterns: one batch of `copies` patterns for each view.
             looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
         """
-        colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
+        paint = dense_colours if self._dense else canvas_colours
+        colours = [paint(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
         if looks is not None:
             colours = [
                 _worn(colour, view.clean, looks.left(view.footprints.centre[None], self._copies))
@@ -136,6 +139,19 @@ def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 
     boxes, seen = pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3)
     painted = cast("Tensor", PaintedRectangles.apply(boxes, seen, view.runs))
     return painted[:, : view.clean.shape[-2]].view(*batch, -1, 3)
+
+
+def dense_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
+    """What `canvas_colours` gives, from the masks of all figures in all pixels, without asking the device for a number.
+
+    So it multiplies figure by figure: the gradient of a cumulative product asks whether a factor is 0.
+    """
+    masks = coverages(pattern, view.footprints)
+    through, seen = torch.ones_like(masks[..., 0, :]), list[Tensor]()
+    for mask in reversed(masks.unbind(-2)):
+        seen.append(mask * through)
+        through = through * (1 - mask)
+    return blend(torch.stack(seen[::-1], -2), view.response(pattern.colours), view)
 
 
 def blend(visibility: Float[Tensor, "*b k p"], seen: Float[Tensor, "*b k 3"], view: CanvasPixels) -> Tensor:

@@ -14,6 +14,7 @@ from roadproof.coverage import Footprints, canvas_share
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.photometry import ColourTransform, PixelMaps, Response
+from roadproof.photometry.responses import placed
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -123,7 +124,7 @@ def view_canvas(
         clean=clean,
         gain=gain,
         bias=bias,
-        response=colour.response,
+        response=placed(colour.response, device, dtype),
         runs=runs,
     )
 

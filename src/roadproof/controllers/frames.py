@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
+from roadproof.constants import constant, kept
 from roadproof.errors import ControllerError
 
 
@@ -74,7 +75,8 @@ class FramePreparation:
             frames = yuv_from_rgb(frames)
         if self.mean == (0.0, 0.0, 0.0) and self.std == (1.0, 1.0, 1.0):
             return frames
-        return (frames - frames.new_tensor(self.mean)[:, None, None]) / frames.new_tensor(self.std)[:, None, None]
+        mean, std = constant(self.mean, frames), constant(self.std, frames)
+        return (frames - mean[:, None, None]) / std[:, None, None]
 
 
 def require_frame_size(frames: Float[Tensor, "b 3 h w"], expected: tuple[int, int] | None) -> None:
@@ -128,14 +130,14 @@ def resize_by_area(frames: Float[Tensor, "b 3 h w"], size: tuple[int, int]) -> F
     """
     height, width = frames.shape[-2:]
     if size[0] != height:
-        frames = _area_weights(height, size[0], frames) @ frames
+        frames = kept(_area_weights, (height, size[0]), frames) @ frames
     if size[1] != width:
-        frames = frames @ _area_weights(width, size[1], frames).T
+        frames = frames @ kept(_area_weights, (width, size[1]), frames).T
     return frames
 
 
-def _area_weights(inputs: int, outputs: int, like: Tensor) -> Float[Tensor, "outputs inputs"]:
+def _area_weights(inputs: int, outputs: int) -> Float[Tensor, "outputs inputs"]:
     edges = torch.arange(outputs + 1, dtype=torch.float64) * (inputs / outputs)
     pixel = torch.arange(inputs, dtype=torch.float64)
     overlap = torch.minimum(edges[1:, None], pixel + 1) - torch.maximum(edges[:-1, None], pixel)
-    return (overlap.clamp(min=0) * (outputs / inputs)).to(like)
+    return overlap.clamp(min=0) * (outputs / inputs)

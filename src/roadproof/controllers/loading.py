@@ -29,7 +29,7 @@ from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.controllers.waypoint import WAYPOINT_ON_CARLA, WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
-from roadproof.io.files import write_tensors
+from roadproof.io.files import AnyPath, as_path, write_tensors
 
 ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet", "waypoint")
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
@@ -156,7 +156,7 @@ PICKLES = (".pt", ".pth", ".ckpt", ".pkl", ".ts", ".torchscript", ".jit")
 
 def save_controller(
     controller: CIL | ConditionalPilotNet | NetworkController,
-    path: Path,
+    path: AnyPath,
     *,
     dtype: str = "float32",
     origin: str | None = None,
@@ -195,7 +195,7 @@ def save_controller(
         )
     kept = torch.float16 if dtype == "float16" else torch.float32
     tensors = {name: tensor.detach().cpu().to(kept).contiguous() for name, tensor in network.state_dict().items()}
-    write_tensors(path, tensors, {_METADATA_KEY: replace(card, origin=origin).to_json()})
+    write_tensors(as_path(path), tensors, {_METADATA_KEY: replace(card, origin=origin).to_json()})
 
 
 def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:

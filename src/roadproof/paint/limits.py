@@ -6,8 +6,9 @@ becomes a pattern that obeys, so no step of any search ever leaves them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -93,8 +94,8 @@ class PaintLimits:
                 "contrast needs the colour of the asphalt, which was not measured; give asphalt in the file of --paint "
                 "(PaintLimits(asphalt=...))"
             )
-        colours, _ = _maps(self, site, albedo)
         darkest = torch.full((1, 3), albedo[0])
+        colours, _ = _maps(self, site, albedo, darkest.device, darkest.dtype)
         if black and float((colours(darkest) - darkest).abs().max()) > 1e-3:
             raise PatternError("only black paint is searched, but the limits on colour leave no black; let colour vary")
 
@@ -107,7 +108,7 @@ class PaintLimits:
             albedo: lowest and highest value of a colour channel in the search space.
             max_share: largest share of the canvas that may be painted, besides `max_area_m2`; None for no such limit.
         """
-        colours, clear = _maps(self, site, albedo)
+        colours, clear = _maps(self, site, albedo, pattern.boxes.device, pattern.boxes.dtype)
         boxes = pattern.boxes if clear is None else clear(pattern.boxes)
         obeying = Pattern(pattern.shapes, boxes, colours(pattern.colours))
         if self.max_area_m2 is not None and site.size_m is not None:
@@ -117,7 +118,9 @@ class PaintLimits:
 
 
 @lru_cache(maxsize=32)
-def _maps(limits: PaintLimits, site: Site, albedo: tuple[float, float]) -> tuple[AllowedColours, KeepOut | None]:
+def _maps(
+    limits: PaintLimits, site: Site, albedo: tuple[float, float], device: torch.device, dtype: torch.dtype
+) -> tuple[AllowedColours, KeepOut | None]:
     """The maps that bring colours and boxes to allowed ones; no map of boxes without a keep-out or marks."""
     colours = allowed_colours(
         albedo=albedo,
@@ -127,7 +130,21 @@ def _maps(limits: PaintLimits, site: Site, albedo: tuple[float, float]) -> tuple
         asphalt=site.asphalt,
     )
     clear = None if limits.keep_out_m is None else keep_out(site, limits.keep_out_m)
-    return colours, clear
+    return _placed(colours, device, dtype), clear and _placed(clear, device, dtype)
+
+
+_Map = TypeVar("_Map", AllowedColours, KeepOut)
+
+
+def _placed(made: _Map, device: torch.device, dtype: torch.dtype) -> _Map:
+    """A map whose tensors are on a device and in a precision."""
+
+    def moved(value: Any) -> Any:  # noqa: ANN401  # whatever a field holds
+        if isinstance(value, tuple):
+            return tuple(map(moved, cast("tuple[object, ...]", value)))
+        return value.to(device, dtype) if isinstance(value, Tensor) else value
+
+    return replace(made, **{each.name: moved(getattr(made, each.name)) for each in fields(made)})
 
 
 def shrunk(pattern: Pattern, max_share: float) -> Pattern:

@@ -62,6 +62,10 @@ class AffineResponse:
         """The seen colour of each painted colour."""
         return painted @ self.matrix.to(painted).mT + self.offset.to(painted)
 
+    def on(self, device: torch.device | str, dtype: torch.dtype) -> AffineResponse:
+        """The response with its numbers on a device and in a precision."""
+        return AffineResponse(self.matrix.to(device, dtype), self.offset.to(device, dtype))
+
     @classmethod
     def identity(cls) -> AffineResponse:
         """Seen as painted: what per-pixel maps stand on where a renderer multiplies paint by light."""
@@ -100,19 +104,48 @@ class FilmResponse:
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """The seen colour of each painted colour."""
+        return self._curve()(painted)
+
+    def on(self, device: torch.device | str, dtype: torch.dtype) -> Response:
+        """The response with its numbers on a device and in a precision."""
+        return self._curve().on(device, dtype)
+
+    def _curve(self) -> _Curve:
         to_wide = torch.tensor(_AP1_FROM_SRGB, dtype=torch.float64)
         before = _saturation(_SATURATION_BEFORE) @ to_wide @ torch.diag(self.exposure.double())
         after = cast("Tensor", torch.linalg.inv(to_wide)) @ _saturation(_SATURATION_AFTER)
-        contrast, encoding = self.contrast.to(painted), self.encoding.to(painted)
-        light = (decode_srgb(painted) @ before.to(painted).mT).clamp_min(0.0) + _DARKEST
-        curve = torch.sigmoid(contrast * light.log())
-        return encode_srgb(encode_srgb(_clip_softly(curve @ after.to(painted).mT)) ** encoding)
+        return _Curve(before, after, self.contrast, self.encoding)
 
     @classmethod
     def from_parameters(cls, parameters: Float[Tensor, " 5"]) -> FilmResponse:
         """The response from five parameters: the logarithms of the three exposures, the contrast and the encoding."""
         positive = parameters.exp()
         return cls(positive[:3], positive[3], positive[4])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Curve:
+    """A film response with the matrices before and after its curve worked out."""
+
+    before: Float[Tensor, "3 3"]
+    after: Float[Tensor, "3 3"]
+    contrast: Float[Tensor, ""]
+    encoding: Float[Tensor, ""]
+
+    def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        contrast, encoding = self.contrast.to(painted), self.encoding.to(painted)
+        light = (decode_srgb(painted) @ self.before.to(painted).mT).clamp_min(0.0) + _DARKEST
+        curve = torch.sigmoid(contrast * light.log())
+        return encode_srgb(encode_srgb(_clip_softly(curve @ self.after.to(painted).mT)) ** encoding)
+
+    def on(self, device: torch.device | str, dtype: torch.dtype) -> _Curve:
+        parts = (self.before, self.after, self.contrast, self.encoding)
+        return _Curve(*(part.to(device, dtype) for part in parts))
+
+
+def placed(response: Response, device: torch.device | str, dtype: torch.dtype) -> Response:
+    """A response with its numbers on a device and in a precision; one of the user's own is left as it is."""
+    return response.on(device, dtype) if isinstance(response, AffineResponse | FilmResponse) else response
 
 
 def fit_affine(

@@ -1,0 +1,102 @@
+"""Groups side by side: the same values and counts as one by one, and only where two calls at once do no harm."""
+
+import pytest
+import torch
+
+from painted_ground import RampFollower, known_vehicle, recorded_road
+from roadproof.attacks import PathDeviation, SteeringShift
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
+from roadproof.attacks.side_by_side import Beside, side_by_side
+from roadproof.compositing.variation import Variation
+from roadproof.controllers import pilotnet_controller
+from roadproof.errors import ControllerError
+from roadproof.search_space import SearchSpace
+
+SPACE = SearchSpace(figures=2)
+BOTH = (RIGHT_GROUP, LEFT_GROUP)
+
+
+@pytest.fixture(scope="module")
+def road():
+    return recorded_road(every=2)
+
+
+@pytest.fixture(scope="module")
+def network(road):
+    height, width = road.recordings[0].frames.shape[1:3]
+    made = pilotnet_controller(seed=0).eval().requires_grad_(False)
+    assert made.input_size in (None, (height, width))
+    return made
+
+
+@pytest.fixture
+def two_threads():
+    """Threads of torch, whatever the tests have."""
+    usual = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(usual)
+
+
+def measured(objective, road, controller, groups=BOTH):
+    with known_vehicle():
+        return objective.measure(road, controller, groups, device="cpu")
+
+
+def one_by_one(measure, unit):
+    """What each group has by itself, or each half of the points of one group, on one thread."""
+    torch.set_num_threads(1)
+    count = len(measure.groups)
+    parts = unit.split(1) if count > 1 else [some for some in unit.tensor_split(2, 1) if some.numel()]
+    each = [measure.of_groups([k % count]).values_and_gradients(SPACE, points) for k, points in enumerate(parts)]
+    torch.set_num_threads(2)
+    return [torch.cat(results, 0 if count > 1 else 1) for results in zip(*each, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("objective", "groups", "points"),
+    [
+        (SteeringShift(), BOTH, 3),
+        (SteeringShift(), BOTH[:1], 1),
+        (PathDeviation(), BOTH, 1),
+        (PathDeviation(), BOTH[:1], 3),
+    ],
+    ids=["steering-2-3", "steering-1-1", "path-2-1", "path-1-3"],
+)
+def test_values_gradients_and_counts_are_those_of_each_group(road, network, two_threads, objective, groups, points):
+    measure = measured(objective, road, network, groups)
+    unit = SPACE.random((len(groups), points), torch.Generator().manual_seed(1))
+    begun = measure.frames_evaluated
+    whole = measure.values(SPACE, unit)
+    count, expected = measure.frames_evaluated - begun, one_by_one(measure, unit)
+    beside = side_by_side(measure)
+    assert isinstance(beside, Beside)
+    for _ in range(2):
+        begun = measure.frames_evaluated
+        found = beside.values_and_gradients(SPACE, unit)
+        assert measure.frames_evaluated - begun == count
+        assert all(torch.equal(mine, theirs) for mine, theirs in zip(found, expected, strict=True))
+    # All groups in one batch differ by rounding, which a closed loop enlarges.
+    torch.testing.assert_close(beside.values(SPACE, unit), whole, rtol=2e-2, atol=2e-3)
+    assert torch.get_num_threads() == 2
+
+
+def test_a_users_code_a_mean_over_looks_and_one_thread_stay_as_they_are(road, network, two_threads):
+    own, varied = measured(PathDeviation(), road, RampFollower()), SteeringShift(variation=Variation())
+    for measure in (own, measured(varied, road, network)):
+        assert side_by_side(measure) is measure
+    torch.set_num_threads(1)
+    measure = measured(SteeringShift(), road, network)
+    assert side_by_side(measure) is measure
+
+
+def test_an_error_in_one_group_is_raised_and_leaves_the_threads_as_they_were(road, network, two_threads, monkeypatch):
+    beside = side_by_side(measured(SteeringShift(), road, network))
+
+    def fails(*_):
+        raise ControllerError("the controller answers NaN")
+
+    monkeypatch.setattr(beside._parts[1], "values", fails)
+    with pytest.raises(ControllerError, match="answers NaN"):
+        beside.values(SPACE, SPACE.random((2, 1), torch.Generator().manual_seed(3)))
+    assert torch.get_num_threads() == 2
