@@ -132,6 +132,17 @@ def test_the_gap_says_how_far_the_pictures_are_from_recorded_ones(world):
     assert float(rolled.left_m[0, 0]) == pytest.approx(-0.6, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    "pulling", [(1e9, -8.0, 1e3, 0.0, 0.0), (float("nan"), -8.0, 0.0, 0.0, 0.0)], ids=["far", "NaN"]
+)
+def test_a_car_that_leaves_all_bounds_is_one_clear_line(pulling):
+    wild = dataclasses.replace(VEHICLE, pulling=pulling, curving=(0.9, 1e3, 0.0, 0.0))
+    world = RecordedWorld(recorded_road(every=2), vehicle=wild)
+    world.fit(RampFollower())
+    with pytest.raises(RecordingError, match="a car leaves all bounds in these recordings"):
+        world.roll(RampFollower())
+
+
 def test_sets_too_thin_to_drive_in_are_one_clear_line():
     aside = recorded(Side.RIGHT, -1.0, every=8)
     road = recorded_road(every=8)

@@ -69,25 +69,35 @@ class Obstacles:
             car: cars after the step, as if there were no obstacles.
             dt_s: seconds per step.
         """
-        if not len(self):
-            return car
         x, y, yaw = car.x_m, car.y_m, car.yaw_rad
+        # Most of the time nothing touches: that is asked without gradients, which would cost twice as much.
+        if not self._touched(x.detach(), y.detach(), yaw.detach()):
+            return car
         pushed = torch.zeros_like(x)
         for _ in range(_PUSHES):
-            c, s = torch.cos(yaw), torch.sin(yaw)
-            circles = torch.stack([x[:, None] + self._ahead * c[:, None], y[:, None] + self._ahead * s[:, None]], -1)
-            away, normal = _distances(circles, self._boxes)
+            away, normal = _distances(self._circles(x, y, yaw), self._boxes)
             depth, deepest = (RADIUS_M - away).flatten(1).max(1)
             if not (depth > 0).any():
                 break
             n_x, n_y = normal.flatten(1, 2)[torch.arange(len(x)), deepest].unbind(1)
-            lever = self._ahead[deepest // len(self)] * (c * n_y - s * n_x)
+            lever = self._ahead[deepest // len(self)] * (torch.cos(yaw) * n_y - torch.sin(yaw) * n_x)
             push = depth.clamp_min(0.0) / (1 + (lever / GYRATION_M) ** 2)
             x, y, yaw = x + push * n_x, y + push * n_y, yaw + push * lever / GYRATION_M**2
             pushed = pushed + push
         went = ((x - before.x_m).square() + (y - before.y_m).square() + 1e-18).sqrt() / dt_s
         slowed = (went.minimum(car.speed_mps) - SLOWED_MPS2 * dt_s).clamp_min(0.0)
         return car._replace(x_m=x, y_m=y, yaw_rad=yaw, speed_mps=torch.where(pushed > 0, slowed, car.speed_mps))
+
+    def _circles(
+        self, x: Float[Tensor, " r"], y: Float[Tensor, " r"], yaw: Float[Tensor, " r"]
+    ) -> Float[Tensor, "r 3 2"]:
+        """The middles of each car's circles."""
+        ahead = self._ahead
+        return torch.stack([x[:, None] + ahead * yaw.cos()[:, None], y[:, None] + ahead * yaw.sin()[:, None]], -1)
+
+    def _touched(self, x: Float[Tensor, " r"], y: Float[Tensor, " r"], yaw: Float[Tensor, " r"]) -> bool:
+        """Whether any car is inside an obstacle."""
+        return len(self) > 0 and bool((_distances(self._circles(x, y, yaw), self._boxes)[0] < RADIUS_M).any())
 
 
 def _distances(

@@ -86,6 +86,9 @@ MISSED = 0.04
 """A frame is helped out by another where the picture reaches so far beyond it, in halves of its width or height."""
 
 
+_FURTHEST_M = 1e4
+
+
 class FrameBank:
     """All recorded frames of a set with their poses and the light on their canvas, ready to be looked up.
 
@@ -183,7 +186,12 @@ class FrameBank:
         return views / views.square().sum((1, 2), keepdim=True).sqrt()
 
     def nearest(self, poses: Poses, alike: Alike = NEAREST) -> Gap:
-        """The recorded frame that shows most of what is seen from each pose."""
+        """The recorded frame that shows most of what is seen from each pose.
+
+        Raises:
+            RecordingError: a pose is out of all bounds, or NaN.
+        """
+        _require_on_earth(poses)
         dx, dy = poses.x_m[:, None] - self.poses.x_m, poses.y_m[:, None] - self.poses.y_m
         c, s = torch.cos(poses.yaw_rad)[:, None], torch.sin(poses.yaw_rad)[:, None]
         ahead, left = c * dx + s * dy, c * dy - s * dx
@@ -322,6 +330,21 @@ class FrameBank:
         bottom = float(torch.where(ahead, row, last).max())
         rows = (min(max(math.floor(top) - 1, self.horizon_row), last), min(max(math.ceil(bottom) + 2, 0), last))
         return slice(*rows) if rows[0] < rows[1] else None
+
+
+def _require_on_earth(poses: Poses) -> None:
+    """Refuse cars that no picture can be made for, however far off.
+
+    Raises:
+        RecordingError: a car is further from the canvas than any drive goes, or nowhere.
+    """
+    furthest = float(torch.stack(poses.detached()).abs().amax())
+    if not furthest < _FURTHEST_M:
+        raise RecordingError(
+            "a car leaves all bounds in these recordings: the controller's answers and the vehicle that was identified "
+            "from the drives do not go together; give drives that steer more, a Vehicle of your own, or a controller "
+            "that drives this road"
+        )
 
 
 class Views(NamedTuple):

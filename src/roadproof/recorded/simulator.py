@@ -22,7 +22,8 @@ from PIL import Image
 from roadproof.compositing.raster import composite_raster
 from roadproof.datatypes import Command, Control, Ending, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CanvasPlacement, Homography, homography_from_pose
+from roadproof.geometry import CanvasPlacement, homography_from_pose
+from roadproof.homographies import Homography
 from roadproof.io.files import is_plain_name
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle

@@ -174,6 +174,9 @@ class RecordedWorld:
             starts: offsets from the clean drive at which the drives begin.
             every: number of steps from one picture to the next, 1 or more; controls are held in between.
             looks: looks of paint and camera, given to the drives in turn; None for paint and camera as recorded.
+
+        Raises:
+            RecordingError: a car leaves all bounds, or its pose is NaN.
         """
         count = len(starts) * (1 if pattern is None else len(pattern.boxes))
         if pattern is not None:
