@@ -144,6 +144,30 @@ def test_a_cluster_finds_and_drives_as_this_machine_does(on_a_cluster, tmp_path)
     assert read_table(place / "there").drop(columns=time).equals(here.drop(columns=time))
 
 
+@pytest.mark.slow
+def test_a_cluster_loses_a_node_and_goes_on_with_the_others(tmp_path):
+    pytest.importorskip("ray", reason="ray is not installed")
+    write_plan(tmp_path, COUNTED.replace("[1, 2]", "[1, 2, 3]"))
+    (tmp_path / "nodes").mkdir()
+    script = Path(__file__).parents[1] / "support" / "study_on_nodes.py"
+    fair = os.environ | {"RAY_raylet_start_wait_time_s": "240", "RAY_worker_niceness": "0"}
+    ran = subprocess.run(
+        [sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, timeout=600, env=fair
+    )
+    assert ran.returncode == 0, ran.stderr
+    study = load_study(tmp_path / "plan.toml")
+    began = [each.name.split("-") for each in (tmp_path / "nodes").iterdir()]
+    by_job = {job.figures: [node for key, node in began if key == job.key] for job in study.jobs}
+    # Two nodes had a job each; the one that took its node down was done again on the other.
+    assert len({node for _, node in began}) == 2
+    assert len(by_job[2]) == 2
+    assert read_table(tmp_path / "there").equals(run_study(study, tmp_path / "here", counts))
+    # What was done before the interruption was not done again; the third job may have been under way.
+    runs = [each.read_text().count("run") for each in tmp_path.glob("roadproof-study-*/*/runs")]
+    assert len(runs) == 3
+    assert sum(runs) in (3, 4)
+
+
 def test_less_than_one_worker_is_refused(small_study, tmp_path):
     with pytest.raises(StudyError, match="workers is 0"):
         run_study(small_study, tmp_path, counts, workers=0)

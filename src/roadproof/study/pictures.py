@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ GROUND = Ground(sidewalk="#d8d4c9", asphalt="#b9bcc0", marking="#f6f4ee")
 GRASS = "#e4e9d9"
 CLEAN = "#1c2126"
 PICTURE_PX = 160
+
+_LETTER_IN = 0.085
+"""Width of a letter of a title, inches."""
 
 Jobs = Mapping[JobId, KeptJob]
 
@@ -202,12 +206,14 @@ def _grid(
         return None
     figure = Figure(figsize=size_in, layout="constrained")
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False)
+    letters = max(8, int(size_in[0] / len(titles) / _LETTER_IN))
+    over = ["\n".join(fill(line, letters, break_on_hyphens=False) for line in title.splitlines()) for title in titles]
     for row, column in product(range(len(rows)), range(len(titles))):
         axes, cell = grid[row, column], rows[row][column]
         axes.set(xticks=[], yticks=[])
         axes.spines[:].set_visible(False)
         if row == 0:
-            axes.set_title(titles[column], fontsize=9.5, color=INK)
+            axes.set_title(over[column], fontsize=9.5, color=INK)
         if column == 0:
             axes.set_ylabel(labels[row], fontsize=9.5, color=INK)
         if cell.picture is None:

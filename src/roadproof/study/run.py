@@ -118,9 +118,10 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job
             ray.init(address=cluster, log_to_driver=False, include_dashboard=False if cluster == "local" else None)
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise StudyError(f"no Ray cluster answers at {cluster}: {error}; start one, or write local") from None
+    running: dict[Any, Job] = {}
     try:
         remote = ray.remote(max_retries=1)(_on_node)
-        running = {remote.remote(job, work): job for job in jobs}
+        running.update({remote.remote(job, work): job for job in jobs})
         while running:
             (reference,), _ = ray.wait(list(running), num_returns=1)
             job = running.pop(reference)
@@ -130,6 +131,9 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job
                 result = failed(job, f"its worker died: {str(error).splitlines()[0]}")
             yield job, result
     finally:
+        # A study that is interrupted leaves no job behind on a cluster that goes on.
+        for reference in running:
+            ray.cancel(reference, force=True)
         if ours:
             ray.shutdown()
 
