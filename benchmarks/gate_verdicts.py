@@ -42,7 +42,7 @@ controller = "{controller}"
 scenarios = [{scenarios}]
 budget = "smoke"
 patterns = "patterns"
-random = 2
+random = 3
 seeds = [{first}, {second}]
 
 [starts]
