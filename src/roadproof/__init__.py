@@ -22,10 +22,12 @@ def _modules() -> dict[str, str]:
 
 
 def __getattr__(name: str) -> object:
+    if name == "__all__":
+        return sorted(_modules())
     if name.startswith("__") or name not in _modules():
         raise AttributeError(f"module 'roadproof' has no attribute {name!r}")
     return getattr(import_module(_modules()[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_modules()])
+    return sorted([*(name for name in globals() if name.startswith("__")), *_modules()])

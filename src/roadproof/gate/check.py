@@ -38,6 +38,7 @@ from roadproof.gate.plan import FRESH, CheckPlan, Key
 from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_reference, worst_of
 from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
@@ -56,7 +57,7 @@ OUTPUTS = (FILE, "junit.xml", "summary.md", WORST)
 def run_check(
     plan: CheckPlan,
     controller: Controller,
-    folder: Path,
+    folder: AnyPath,
     *,
     compare: bool = True,
     device: str = "cpu",
@@ -81,7 +82,7 @@ def run_check(
         OutputError: the folder cannot be written, or another process works in it.
     """
     before: Mapping[Key, Case] = {}
-    begun = time.perf_counter()
+    begun, folder = time.perf_counter(), as_path(folder)
     if processes > 1:
         require_picklable(controller)
     with working_in(folder):

@@ -12,6 +12,7 @@ from roadproof.driving.starts import StartOffset
 from roadproof.errors import CheckError
 from roadproof.gate.plan import BudgetName, CheckPlan, Key
 from roadproof.gate.verdict import Estimate, Kind, Status
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import RecordFile
 
 FILE = "check.json"
@@ -121,13 +122,15 @@ class CheckResult:
         """The cases that failed, or had too few drives."""
         return tuple(case for case in self.cases if case.status is not Status.PASSED)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write check.json; the same bytes for the same result.
 
         Raises:
             OutputError: the file cannot be written.
         """
-        CHECK_FILE.write(path, self, kind="predicted" if self.predicted else "closed loop", verdict=self.status)
+        CHECK_FILE.write(
+            as_path(path), self, kind="predicted" if self.predicted else "closed loop", verdict=self.status
+        )
 
 
 CHECK_FILE = RecordFile(kind=CheckResult, name="roadproof-check-result", error=CheckError, remedy=_AGAIN)

@@ -1,0 +1,5 @@
+"""`python -m roadproof`."""
+
+from roadproof.cli import main
+
+main()
