@@ -155,3 +155,63 @@ def test_sets_too_thin_to_drive_in_are_one_clear_line():
     )
     with pytest.raises(RecordingError, match="no pose for frame"):
         dataclasses.replace(clean, track=few)
+
+
+class Smoothed(RampFollower):
+    """Steers by the mean of what it would do at this picture and at the one before."""
+
+    def __init__(self):
+        super().__init__()
+        self.elapsed = []
+
+    def controls_after(self, memory, frames, speed_mps, command, elapsed_s):
+        now = self.steer(frames, speed_mps, command)
+        self.elapsed.append(elapsed_s)
+        pedals = torch.zeros(len(frames), 2)
+        pedals[:, 0] = 0.1
+        steer = 0.5 * (now + (now if memory is None else memory))
+        return torch.cat([steer.clamp(-1.0, 1.0)[:, None], pedals], 1), now
+
+
+def test_what_a_controller_remembers_is_of_the_drive_so_far(world):
+    controller, patterns = Smoothed(), painted((200, 60, 1.0), (120, 60, 0.0))
+    rolled = world.roll(controller, patterns)
+    dt_s = world.vehicle.dt_s
+    assert controller.elapsed == [0.0] + [dt_s] * (world.course.count - 1)
+    # The cars of a batch remember their own drives.
+    for k in range(2):
+        alone = world.roll(Smoothed(), _one(patterns, k))
+        torch.testing.assert_close(rolled.steer[k], alone.steer[0], atol=1e-5, rtol=1e-4)
+    # With a picture every third step as much time has passed between two.
+    controller.elapsed.clear()
+    world.roll(controller, every=3)
+    assert controller.elapsed[:3] == [0.0, 3 * dt_s, 3 * dt_s]
+    # The memory is what it should be: steering at a step is the mean of two answers.
+    bare = world.roll(RampFollower())
+    assert not torch.allclose(bare.steer, world.roll(Smoothed()).steer)
+
+
+def _one(patterns, k):
+    return Pattern(patterns.shapes, patterns.boxes[k : k + 1], patterns.colours[k : k + 1])
+
+
+def test_gradients_reach_paint_that_is_only_remembered(world):
+    """A controller that steers by the picture before alone: its gradient is that of the loop all the same."""
+
+    class Late(Smoothed):
+        def controls_after(self, memory, frames, speed_mps, command, elapsed_s):
+            now = self.steer(frames, speed_mps, command)
+            controls = torch.zeros(len(frames), 3)
+            controls[:, 0] = (now if memory is None else memory).clamp(-1.0, 1.0)
+            return controls, now
+
+    level = torch.tensor(0.5, requires_grad=True)
+
+    def aside(value):
+        pattern = painted((200, 60, 1.0))
+        return world.roll(Late(), Pattern(pattern.shapes, pattern.boxes, value.expand(1, 1, 3))).right_m.mean()
+
+    (slope,) = torch.autograd.grad(aside(level), level)
+    with torch.no_grad():
+        measured = (aside(level + 0.05) - aside(level - 0.05)) / 0.1
+    assert float(slope) == pytest.approx(float(measured), rel=0.5)

@@ -70,3 +70,12 @@ def test_blur_is_the_mean_of_nine():
     before = pictures(2)
     after = Augmentation(**(NONE | {"blurred": 1.0}))(before, seeded())
     torch.testing.assert_close(after[1, 2, 7, 9], before[1, 2, 6:9, 8:11].mean())
+
+
+def test_a_window_has_one_light_and_each_picture_its_own_noise():
+    before = pictures(1).repeat(6, 1, 1, 1)
+    light = Augmentation(**(NONE | {"brightness": 0.3, "tint": 0.2, "saturation": 0.3}))(before, seeded(), window=3)
+    torch.testing.assert_close(light[0].expand(3, -1, -1, -1), light[:3])
+    assert not torch.allclose(light[0], light[3])
+    noisy = Augmentation(**(NONE | {"noise": 0.1, "noisy": 1.0}))(before, seeded(), window=3)
+    assert not torch.allclose(noisy[0], noisy[1])

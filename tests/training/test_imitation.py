@@ -1,10 +1,19 @@
 """Training learns what the pictures say, goes on where it stopped to the bit, and weighs what it is told to weigh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from roadproof.controllers import CIL, ConditionalPilotNet, CruiseControl, Plan, waypoint_controller
+from roadproof.controllers import (
+    CIL,
+    ConditionalPilotNet,
+    CruiseControl,
+    Plan,
+    temporal_controller,
+    waypoint_controller,
+)
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.errors import TrainingError
 from roadproof.training.augmentation import Augmentation
@@ -32,7 +41,7 @@ def drives(count=240, seed=0):
     expert = np.stack([steer, np.full(count, 0.5), np.zeros(count)], 1).astype(np.float32)
     path = np.stack([np.arange(2.5, 20.1, 2.5) + 0 * steer[:, None], -np.outer(steer, np.arange(1, 9) ** 2 / 8)], 2)
     speed = generator.uniform(0, 8, count).astype(np.float32)
-    return Dataset(frames, speed, command, expert, path.astype(np.float32))
+    return Dataset(frames, speed, command, expert, path.astype(np.float32), np.zeros(len(frames), np.int64))
 
 
 def tiny(seed=0):
@@ -136,7 +145,7 @@ def test_the_rate_rises_and_falls():
 def test_commands_are_drawn_in_their_shares_whatever_was_recorded():
     data = drives(400)
     command = np.where(np.arange(400) < 300, 2, np.where(np.arange(400) < 380, 3, np.where(np.arange(400) < 395, 4, 5)))
-    data = Dataset(data.frames, data.speed_mps, command.astype(np.int8), data.expert, data.path_m)
+    data = replace(data, command=command.astype(np.int8))
     weights = data.weights().numpy()
     for asked, share in SHARES.items():
         assert weights[command == int(asked)].sum() == pytest.approx(share)
@@ -180,3 +189,41 @@ def test_augmentation_is_part_of_the_plan():
     other = imitate(tiny(), data, TrainingPlan(samples=16, batch=8, augmentation=none))
     name = "convolutions.0.conv.weight"
     assert not torch.equal(one.state_dict()[name], other.state_dict()[name])
+
+
+def test_windows_stay_in_their_drives():
+    data = replace(drives(12), first=np.repeat([0, 5], [5, 7]))
+    windows = data.windows(torch.tensor([3, 6, 11]), 4).reshape(3, 4)
+    assert windows.tolist() == [[0, 1, 2, 3], [5, 5, 5, 6], [8, 9, 10, 11]]
+
+
+def film(count=30, length=8, seed=0):
+    """A post moves; the expert steers by how fast, which no single picture tells."""
+    generator = np.random.default_rng(seed)
+    frames = generator.integers(60, 70, (count * length, 88, 200, 3)).astype(np.uint8)
+    pace = generator.choice([-8, 8], count)
+    for k in range(count * length):
+        x = 100 + pace[k // length] * (k % length - length // 2)
+        frames[k, :, x - 10 : x + 10] = 240
+    steer = np.repeat(pace / 16, length)
+    expert = np.stack([steer, np.full(len(steer), 0.5), np.zeros(len(steer))], 1).astype(np.float32)
+    path = np.stack([np.arange(2.5, 20.1, 2.5) + 0 * steer[:, None], -np.outer(steer, np.arange(1, 9) ** 2 / 8)], 2)
+    speed, command = np.full(len(steer), 5.0, np.float32), np.full(len(steer), 2, np.int8)
+    first = np.arange(count).repeat(length) * length
+    return Dataset(frames, speed, command, expert, path.astype(np.float32), first)
+
+
+def test_what_remembers_learns_what_no_single_picture_tells():
+    plan = TrainingPlan(samples=64 * 60, batch=64, seed=1, learning_rate=4e-3, dropout=0.0, averaging=0.9)
+    learnt = imitate(temporal_controller(seed=0), film(), plan)
+    unseen = film(8, seed=9)
+    batch = unseen.batch(torch.arange(len(unseen)))
+    with torch.no_grad():
+        plans = learnt.along(batch.frames, batch.speed_mps, batch.command)
+        steer = learnt.steer_along(plans, batch.speed_mps)
+        alone = learnt.steer(batch.frames, batch.speed_mps, batch.command)
+    middle = torch.arange(4, len(unseen), 8)  # the post is in the middle, whichever way it goes
+    right = batch.expert[middle, 0] > 0
+    apart = steer[middle][right].mean() - steer[middle][~right].mean()
+    assert apart > 0.06
+    assert (alone[middle][right].mean() - alone[middle][~right].mean()).abs() < 0.1 * apart

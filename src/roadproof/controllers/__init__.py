@@ -8,6 +8,7 @@ from roadproof.controllers.cil import CIL as CIL
 from roadproof.controllers.conditional import ConditionalOutput as ConditionalOutput
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet as ConditionalPilotNet
 from roadproof.controllers.frames import FramePreparation as FramePreparation
+from roadproof.controllers.history import HistoryController as HistoryController
 from roadproof.controllers.loading import load_controller as load_controller
 from roadproof.controllers.loading import save_controller as save_controller
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA as PILOTNET_ON_CARLA
@@ -15,12 +16,15 @@ from roadproof.controllers.pilotnet import PilotNet as PilotNet
 from roadproof.controllers.pilotnet import pilotnet_controller as pilotnet_controller
 from roadproof.controllers.protocol import Controller as Controller
 from roadproof.controllers.protocol import PedalController as PedalController
+from roadproof.controllers.protocol import TemporalController as TemporalController
 from roadproof.controllers.published import convert_cil as convert_cil
 from roadproof.controllers.shipped import ModelCard as ModelCard
 from roadproof.controllers.shipped import model_card as model_card
 from roadproof.controllers.shipped import shipped_names as shipped_names
 from roadproof.controllers.steering import CruiseControl as CruiseControl
 from roadproof.controllers.steering import SteeringController as SteeringController
+from roadproof.controllers.temporal import TemporalNet as TemporalNet
+from roadproof.controllers.temporal import temporal_controller as temporal_controller
 from roadproof.controllers.tracking import LinearMPC as LinearMPC
 from roadproof.controllers.tracking import PurePursuit as PurePursuit
 from roadproof.controllers.trajectory import Plan as Plan

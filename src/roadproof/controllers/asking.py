@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.controllers.protocol import Controller, PedalController
+from roadproof.controllers.frames import one_frame_batch
+from roadproof.controllers.protocol import Controller, PedalController, TemporalController
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
@@ -53,6 +54,80 @@ def controls_of(
     require_finite(answer, "controls")
     require_gradient(answer, frames, "controls")
     return answer
+
+
+def controls_after_of(
+    controller: TemporalController,
+    memory: object,
+    frames: Float[Tensor, "b 3 h w"],
+    speed_mps: Float[Tensor, " b"],
+    command: Int[Tensor, " b"],
+    elapsed_s: float,
+) -> tuple[Float[Tensor, "b 3"], object]:
+    """What `TemporalController.controls_after` answers, checked: controls of each car, (B, 3), and what it remembers.
+
+    Raises:
+        ControllerError: the controller raises, or answers wrongly, as in `controls_of`, or without a memory.
+    """
+    member = "controls_after"
+    what = f"the controller's {member}"
+    pair = cast("object", call(what, controller.controls_after, memory, frames, speed_mps, command, elapsed_s))
+    answers = cast("tuple[object, ...]", pair) if isinstance(pair, tuple) else ()
+    if len(answers) != 2:
+        found = _in_words(cast("object", pair))
+        raise ControllerError(f"{what} answered {found}, expected a tuple: the controls, and what it remembers")
+    answer, after = answers
+    controls = _checked(answer, member, frames)
+    require_finite(controls, member)
+    require_gradient(controls, frames, member)
+    return controls, after
+
+
+def answers_of(
+    controller: Controller,
+    memory: object,
+    frames: Float[Tensor, "b 3 h w"],
+    speed_mps: Float[Tensor, " b"],
+    command: Int[Tensor, " b"],
+    elapsed_s: float,
+) -> tuple[Float[Tensor, "b c"], object]:
+    """All that a controller of any kind says: steer, throttle and brake, (B, 3), or steer alone, (B, 1).
+
+    Args:
+        controller: the controller.
+        memory: what this gave with the frames before; None at the first ones.
+        frames: RGB in [0, 1], (B, 3, H, W).
+        speed_mps: speed of the car at each frame, m/s, (B,).
+        command: what the route asks at each frame, in CARLA's codes, (B,).
+        elapsed_s: seconds since the frames before; 0 at the first ones.
+
+    Raises:
+        ControllerError: the controller raises, or answers wrongly.
+    """
+    if isinstance(controller, TemporalController):
+        return controls_after_of(controller, memory, frames, speed_mps, command, elapsed_s)
+    if isinstance(controller, PedalController):
+        return controls_of(controller, frames, speed_mps, command), None
+    return steer_of(controller, frames, speed_mps, command)[:, None], None
+
+
+def act_after_of(
+    controller: TemporalController,
+    memory: object,
+    frame: UInt8[np.ndarray, "h w 3"],
+    speed_mps: float,
+    command: int,
+    elapsed_s: float,
+) -> tuple[Control, object]:
+    """What `TemporalController.controls_after` answers for one camera frame, as plain numbers, and what it remembers.
+
+    Raises:
+        ControllerError: the controller raises, or answers wrongly.
+    """
+    with torch.no_grad():
+        one = one_frame_batch(controller, frame, speed_mps, command)
+        controls, after = controls_after_of(controller, memory, *one, elapsed_s)
+    return Control(*map(float, controls[0])), after
 
 
 def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
@@ -108,8 +183,13 @@ def answer_of(
     Raises:
         ControllerError: the controller raises, or its answer has not the promised shape, dtype or device.
     """
+    answer: object = call(f"the controller's {member}", getattr(controller, member), frames, speed_mps, command)
+    return _checked(answer, member, frames)
+
+
+def _checked(answer: object, member: str, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b ..."]:
+    """An answer with the promised shape, dtype and device."""
     what = f"the controller's {member}"
-    answer: object = call(what, getattr(controller, member), frames, speed_mps, command)
     shape = (len(frames),) if member == "steer" else (len(frames), 3)
     meant = "one value a frame" if member == "steer" else "steer, throttle and brake a frame"
     expected = f"expected a floating-point tensor of shape {shape}, {meant}"

@@ -27,6 +27,9 @@ from roadproof.errors import ControllerError
 CARD_FORMAT = "roadproof-controller"
 CARD_VERSION = 1
 
+PLANNERS = ("waypoint", "temporal")
+"""Architectures that answer with points."""
+
 _NUMBERS_PER_FIELD = {"frame_size": 2, "rows": 2, "network_size": 2, "mean": 3, "std": 3}
 
 
@@ -35,17 +38,20 @@ class ControllerCard:
     """What a weights file does not say by itself.
 
     Args:
-        architecture: "cil", "pilotnet", "conditional-pilotnet" or "waypoint", or None for an exported network.
+        architecture: "cil", "pilotnet", "conditional-pilotnet", "waypoint" or "temporal", or None for an exported
+            network.
         width: factor on CIL's channels and units, 1 by default.
         activation: activation of PilotNet, "elu" or "relu".
         target_speed_mps: speed in m/s that is held when a network that only steers drives, 6 by default.
         preparation: how frames become the network's input; None for the architecture's own.
         tracking: law that steers along the points that the network answers with; None for a network that steers.
         dt_s: time between those points, seconds; None where they have no times.
+        frames_apart_s: time between the frames that an exported network takes at once, seconds, a multiple of 0.05;
+            None for a network that takes one frame.
         origin: what the weights were made from, in words; None if it is not said.
 
     Raises:
-        ControllerError: a law for a network that steers, or a time between points that has nothing to act on.
+        ControllerError: a law for a network that steers, or a time between points or frames that has nothing to act on.
     """
 
     architecture: str | None = None
@@ -55,11 +61,12 @@ class ControllerCard:
     preparation: FramePreparation | None = None
     tracking: PurePursuit | LinearMPC | None = None
     dt_s: float | None = None
+    frames_apart_s: float | None = None
     origin: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what would change nothing."""
-        if self.tracking is not None and self.architecture not in (None, "waypoint"):
+        if self.tracking is not None and self.architecture not in (None, *PLANNERS):
             raise ControllerError(
                 f"tracking is for networks that answer with points, {self.architecture} steers; drop it"
             )
@@ -67,6 +74,11 @@ class ControllerCard:
             raise ControllerError(
                 f"dt_s is {self.dt_s}, but only exported networks with a tracking law have points whose times it could "
                 "be; give tracking or drop dt_s"
+            )
+        if self.frames_apart_s is not None and self.architecture is not None:
+            raise ControllerError(
+                f"frames_apart_s is {self.frames_apart_s}, but only exported networks may take several frames at once, "
+                f"and this is {self.architecture}; drop it"
             )
 
     def to_json(self) -> str:
@@ -101,7 +113,9 @@ def read_card(text: str, source: str) -> ControllerCard:
         name: _text(stated, name, source) for name in ("architecture", "activation", "origin") if name in stated
     }
     values |= {
-        name: _number(stated[name], name, source) for name in ("width", "target_speed_mps", "dt_s") if name in stated
+        name: _number(stated[name], name, source)
+        for name in ("width", "target_speed_mps", "dt_s", "frames_apart_s")
+        if name in stated
     }
     if "preparation" in stated:
         values["preparation"] = _preparation(_object(stated["preparation"], source), source)

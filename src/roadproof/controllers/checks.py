@@ -13,8 +13,16 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from roadproof.controllers.asking import NO_GRADIENT, act_of, answer_of, controls_of, frame_size_of, steer_of
-from roadproof.controllers.protocol import Controller, PedalController, missing_members
+from roadproof.controllers.asking import (
+    NO_GRADIENT,
+    act_of,
+    answer_of,
+    controls_after_of,
+    controls_of,
+    frame_size_of,
+    steer_of,
+)
+from roadproof.controllers.protocol import Controller, PedalController, TemporalController, missing_members
 from roadproof.datatypes import Command
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
@@ -23,6 +31,9 @@ DRIVES = "drives"
 """The check without which nothing can be driven."""
 
 _INTERFACE = "give the object the members of roadproof.controllers.Controller"
+_STEP_S = 0.05
+"""Time from a made-up frame to the next."""
+
 _BROKEN_GRADIENT = "look for square roots and norms at zero, whose derivative is infinite"
 
 
@@ -152,6 +163,9 @@ def require_usable(
         raise ControllerError(f"the controller's gradient is NaN or infinite; {_BROKEN_GRADIENT}")
     if isinstance(controller, PedalController):
         controls_of(controller, leaf, few.speed_mps, few.command)
+    if isinstance(controller, TemporalController):
+        _, memory = controls_after_of(controller, None, *few, 0.0)
+        controls_after_of(controller, memory, *few, _STEP_S)
     if drives:
         act_of(controller, _picture(few), float(few.speed_mps[0]), int(few.command[0]))
 
@@ -169,6 +183,8 @@ def _checks(controller: Controller, drive: _Drive, tolerance: float) -> Iterator
         yield from _gradient_checks(steer, leaf)
     if isinstance(controller, PedalController):
         yield _pedal_check(controller, drive)
+    if isinstance(controller, TemporalController):
+        yield from _memory_checks(controller, drive, tolerance)
     yield _act_check(controller, drive)
 
 
@@ -245,6 +261,35 @@ def _pedal_check(controller: PedalController, drive: _Drive) -> ControllerCheck:
     return ControllerCheck(
         "pedals", outside == 0, f"outside their ranges for {outside} of {len(controls)} frames", advice
     )
+
+
+def _memory_checks(controller: TemporalController, drive: _Drive, tolerance: float) -> Iterator[ControllerCheck]:
+    """Whether what is remembered does what a search and many cars side by side rely on."""
+    shapes = "answer controls_after with a tuple: (b, 3) controls inside their ranges, and what is to be remembered"
+    leaf, later = drive.frames.clone().requires_grad_(), drive._replace(frames=drive.frames.flip(3))
+    try:
+        first, memory = controls_after_of(controller, None, leaf, drive.speed_mps, drive.command, 0.0)
+        once, again = (controls_after_of(controller, memory, *later, _STEP_S)[0] for _ in range(2))
+        parts = [_Drive(*(values[i : i + 1] for values in drive)) for i in range(len(drive.frames))]
+        alone = torch.cat([controls_after_of(controller, None, *part, 0.0)[0] for part in parts])
+        gradient = _gradient_of(once[:, 0], leaf)
+        alike = steer_of(controller, leaf, drive.speed_mps, drive.command).clamp(-1.0, 1.0)
+    except ControllerError as error:
+        yield _failed("memory", error, shapes)
+        return
+    first, once, again = (each.detach() for each in (first, once, again))
+    yield _equal(
+        "memory", first[:, 0], alike.detach(), tolerance, "let steer answer as controls_after does without a memory"
+    )
+    advice = "make a new memory at every call: what is given must not be written to, and nothing kept besides"
+    yield _equal("memory untouched", once[:, 0], again[:, 0], tolerance, advice)
+    yield _equal(
+        "cars apart", first[:, 0], alone[:, 0].detach(), tolerance, "remember every car of the batch by itself"
+    )
+    found = gradient is not None and bool(gradient.isfinite().all())
+    told = "reaches" if found else "does not reach"
+    advice = "keep tensors in the memory as they are: no detach, no_grad or numpy, or paint seen before has no effect"
+    yield ControllerCheck("gradient through memory", found, f"it {told} the frames before", advice)
 
 
 def _act_check(controller: Controller, drive: _Drive) -> ControllerCheck:

@@ -3,8 +3,9 @@
 Convention:
     An exported network takes a batch of any size. Its inputs are told apart by name: `frames` (RGB in [0, 1]) or
     `frames_yuv` (OpenCV's YUV, x / 127.5 − 1), and `speed_mps` and `command` if it wants them; a single input may
-    have any name and is then `frames`. Its only output is the steering, (b,) or (b, 1), positive to the right.
-    A card beside the file (`cards`) says more: the size of the recorded frames, rows to keep, colour, mean and
+    have any name and is then `frames`. An input of shape (b, n, 3, h, w) holds the last n frames of a drive, oldest
+    first, and the card says how far apart they lie. The only output is the steering, (b,) or (b, 1), positive to the
+    right. A card beside the file (`cards`) says more: the size of the recorded frames, rows to keep, colour, mean and
     deviation. Without one, frames come at the network's own size.
 """
 
@@ -25,6 +26,7 @@ from torch import Tensor, nn
 
 from roadproof.controllers.cards import ControllerCard
 from roadproof.controllers.frames import FramePreparation
+from roadproof.controllers.history import HistoryController
 from roadproof.controllers.onnx_graph import OnnxGraph
 from roadproof.controllers.steering import CruiseControl, SteeringController
 from roadproof.controllers.trajectory import TrajectoryController
@@ -38,7 +40,7 @@ _YUV_SIGNED = FramePreparation(colour="yuv", mean=(0.5, 0.5, 0.5), std=(0.5, 0.5
 
 def exported_controller(
     path: Path, card: ControllerCard, *, device: torch.device, dtype: torch.dtype
-) -> SteeringController | TrajectoryController:
+) -> SteeringController | TrajectoryController | HistoryController:
     """A controller around an exported network.
 
     Args:
@@ -48,7 +50,8 @@ def exported_controller(
         dtype: precision in which the network computes; a `.pt2` file has its own.
 
     Raises:
-        ControllerError: the file cannot be read, its inputs cannot be told apart, or its batch is fixed.
+        ControllerError: the file cannot be read, its inputs cannot be told apart, its batch is fixed, or it takes
+            several frames and the card does not say how far apart.
         DeviceError: the precision of a `.pt2` file is another.
     """
     network = TorchProgram(path, device) if path.suffix == ".pt2" else OnnxGraph(path)
@@ -56,13 +59,23 @@ def exported_controller(
         own = {parameter.dtype for parameter in network.parameters() if parameter.is_floating_point()} - {dtype}
         if own:
             raise DeviceError(f"{path} computes in {own.pop()}, not {dtype}; ask for that dtype or export it again")
-    names, preparation = _bound(network.inputs, card, path)
+    names, frames, preparation = _bound(network.inputs, card, path)
     cruise = CruiseControl(target_mps=card.target_speed_mps)
     if card.tracking is not None:
-        return TrajectoryController(
+        single = TrajectoryController(
             network, preparation=preparation, law=card.tracking, dt_s=card.dt_s, inputs=names, cruise=cruise
         )
-    return SteeringController(network, preparation=preparation, inputs=names, cruise=cruise)
+    else:
+        single = SteeringController(network, preparation=preparation, inputs=names, cruise=cruise)
+    if frames is None and card.frames_apart_s is None:
+        return single
+    if frames is None or card.frames_apart_s is None:
+        raise ControllerError(
+            f"{path} takes {'one frame' if frames is None else f'{frames} frames'} at once and its card says "
+            f"frames_apart_s {card.frames_apart_s}; networks of several frames take (b, n, 3, h, w), oldest first, and "
+            "their card says how many seconds lie between two"
+        )
+    return HistoryController(single, frames=frames, apart_s=card.frames_apart_s)
 
 
 class TorchProgram(nn.Module):
@@ -134,8 +147,10 @@ class TorchProgram(nn.Module):
         return self
 
 
-def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple[str, ...], FramePreparation]:
-    """The kind of each input of a network, and how its frames are prepared."""
+def _bound(
+    shapes: InputShapes, card: ControllerCard, path: Path
+) -> tuple[tuple[str, ...], int | None, FramePreparation]:
+    """The kind of each input of a network, how many frames it takes where several, and how they are prepared."""
     known = {"frames", "frames_yuv", "speed_mps", "command"}
     names = list(shapes)
     if len(names) == 1 and names[0] not in known:
@@ -148,7 +163,7 @@ def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple
         )
     picture = shapes[list(shapes)[names.index(pictures[0])]]
     preparation = card.preparation or (_YUV_SIGNED if pictures[0] == "frames_yuv" else FramePreparation())
-    size = picture[2:] if len(picture) == 4 else (None, None)
+    size = picture[-2:] if len(picture) in (4, 5) else (None, None)
     if size[0] is not None and size[1] is not None:
         fixed = (size[0], size[1])
         if preparation.network_size not in (None, fixed):
@@ -156,7 +171,10 @@ def _bound(shapes: InputShapes, card: ControllerCard, path: Path) -> tuple[tuple
         whole = preparation.rows is None and preparation.network_size is None
         frame_size = preparation.frame_size or (fixed if whole else None)
         preparation = replace(preparation, network_size=fixed, frame_size=frame_size)
-    return tuple("frames" if name in pictures else name for name in names), preparation
+    frames = picture[1] if len(picture) == 5 else None
+    if len(picture) == 5 and frames is None:
+        raise ControllerError(f"{path} takes any number of frames at once; export it for one number of them")
+    return tuple("frames" if name in pictures else name for name in names), frames, preparation
 
 
 def _is_torchscript(path: Path) -> bool:

@@ -94,10 +94,10 @@ def require_frame_size(frames: Float[Tensor, "b 3 h w"], expected: tuple[int, in
 
 
 def one_frame_batch(
-    network: nn.Module, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int
+    network: object, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int
 ) -> tuple[Float[Tensor, "1 3 h w"], Float[Tensor, " 1"], Int[Tensor, " 1"]]:
-    """One camera frame, speed and command as a batch of one on the network's device."""
-    first = next(network.parameters(), None)
+    """One camera frame, speed and command as a batch of one on the network's device; the CPU's if it is no module."""
+    first = next(network.parameters(), None) if isinstance(network, nn.Module) else None
     device = None if first is None else first.device
     picture = torch.tensor(frame, device=device).permute(2, 0, 1)[None]
     return (

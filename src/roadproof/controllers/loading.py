@@ -18,20 +18,21 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from roadproof.controllers.asking import frame_size_of
-from roadproof.controllers.cards import ControllerCard, read_card
+from roadproof.controllers.cards import PLANNERS, ControllerCard, read_card
 from roadproof.controllers.cil import CIL
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
 from roadproof.controllers.protocol import Controller, missing_members
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.steering import CruiseControl, NetworkController
+from roadproof.controllers.temporal import TemporalNet, temporal_controller
 from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.controllers.waypoint import WAYPOINT_ON_CARLA, WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
 from roadproof.io.files import AnyPath, as_path, write_tensors
 
-ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet", "waypoint")
+ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet", *PLANNERS)
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
     "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, "
@@ -56,7 +57,9 @@ def load_network(path: Path) -> CIL | ConditionalPilotNet | TrajectoryController
     """
     network = _from_weights(path, None)
     if not isinstance(network, CIL | ConditionalPilotNet | TrajectoryController):
-        raise ControllerError(f"{path} holds a PilotNet, expected CIL, a conditional PilotNet or a waypoint network")
+        raise ControllerError(
+            f"{path} holds a PilotNet, expected CIL, a conditional PilotNet, a waypoint or a temporal network"
+        )
     return network
 
 
@@ -161,7 +164,7 @@ def save_controller(
     dtype: str = "float32",
     origin: str | None = None,
 ) -> None:
-    """Write a CIL, PilotNet or waypoint controller as safetensors, its card in the header.
+    """Write a CIL, PilotNet, waypoint or temporal controller as safetensors, its card in the header.
 
     Args:
         controller: the network as it was trained, not folded.
@@ -188,10 +191,12 @@ def save_controller(
             preparation=controller.preparation,
         )
     elif isinstance(network, WaypointNet) and isinstance(controller, TrajectoryController):
-        card = ControllerCard(architecture="waypoint", preparation=controller.preparation, tracking=controller.law)
+        name = "temporal" if isinstance(network, TemporalNet) else "waypoint"
+        card = ControllerCard(architecture=name, preparation=controller.preparation, tracking=controller.law)
     else:
         raise ControllerError(
-            f"cannot save a {type(network).__name__}, expected CIL, PilotNet or a waypoint network; export it instead"
+            f"cannot save a {type(network).__name__}, expected CIL, PilotNet, a waypoint or a temporal network; export "
+            "it instead"
         )
     kept = torch.float16 if dtype == "float16" else torch.float32
     tensors = {name: tensor.detach().cpu().to(kept).contiguous() for name, tensor in network.state_dict().items()}
@@ -212,8 +217,9 @@ def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
         network = CIL(width=card.width) if card.architecture == "cil" else _conditional_pilotnet(card)
         _fill(network, state, path)
         return network
-    if card.architecture == "waypoint":
-        planner = waypoint_controller(preparation=card.preparation or WAYPOINT_ON_CARLA, law=card.tracking)
+    if card.architecture in PLANNERS:
+        fresh = waypoint_controller if card.architecture == "waypoint" else temporal_controller
+        planner = fresh(preparation=card.preparation or WAYPOINT_ON_CARLA, law=card.tracking)
         _fill(planner.network, state, path)
         return planner
     controller = pilotnet_controller(

@@ -68,6 +68,36 @@ class PedalController(Controller, Protocol):
         ...
 
 
+@runtime_checkable
+class TemporalController(Controller, Protocol):
+    """A controller that remembers: what it does depends on the frames before, too.
+
+    `steer`, `controls` and `act` answer a frame as the first one of a drive, which is what searches on single recorded
+    frames ask for. In a simulator and in the recorded world frames come in the order of the drive, each of them to
+    `controls_after`. The controller itself keeps nothing, so that many cars can be driven side by side.
+    """
+
+    def controls_after(
+        self,
+        memory: object,
+        frames: Float[Tensor, "b 3 h w"],
+        speed_mps: Float[Tensor, " b"],
+        command: Int[Tensor, " b"],
+        elapsed_s: float,
+    ) -> tuple[Float[Tensor, "b 3"], object]:
+        """Steer, throttle and brake of B cars at the next frame of their drives, and what is remembered from then on.
+
+        Args:
+            memory: what was remembered at the frame before, of whatever kind; None at the first frame. It is not
+                written to, and gradients flow through its tensors to the frames before.
+            frames: RGB in [0, 1], (B, 3, H, W).
+            speed_mps: speed of the car at each frame, m/s, (B,).
+            command: what the route asks at each frame, in CARLA's codes (`datatypes.Command`), (B,).
+            elapsed_s: seconds since the frame before; 0 at the first.
+        """
+        ...
+
+
 def missing_members(candidate: object) -> tuple[str, ...]:
     """The members that an object lacks to be a `Controller`; its properties are read, which may raise."""
     return tuple(name for name in ("input_size", "steer", "act") if not hasattr(candidate, name))

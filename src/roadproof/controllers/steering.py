@@ -87,7 +87,7 @@ class NetworkController(nn.Module):
         return self.preparation.frame_size
 
     def answer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> object:
         """What the network answers, in its own dtype.
 
@@ -97,18 +97,24 @@ class NetworkController(nn.Module):
         tensors = chain(self.network.parameters(), self.network.buffers())
         dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), frames.dtype)
         values = {
-            "frames": self.preparation(frames).to(dtype),
+            "frames": self._prepared(frames).to(dtype),
             "speed_mps": speed_mps.to(dtype),
             "command": command.to(torch.int64),
         }
         return self.network(*(values[name] for name in self.inputs))
+
+    def _prepared(self, frames: Float[Tensor, "b *n 3 h w"]) -> Float[Tensor, "b *n 3 hn wn"]:
+        if frames.ndim == 4:
+            return self.preparation(frames)
+        prepared = self.preparation(frames.flatten(0, 1))
+        return prepared.reshape(*frames.shape[:2], *prepared.shape[1:])
 
 
 class SteeringController(NetworkController):
     """A `Controller` around a network that answers with one steering value a frame, of shape (B,) or (B, 1)."""
 
     def steer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Steering, positive to the right and not clipped; see `Controller.steer`.
 
@@ -128,7 +134,7 @@ class SteeringController(NetworkController):
         return answer.reshape(-1).to(frames.dtype)
 
     def controls(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Float[Tensor, "b 3"]:
         """Steer by the network, throttle and brake by `cruise`; see `controllers.PedalController`.
 

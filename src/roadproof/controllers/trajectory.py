@@ -64,7 +64,7 @@ class TrajectoryController(NetworkController):
         self.dt_s = dt_s
 
     def forward(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Plan:
         """The plan for each frame, differentiable in the frames.
 
@@ -90,7 +90,7 @@ class TrajectoryController(NetworkController):
         return Plan(path, lengths_of(steps).mean(1) / self.dt_s)
 
     def steer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Steering along the plan, positive to the right and not clipped; see `Controller.steer`.
 
@@ -100,21 +100,24 @@ class TrajectoryController(NetworkController):
         return self.steer_along(self(frames, speed_mps, command), speed_mps).to(frames.dtype)
 
     def controls(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Float[Tensor, "b 3"]:
         """Steer along the plan, throttle and brake by its speed; see `controllers.PedalController`.
 
         Raises:
             ControllerError: the frames have the wrong size, or the answer is no plan.
         """
-        plan: Plan = self(frames, speed_mps, command)
-        return self.cruise.controls(self.steer_along(plan, speed_mps), speed_mps, plan.target_mps).to(frames.dtype)
+        return self.controls_along(self(frames, speed_mps, command), speed_mps).to(frames.dtype)
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """The control that `controls` gives for one frame."""
         with torch.no_grad():
             steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
         return Control(steer=steer, throttle=gas, brake=brake)
+
+    def controls_along(self, plan: Plan, speed_mps: Float[Tensor, " b"]) -> Float[Tensor, "b 3"]:
+        """Steer, throttle and brake along a plan that was made already, inside their ranges, (B, 3)."""
+        return self.cruise.controls(self.steer_along(plan, speed_mps), speed_mps, plan.target_mps)
 
     def steer_along(self, plan: Plan, speed_mps: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Steering along a plan that was made already, positive to the right, (B,)."""

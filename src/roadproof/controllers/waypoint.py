@@ -37,9 +37,10 @@ WAYPOINT_ON_CARLA = FramePreparation(frame_size=(88, 200), mean=(0.5, 0.5, 0.5),
 WAYPOINT_CRUISE = CruiseControl(gain_per_mps=0.36, hold=0.04)
 """The pedals of the expert in the town, which the target speeds are learnt for."""
 
-_CHANNELS, _SQUEEZED, _IMAGE, _HEAD = (16, 32, 64, 96, 96), 16, 256, 128
+_CHANNELS, _SQUEEZED, _HEAD = (16, 32, 64, 96, 96), 16, 128
 _STRIDES = (2, 2, 2, 1)
-_FLAT = _SQUEEZED * 6 * 13
+FLAT, IMAGE = _SQUEEZED * 6 * 13, 256
+"""Values of a frame's feature maps, and of its image feature."""
 
 
 class WaypointNet(nn.Module):
@@ -47,20 +48,21 @@ class WaypointNet(nn.Module):
 
     Args:
         seed: seed of the initial weights, drawn without touching the global random state.
+        more: number of features that the heads take beside those of the image and the speed.
 
     Convention:
         Heads, in order: follow, straight, left, right.
     """
 
-    def __init__(self, *, seed: int = 0) -> None:
+    def __init__(self, *, seed: int = 0, more: int = 0) -> None:
         super().__init__()
         with seeded(seed):
             self.stem = _normed(3, _CHANNELS[0], kernel=5, stride=2)
             pairs = zip(_CHANNELS, _CHANNELS[1:], _STRIDES, strict=False)
             self.blocks = nn.Sequential(*(_Block(c_in, c_out, stride) for c_in, c_out, stride in pairs))
             self.squeeze = nn.Conv2d(_CHANNELS[-1], _SQUEEZED, 1)
-            self.image = nn.Sequential(nn.SiLU(), nn.Flatten(), nn.Dropout(0.3), nn.Linear(_FLAT, _IMAGE), nn.SiLU())
-            self.heads = nn.ModuleList(_head(_IMAGE + 1) for _ in range(BRANCHES))
+            self.image = nn.Sequential(nn.SiLU(), nn.Flatten(), nn.Dropout(0.3), nn.Linear(FLAT, IMAGE), nn.SiLU())
+            self.heads = nn.ModuleList(_head(IMAGE + more + 1) for _ in range(BRANCHES))
         straight = torch.stack([torch.tensor(PATH_M), torch.zeros(len(PATH_M))], 1)
         self.register_buffer("straight", straight, persistent=False)
 
@@ -70,11 +72,18 @@ class WaypointNet(nn.Module):
         self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
     ) -> Plan:
         """The path and the speed of the commanded head."""
-        image = self.image(self.squeeze(self.blocks(functional.silu(self.stem(frames)))))
-        joined = torch.cat([image, speed_mps[:, None] / SPEED_SCALE_MPS], 1)
+        return self.plan(self.image(self.maps(frames)), speed_mps, command)
+
+    def maps(self, frames: Float[Tensor, "b 3 88 200"]) -> Float[Tensor, "b c 6 13"]:
+        """The feature maps of each frame, from which its image feature is made."""
+        return self.squeeze(self.blocks(functional.silu(self.stem(frames))))
+
+    def plan(self, features: Float[Tensor, "b f"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]) -> Plan:
+        """The path and the speed that the commanded head makes of features."""
+        joined = torch.cat([features, speed_mps[:, None] / SPEED_SCALE_MPS], 1)
         answer = commanded(self.heads, joined, command)
         # The network says by how much the way differs from straight on, as a share of the distance.
-        shares = answer[:, 1:].reshape(len(frames), -1, 2)
+        shares = answer[:, 1:].reshape(len(features), -1, 2)
         path = self.straight + shares * self.straight[:, :1]
         return Plan(path, speed_mps + answer[:, 0] / WAYPOINT_CRUISE.gain_per_mps)
 

@@ -14,8 +14,8 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from roadproof.controllers import Controller
-from roadproof.controllers.asking import act_of, frame_size_of
+from roadproof.controllers import Controller, TemporalController
+from roadproof.controllers.asking import act_after_of, act_of, frame_size_of
 from roadproof.datatypes import Control, Ending, Observation, Weather
 from roadproof.driving.episode import GIVEN, SEEN, Episode
 from roadproof.errors import ControllerError
@@ -187,7 +187,25 @@ def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) ->
     """The policy of a driver for a drive that has just begun."""
     if not isinstance(driver, Controller):
         return driver(simulator)
+    if isinstance(driver, TemporalController):
+        return _remembering(driver)
     return lambda seen: act_of(driver, seen.frame, seen.state.speed_mps, int(seen.command))
+
+
+def _remembering(controller: TemporalController) -> Policy:
+    """The policy of one drive, which carries on what the controller remembers of it."""
+    memory: object = None
+    before_s: float | None = None
+
+    def policy(seen: Observation) -> Control:
+        nonlocal memory, before_s
+        elapsed_s = 0.0 if before_s is None else seen.time_s - before_s
+        asked = (seen.frame, seen.state.speed_mps, int(seen.command), elapsed_s)
+        control, memory = act_after_of(controller, memory, *asked)
+        before_s = seen.time_s
+        return control
+
+    return policy
 
 
 def _check_size(controller: Controller, simulator: Simulator) -> None:

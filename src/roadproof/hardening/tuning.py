@@ -22,8 +22,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from roadproof.controllers import Controller, PedalController
-from roadproof.controllers.asking import controls_of, steer_of
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import answers_of
 from roadproof.controllers.conditional import ConditionalNetwork
 from roadproof.controllers.precision import multiplies_bfloat16
 from roadproof.errors import TrainingError
@@ -107,7 +107,8 @@ def answers(
 ) -> Float[Tensor, "b c"]:
     """Steer, throttle and brake where a controller says them for batches, else steer alone.
 
-    Those of a conditional network are its linear ones: the rules of its agent have no gradient where they cut.
+    Those of a conditional network are its linear ones: the rules of its agent have no gradient where they cut. A
+    temporal controller is asked about frames as the first ones of a drive.
 
     Raises:
         ControllerError: the controller raises, or answers wrongly.
@@ -115,9 +116,7 @@ def answers(
     with _mixed(frames.device):
         if isinstance(controller, ConditionalNetwork):
             return controller(frames, speed_mps, command).controls.float()
-        if isinstance(controller, PedalController):
-            return controls_of(controller, frames, speed_mps, command).float()
-        return steer_of(controller, frames, speed_mps, command).float()[:, None]
+        return answers_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
 
 
 def training_step(model: nn.Module, batch: TuningBatch) -> Float[Tensor, ""]:

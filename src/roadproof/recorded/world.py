@@ -15,8 +15,8 @@ from torch import Tensor
 
 from roadproof.compositing.composite import composite_own
 from roadproof.compositing.variation import Looks
-from roadproof.controllers import Controller, PedalController
-from roadproof.controllers.asking import controls_of, steer_of
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import answers_of, steer_of
 from roadproof.driving.deviation import deviation_m
 from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
@@ -193,12 +193,17 @@ class RecordedWorld:
         off = torch.tensor([start.steer for start in starts], dtype=torch.float64, device=self.device)
         off = off.repeat(count // len(starts))
         gap = self.bank.nearest(Poses(car.x_m, car.y_m, car.yaw_rad))
+        memory: object = None
         for step in range(course.count):
             poses = Poses(car.x_m, car.y_m, car.yaw_rad)
             place = course.locate(poses)
             if step % every == 0:
                 gap = self.bank.nearest(poses.detached())
-                answer = self._answer(controller, pattern, poses, car, gap, looks, step)
+                frames = self._frames(pattern, poses, gap, looks, step)
+                seen = (frames, car.speed_mps.float(), self.bank.command[gap.frame])
+                elapsed_s = min(step, every) * self.vehicle.dt_s
+                found, memory = answers_of(controller, memory, *seen, elapsed_s)
+                answer = found.double()
                 past = place.s_m > self._shown_m
                 steer = torch.where(past, course.law(place), answer[:, 0] + off + course.feedback(place))
                 steer = steer.clamp(-1.0, 1.0)
@@ -288,16 +293,10 @@ class RecordedWorld:
             o + course.steer[max(first - 1, 0)],
         )
 
-    def _answer(
-        self,
-        controller: Controller,
-        pattern: Pattern | None,
-        poses: Poses,
-        car: Motion,
-        gap: Gap,
-        looks: Looks | None,
-        step: int,
-    ) -> Float[Tensor, "r c"]:
+    def _frames(
+        self, pattern: Pattern | None, poses: Poses, gap: Gap, looks: Looks | None, step: int
+    ) -> Float[Tensor, "r 3 h w"]:
+        """What R cars see."""
         with torch.no_grad():
             views = self.bank.show(poses.detached(), gap)
         frames = views.frames
@@ -305,10 +304,7 @@ class RecordedWorld:
             frames = composite_own(pattern, frames, views.canvas, looks)
         if looks is not None:
             frames = looks.seen(frames, len(frames), step)
-        speed, command = car.speed_mps.float(), self.bank.command[gap.frame]
-        if isinstance(controller, PedalController):
-            return controls_of(controller, frames, speed, command).double()
-        return steer_of(controller, frames, speed, command).double()[:, None]
+        return frames
 
     def _recorded_pedals(self, place: Place, car: Motion) -> Float[Tensor, "r 2"]:
         """Pedals that aim at the clean drive's speed a little way ahead, so that a car does not stand for ever."""

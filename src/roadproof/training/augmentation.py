@@ -32,18 +32,21 @@ class Augmentation:
     noisy: float = 0.3
     blurred: float = 0.15
 
-    def __call__(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
+    def __call__(
+        self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator, *, window: int = 1
+    ) -> Float[Tensor, "b 3 h w"]:
         """Varied copies in [0, 1], each picture in its own way; drawn on the CPU, whatever the frames are on.
 
         Args:
             frames: RGB in [0, 1].
             generator: where the randomness comes from.
+            window: number of pictures, one after the other, that are varied alike but for blur and noise.
         """
-        count = len(frames)
+        count = len(frames) // window
 
         def factor(deviation: float, channels: int = 1) -> Float[Tensor, "b c 1"]:
             drawn = torch.randn(count, channels, 1, generator=generator).mul(deviation).exp()
-            return drawn.to(frames)
+            return drawn.repeat_interleave(window, 0).to(frames)
 
         contrast, saturation = factor(self.contrast), factor(self.saturation)
         gain = factor(self.brightness) * factor(self.tint, 3)

@@ -9,12 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int, Int8, UInt8
+from jaxtyping import Float, Float32, Int, Int8, Int64, UInt8
 from torch import Tensor
 
 from roadproof.datatypes import Command
 from roadproof.errors import TrainingError
 from roadproof.training.shards import Shard
+
+_TOLD = ("frames", "speed_mps", "command", "expert", "path_m")
 
 SHARES = {Command.FOLLOW: 0.46, Command.LEFT: 0.2, Command.RIGHT: 0.2, Command.STRAIGHT: 0.14}
 """How often each command is seen while learning, however often it was recorded."""
@@ -48,6 +50,7 @@ class Dataset:
         command: command at each frame, in CARLA's codes.
         expert: steer, throttle and brake that the expert would give at each frame.
         path_m: points of the route ahead, metres ahead of and left of the car.
+        first: number of the first frame of each frame's drive.
     """
 
     frames: UInt8[np.ndarray, "n h w 3"]
@@ -55,6 +58,7 @@ class Dataset:
     command: Int8[np.ndarray, " n"]
     expert: Float32[np.ndarray, "n 3"]
     path_m: Float32[np.ndarray, "n p 2"]
+    first: Int64[np.ndarray, " n"]
 
     @classmethod
     def load(cls, paths: Sequence[Path]) -> Dataset:
@@ -69,7 +73,10 @@ class Dataset:
         sizes = {shard.frames.shape[1:] for shard in shards}
         if len(sizes) > 1:
             raise TrainingError(f"recorded frames have sizes {sorted(sizes)}, expected one size")
-        return cls(*(np.concatenate([getattr(s, n) for s in shards]) for n in cls.__slots__))
+        lengths = [len(shard) for shard in shards]
+        first = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)
+        told = {name: np.concatenate([getattr(shard, name) for shard in shards]) for name in _TOLD}
+        return cls(**told, first=first)
 
     def __len__(self) -> int:
         """How many frames there are."""
@@ -88,6 +95,14 @@ class Dataset:
         if not weight.any():
             raise TrainingError("no recorded frame has a known command")
         return torch.from_numpy(weight / weight.sum())
+
+    def windows(self, last: Int[Tensor, " w"], length: int) -> Int[Tensor, " n"]:
+        """Numbers of the frames of windows, one window after the other: the `last` frame of each and those before it.
+
+        A window that would begin before its drive repeats the drive's first frame.
+        """
+        numbers = last[:, None] - torch.arange(length - 1, -1, -1)
+        return numbers.maximum(torch.from_numpy(self.first)[last][:, None]).flatten()
 
     def batch(self, chosen: Int[Tensor, " b"], device: torch.device | str = "cpu") -> Batch:
         """The chosen frames, as a network takes them."""

@@ -23,6 +23,7 @@ from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
 from roadproof.controllers.precision import multiplies_bfloat16
 from roadproof.controllers.steering import CruiseControl
+from roadproof.controllers.temporal import WINDOW, TemporalPlanner
 from roadproof.controllers.trajectory import Plan
 from roadproof.controllers.weights import seeded
 from roadproof.errors import TrainingError
@@ -160,8 +161,11 @@ def imitate(
         for group in optimiser.param_groups:
             group["lr"] = plan.rate(step)
         draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
-        batch = data.batch(torch.multinomial(weights, plan.batch, replacement=True, generator=draw), place)
-        batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw))
+        # What remembers learns from whole windows of frames; the last of each is drawn.
+        window = WINDOW if isinstance(network, TemporalPlanner) else 1
+        last = torch.multinomial(weights, plan.batch // window, replacement=True, generator=draw)
+        batch = data.batch(data.windows(last, window), place)
+        batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw, window=window))
         found = _step(network, batch, plan, optimiser, step)
         _average(average, network, min(plan.averaging, (1 + step) / (10 + step)))
         sums += found
@@ -184,8 +188,9 @@ def _step(
     """Learn from one batch; its loss and its error of steering."""
     device = batch.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16, enabled=multiplies_bfloat16(device))
+    ask = network.along if isinstance(network, TemporalPlanner) else network
     with seeded(plan.seed * 1_000_003 + step), mixed:
-        answer: ConditionalOutput | Plan = network(batch.frames, batch.speed_mps, batch.command)
+        answer: ConditionalOutput | Plan = ask(batch.frames, batch.speed_mps, batch.command)
     if isinstance(network, TrajectoryController):
         assert isinstance(answer, Plan)
         loss, steer = plan_loss(answer, batch, plan.loss, network.cruise), network.steer_along(answer, batch.speed_mps)

@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, waypoint_controller
+from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, temporal_controller, waypoint_controller
 from roadproof.controllers.loading import load_network
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.errors import TrainingError
@@ -35,7 +35,13 @@ from roadproof.training.imitation import Learner, TrainingPlan, imitate
 
 FORMAT = "roadproof-recipe"
 FORMAT_VERSION = 1
-NETWORKS = ("cil", "pilotnet", "waypoint")
+FRESH: dict[str, Callable[..., Learner]] = {
+    "cil": CIL,
+    "pilotnet": ConditionalPilotNet,
+    "waypoint": waypoint_controller,
+    "temporal": temporal_controller,
+}
+"""What makes each network with fresh weights."""
 
 OnStage = Callable[[str, int, int, str], object]
 """Called with a stage's name, how much of it is done, of how much, and a word about it."""
@@ -50,7 +56,8 @@ class Recipe:
     """How a controller is made.
 
     Args:
-        network: "cil", "pilotnet" for the conditional PilotNet, or "waypoint" for the one that sees a path.
+        network: "cil", "pilotnet" for the conditional PilotNet, "waypoint" for the one that sees a path, or "temporal"
+            for that with a memory.
         width: factor on the channels and units of CIL.
         seed: the seed of scenarios, traffic, disturbances, weights and batches.
         start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
@@ -81,8 +88,8 @@ class Recipe:
     round_samples: int = 100_000
 
     def __post_init__(self) -> None:
-        if self.network not in NETWORKS:
-            raise TrainingError(f"network is {self.network!r}, expected one of {', '.join(NETWORKS)}")
+        if self.network not in FRESH:
+            raise TrainingError(f"network is {self.network!r}, expected one of {', '.join(FRESH)}")
         for name in ("painted_drives", "rounds"):
             if getattr(self, name) < 0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected 0 or more")
@@ -97,10 +104,8 @@ class Recipe:
         if self.start is not None:
             named = not self.start.endswith(".safetensors")
             return load_network(shipped_weights(self.start) if named else Path(self.start))
-        if self.network == "cil":
-            return CIL(width=self.width, seed=self.seed)
-        fresh = waypoint_controller if self.network == "waypoint" else ConditionalPilotNet
-        return fresh(seed=self.seed)
+        width = {"width": self.width} if self.network == "cil" else {}
+        return FRESH[self.network](seed=self.seed, **width)
 
     def expert_plans(self) -> dict[str, CollectionPlan]:
         """The plans of the expert's drives, by the name of their folder."""
@@ -122,7 +127,9 @@ class Recipe:
     def training_plan(self, number: int) -> TrainingPlan:
         """The plan of the training after a round; round 0 learns from the expert's drives alone."""
         first = number == 0
+        # The frames of a window resemble each other: more of them make a batch as varied.
         return TrainingPlan(
+            batch=256 if self.network == "temporal" else 128,
             samples=self.samples if first else self.round_samples,
             learning_rate=self.learning_rate if first else self.learning_rate / 3,
             seed=self.seed + 1000 * number,
