@@ -4,7 +4,7 @@ import torch
 
 from roadproof.constants import constant, kept
 from roadproof.photometry import AffineResponse
-from roadproof.photometry.responses import FilmResponse, placed
+from roadproof.photometry.responses import FilmResponse, response_on
 
 
 def test_a_constant_has_the_numbers_precision_and_device_that_were_asked_for_and_is_made_once():
@@ -44,6 +44,6 @@ def test_a_response_on_a_device_answers_the_same_bit_for_bit():
     affine = AffineResponse(torch.rand(3, 3, dtype=torch.float64), torch.rand(3, dtype=torch.float64))
     painted = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
     for response in (film, affine):
-        assert torch.equal(placed(response, "cpu", torch.float32)(painted), response(painted))
+        assert torch.equal(response_on(response, "cpu", torch.float32)(painted), response(painted))
     own = lambda painted: painted  # noqa: E731
-    assert placed(own, "cpu", torch.float32) is own
+    assert response_on(own, "cpu", torch.float32) is own

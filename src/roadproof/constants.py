@@ -1,4 +1,4 @@
-"""Small tensors that many calls need, made once for each device and kept there.
+"""Small tensors on their devices: those that many calls need, made once for each device and kept there.
 
 To make one anew at every call copies it from the host to the device, for which a GPU has to be waited for.
 """
@@ -6,11 +6,14 @@ To make one anew at every call copies it from the host to the device, for which 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import fields, replace
 from functools import lru_cache
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 
+Made = TypeVar("Made")
 Numbers = tuple[float, ...] | tuple[tuple[float, ...], ...]
 
 
@@ -50,3 +53,15 @@ def _kept(make: Callable[..., Tensor], of: tuple[Hashable, ...], device: torch.d
 
 def _exact(values: Numbers) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+def placed(made: Made, device: torch.device | str, dtype: torch.dtype) -> Made:
+    """A dataclass with the tensors of its fields, and of tuples in them, on a device and in a precision."""
+
+    def moved(value: Any) -> Any:  # noqa: ANN401  # whatever a field holds
+        if isinstance(value, tuple):
+            return tuple(map(moved, cast("tuple[object, ...]", value)))
+        return value.to(device, dtype) if isinstance(value, Tensor) else value
+
+    record = cast("Any", made)
+    return replace(record, **{each.name: moved(getattr(record, each.name)) for each in fields(record)})

@@ -1,6 +1,7 @@
 """Runs beside each other: their numbers, and what is said where they are not alike."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
@@ -9,7 +10,7 @@ from command import answered, roadproof
 from pages import HOSTILE, Page
 from roadproof.errors import RoadproofError
 from roadproof.patterns import raster
-from roadproof.report.comparison import compared, write_comparison
+from roadproof.report.comparison import _name, compared, write_comparison
 from roadproof.report.page import result_of
 from roadproof.report.run import read_run
 from roadproof.scenarios import find_scenario
@@ -118,3 +119,8 @@ def test_the_command_answers_programs_with_what_result_json_says(runs, tmp_path,
     assert told[1]["closed_loop"]["change_m"]["value"] < -0.1
     # What is driven is not compared with what is predicted.
     assert told[2]["foreseen"]["change_m"] is None
+
+
+def test_runs_are_called_by_what_tells_them_apart():
+    paths = [Path(each) for each in ("/a/one/left-03", "/b/one/left-03", "/b/two/right-05", "/left-03")]
+    assert [_name(path, paths) for path in paths] == ["a/one/left-03", "b/one/left-03", "right-05", "/left-03"]

@@ -14,7 +14,7 @@ from roadproof.coverage import Footprints, canvas_share
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.photometry import ColourTransform, PixelMaps, Response
-from roadproof.photometry.responses import placed
+from roadproof.photometry.responses import response_on
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -124,7 +124,7 @@ def view_canvas(
         clean=clean,
         gain=gain,
         bias=bias,
-        response=placed(colour.response, device, dtype),
+        response=response_on(colour.response, device, dtype),
         runs=runs,
     )
 

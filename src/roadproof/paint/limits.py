@@ -6,14 +6,14 @@ becomes a pattern that obeys, so no step of any search ever leaves them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.constants import placed
 from roadproof.errors import PatternError
 from roadproof.paint.colours import AllowedColours, allowed_colours
 from roadproof.paint.keepout import KeepOut, keep_out
@@ -130,21 +130,7 @@ def _maps(
         asphalt=site.asphalt,
     )
     clear = None if limits.keep_out_m is None else keep_out(site, limits.keep_out_m)
-    return _placed(colours, device, dtype), clear and _placed(clear, device, dtype)
-
-
-_Map = TypeVar("_Map", AllowedColours, KeepOut)
-
-
-def _placed(made: _Map, device: torch.device, dtype: torch.dtype) -> _Map:
-    """A map whose tensors are on a device and in a precision."""
-
-    def moved(value: Any) -> Any:  # noqa: ANN401  # whatever a field holds
-        if isinstance(value, tuple):
-            return tuple(map(moved, cast("tuple[object, ...]", value)))
-        return value.to(device, dtype) if isinstance(value, Tensor) else value
-
-    return replace(made, **{each.name: moved(getattr(made, each.name)) for each in fields(made)})
+    return placed(colours, device, dtype), clear and placed(clear, device, dtype)
 
 
 def shrunk(pattern: Pattern, max_share: float) -> Pattern:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from roadproof.constants import placed
 from roadproof.errors import ColourError
 
 SATURATED = 1.5 / 255
@@ -62,10 +63,6 @@ class AffineResponse:
         """The seen colour of each painted colour."""
         return painted @ self.matrix.to(painted).mT + self.offset.to(painted)
 
-    def on(self, device: torch.device | str, dtype: torch.dtype) -> AffineResponse:
-        """The response with its numbers on a device and in a precision."""
-        return AffineResponse(self.matrix.to(device, dtype), self.offset.to(device, dtype))
-
     @classmethod
     def identity(cls) -> AffineResponse:
         """Seen as painted: what per-pixel maps stand on where a renderer multiplies paint by light."""
@@ -104,13 +101,10 @@ class FilmResponse:
 
     def __call__(self, painted: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """The seen colour of each painted colour."""
-        return self._curve()(painted)
+        return self.curve()(painted)
 
-    def on(self, device: torch.device | str, dtype: torch.dtype) -> Response:
-        """The response with its numbers on a device and in a precision."""
-        return self._curve().on(device, dtype)
-
-    def _curve(self) -> _Curve:
+    def curve(self) -> _Curve:
+        """The response with the matrices before and after its curve worked out."""
         to_wide = torch.tensor(_AP1_FROM_SRGB, dtype=torch.float64)
         before = _saturation(_SATURATION_BEFORE) @ to_wide @ torch.diag(self.exposure.double())
         after = cast("Tensor", torch.linalg.inv(to_wide)) @ _saturation(_SATURATION_AFTER)
@@ -138,14 +132,11 @@ class _Curve:
         curve = torch.sigmoid(contrast * light.log())
         return encode_srgb(encode_srgb(_clip_softly(curve @ self.after.to(painted).mT)) ** encoding)
 
-    def on(self, device: torch.device | str, dtype: torch.dtype) -> _Curve:
-        parts = (self.before, self.after, self.contrast, self.encoding)
-        return _Curve(*(part.to(device, dtype) for part in parts))
 
-
-def placed(response: Response, device: torch.device | str, dtype: torch.dtype) -> Response:
+def response_on(response: Response, device: torch.device | str, dtype: torch.dtype) -> Response:
     """A response with its numbers on a device and in a precision; one of the user's own is left as it is."""
-    return response.on(device, dtype) if isinstance(response, AffineResponse | FilmResponse) else response
+    ready = response.curve() if isinstance(response, FilmResponse) else response
+    return placed(ready, device, dtype) if isinstance(ready, AffineResponse | _Curve) else ready
 
 
 def fit_affine(

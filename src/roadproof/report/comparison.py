@@ -32,7 +32,7 @@ class Compared:
     """One run of a comparison.
 
     Args:
-        name: what it is called: its folder's name, with the folder above where two have the same.
+        name: what it is called: its folder's name, with the folders above as far as others have the same.
         judged: the evaluation of the run.
         verdict: what the run shows.
         alone: the run's drives over the pattern, alone on the road, in each weather, and in all together under None.
@@ -134,9 +134,10 @@ def _size(each: Compared) -> tuple[float, float]:
 
 
 def _name(path: Path, paths: Sequence[Path]) -> str:
-    whole = path.resolve()
-    shared = sum(each.resolve().name == whole.name for each in paths) > 1
-    return f"{whole.parent.name}/{whole.name}" if shared else whole.name
+    """The last parts of a path, as many as it takes to tell it from the others."""
+    own, *others = (each.resolve().parts for each in (path, *(each for each in paths if each != path)))
+    depth = next(n for n in range(1, len(own) + 1) if all(other[-n:] != own[-n:] for other in others))
+    return Path(*own[-depth:]).as_posix()
 
 
 def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Mean | None:
