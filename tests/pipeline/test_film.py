@@ -32,7 +32,9 @@ def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town
     (drive,) = load_episodes(tmp_path, [done.shown().painted])
     assert film_trial(town, done, np.zeros((400, 400, 4), np.uint8), tmp_path)
     with av.open(str(tmp_path / "film.mp4")) as film:
-        frames = sum(1 for _ in film.decode(video=0))
+        pictures = sum(1 for _ in film.decode(video=0))
+        assert film.streams.video[0].average_rate == 10
+    frames = 2 * pictures  # of steps of 0.05 s, one picture in 0.1 s
     stood_at = int(np.flatnonzero(drive.speed_mps > 0.1)[-1])
     assert stood_at + EVENT_SHOWN_S / drive.dt_s <= frames <= stood_at + EVENT_SHOWN_S / drive.dt_s + 3
     assert frames < len(drive) - 20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -31,6 +32,9 @@ MOST_BYTES = 4_500_000
 QUALITIES = (26, 30, 34, 38)
 
 VIEW = (640, 480)
+PICTURE_S = 0.1
+"""Time from one picture of the film to the next: drawing them takes most of its time."""
+
 CAPTION_PX = 96
 MOMENTS = 25
 """Pictures of a passage: enough to move through it, a picture every third step or so."""
@@ -69,19 +73,25 @@ class Strip:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Side:
-    """One of the two drives: its title, colour and episode, and its camera pictures as JPEG, a tenth of the memory."""
+    """One of the two drives: its title, colour and episode, and its camera pictures as JPEG, a tenth of the memory.
+
+    There is a picture of the first of `shown` steps and of every `each`-th after it.
+    """
 
     title: str
     colour: tuple[int, int, int]
     episode: Episode
+    each: int
+    shown: int
     pictures: Sequence[bytes]
 
-    def last(self, step: int) -> int:
-        """The step whose picture is shown at a step; after the last picture, that one stays."""
-        return min(step, len(self.pictures) - 1)
-
     def picture(self, step: int) -> Image.Image:
-        return Image.open(io.BytesIO(self.pictures[self.last(step)])).convert("RGB")
+        """The picture of a step, or the last one before it."""
+        return Image.open(io.BytesIO(self.pictures[min(step, self.shown - 1) // self.each])).convert("RGB")
+
+    def told(self, step: int) -> int:
+        """The step whose state is told beside the picture: with the last picture, that of the last step."""
+        return step if step + self.each < self.shown else self.shown - 1
 
 
 def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage, folder: Path) -> bool:
@@ -106,48 +116,61 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
     predicted = ", predicted" if painted.paint.predicted else ""
     sides = (
-        _Side(f"without paint{predicted}", CLEAN, clean, _pictures(simulator, start, clean, None)),
-        _Side(f"with paint{predicted}", PAINTED, painted, _pictures(simulator, start, painted, paint)),
+        _filmed(f"without paint{predicted}", CLEAN, simulator, start, clean, None),
+        _filmed(f"with paint{predicted}", PAINTED, simulator, start, painted, paint),
     )
     beside_m = lateral_m(path_of(clean), path_of(painted))
     last = min(len(clean), len(painted)) - 1
     seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
     first, end = min(seen.start, last), min(seen.stop - 1, last)
-    steps: list[int] = sorted({round(first + (end - first) * k / (MOMENTS - 1)) for k in range(MOMENTS)})
+    each = sides[0].each
+    wanted = (first + (end - first) * k / (MOMENTS - 1) for k in range(MOMENTS))
+    steps: list[int] = sorted({min(each * round(step / each), last // each * each) for step in wanted})
     bare, driven = (
         np.stack([np.asarray(side.picture(k).resize(STRIP_SIZE, Image.Resampling.LANCZOS)) for k in steps])
         for side in sides
     )
     Strip(time_s=painted.time_s[steps], lateral_m=beside_m[steps], clean=bare, painted=driven).save(folder / STRIP)
-    poster = _page(sides, beside_m, int(np.abs(beside_m[: last + 1]).argmax()))
+    poster = _page(sides, beside_m, int(np.abs(beside_m[: last + 1]).argmax()) // each * each)
     write_atomically(folder / POSTER, lambda part: poster.save(part, format="JPEG", quality=82))
     if not can_film():
         return False
     for quality in QUALITIES:
-        with film_file(folder / FILM, poster.size, clean.dt_s, quality=quality) as add:
-            for step in range(max(len(side.pictures) for side in sides)):
+        with film_file(folder / FILM, poster.size, each * clean.dt_s, quality=quality) as add:
+            for step in range(0, max(side.shown for side in sides), each):
                 add(np.asarray(_page(sides, beside_m, step)))
         if (folder / FILM).stat().st_size <= MOST_BYTES:
             break
     return True
 
 
-def _pictures(simulator: Simulator, start: Scenario, episode: Episode, paint: PatternImage | None) -> list[bytes]:
-    """The camera's pictures of a drive as JPEG.
+def _filmed(
+    title: str,
+    colour: tuple[int, int, int],
+    simulator: Simulator,
+    start: Scenario,
+    episode: Episode,
+    paint: PatternImage | None,
+) -> _Side:
+    """A drive again, with the camera's pictures.
 
     A car that stands for good, at a rail until its time is up, say, is shown for a moment only.
     """
     kept: list[bytes] = []
     moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
     enough = min(int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s), len(episode)) if moving.size else 1
+    each = max(1, round(PICTURE_S / episode.dt_s))
+    wanted, steps = frozenset(range(0, enough, each)), itertools.count()
 
     def keep(seen: Observation, _: Control | None) -> None:
+        if next(steps) not in wanted:
+            return
         file = io.BytesIO()
         Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
         kept.append(file.getvalue())
 
-    drive_again(simulator, episode, start, pattern=paint, steps=enough, full_pictures=True, on_step=keep)
-    return kept
+    drive_again(simulator, episode, start, pattern=paint, steps=enough, full_pictures=wanted, on_step=keep)
+    return _Side(title, colour, episode, each, enough, kept)
 
 
 def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: int) -> Image.Image:
@@ -156,14 +179,14 @@ def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: i
     page = Image.new("RGB", (2 * VIEW[0], VIEW[1] + CAPTION_PX), PAPER)
     pen = ImageDraw.Draw(page)
     for left, side in zip((0, VIEW[0]), sides, strict=True):
-        k, episode = side.last(step), side.episode
-        page.paste(side.picture(k), (left, CAPTION_PX))
+        k, episode = side.told(step), side.episode
+        page.paste(side.picture(step), (left, CAPTION_PX))
         pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=side.colour)
         pen.text((left + 20, 12), side.title, side.colour, large)
         beside = f"{abs(beside_m[k]):.2f} m to the {'left' if beside_m[k] > 0 else 'right'}" if left else ""
         state = f"{abs(3.6 * episode.speed_mps[k]):.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
         pen.text((left + 20, 50), state, INK, small)
-        event, fresh = last_event(episode, k, len(side.pictures))
+        event, fresh = last_event(episode, k, side.shown)
         pen.text((left + VIEW[0] - 20, 14), event, PAINTED if fresh else FAINT, large, anchor="ra")
     pen.line((VIEW[0], 0, VIEW[0], page.height), PAPER, 3)
     return page
