@@ -14,7 +14,7 @@ import shown
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "tutorials").glob("*.md"))]
-MODULES = {"blackbox": "optuna", "carla": "carla", "study": "pandas", "video": "av"}
+MODULES = {"blackbox": "optuna", "carla": "carla", "cil": "roadproof_cil", "study": "pandas", "video": "av"}
 PROGRAMS = Path(sysconfig.get_path("scripts"))
 
 

@@ -1,6 +1,7 @@
 """`roadproof controllers`, `check-controller` and `train` as their users call them."""
 
 import dataclasses
+import sys
 
 import pytest
 
@@ -30,6 +31,40 @@ def test_a_card_is_shown_whole(invoke):
     assert code == 0, printed.err
     for text in (model_card("cil").cannot, model_card("cil").data):
         assert " ".join(text.split()) in " ".join(printed.out.split())
+
+
+def test_without_the_large_weights_cards_are_shown_with_what_to_install(invoke, monkeypatch):
+    monkeypatch.setitem(sys.modules, "roadproof_cil", None)
+    code, printed = invoke("controllers")
+    assert code == 0, printed.err
+    assert printed.out.count("not installed  ") == 2
+    assert "The weights of cil and cil-small are not installed: pip install 'roadproof[cil]'" in printed.out
+    code, printed = invoke("controllers", "cil")
+    assert code == 0
+    assert " ".join(model_card("cil").cannot.split()) in " ".join(printed.out.split())
+    assert printed.out.endswith("\nThe weights of cil are not installed: pip install 'roadproof[cil]'\n")
+    code, printed = invoke("controllers", "cil", "--json")
+    assert code == 0
+    assert [each["megabytes"] for each in answered(printed.out)["controllers"]] == [None]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["check-controller", "cil", "--no-drive"],
+        ["drive", "--controller", "cil"],
+        ["train", "--start", "cil"],
+        ["demo", "--controller", "cil"],
+    ],
+)
+def test_without_the_large_weights_whatever_needs_them_is_one_line(invoke, tmp_path, monkeypatch, words):
+    monkeypatch.setitem(sys.modules, "roadproof_cil", None)
+    if words[0] != "check-controller":
+        words = [*words, "--out", tmp_path / "out"]
+    code, printed = invoke(*words)
+    said = "the controller 'cil' needs its weights, which are not installed: pip install 'roadproof[cil]'"
+    assert (code, printed.err) == (2, f"roadproof: {said}\n")
+    assert not (tmp_path / "out" / "drives").exists()
 
 
 def test_an_unknown_controller_is_one_line(invoke):

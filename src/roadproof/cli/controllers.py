@@ -1,4 +1,4 @@
-"""`roadproof controllers`: the controllers that come with the package, and their cards."""
+"""`roadproof controllers`: the shipped controllers, and their cards."""
 
 from __future__ import annotations
 
@@ -18,17 +18,21 @@ def controllers(
     """List the shipped controllers, or show the card of one."""
     from rich.text import Text
 
-    from roadproof.controllers.shipped import model_card, shipped_names, shipped_weights
+    from roadproof.controllers.shipped import INSTALL, installed_weights, model_card, shipped_names
 
     cards = [model_card(each) for each in (shipped_names() if name is None else (name,))]
-    megabytes = [shipped_weights(card.name).stat().st_size / 1e6 for card in cards]
+    weights = [installed_weights(card.name) for card in cards]
+    megabytes = [None if file is None else file.stat().st_size / 1e6 for file in weights]
     if name is None:
         shown = table(("name", "network", "size", "what it is"))
         for card, size in zip(cards, megabytes, strict=True):
-            shown.add_row(*map(Text, (card.name, card.network, f"{size:.1f} MB", card.summary)))
+            said = "not installed" if size is None else f"{size:.1f} MB"
+            shown.add_row(*map(Text, (card.name, card.network, said, card.summary)))
         say(shown, wrapped=True)
     else:
         _show(cards[0])
+    if absent := " and ".join(card.name for card, size in zip(cards, megabytes, strict=True) if size is None):
+        say(f"\nThe weights of {absent} are not installed: {INSTALL}")
     answer({"controllers": [asdict(card) | {"megabytes": size} for card, size in zip(cards, megabytes, strict=True)]})
 
 

@@ -29,7 +29,7 @@ _TOLD_MPS = 0.3
 
 def evaluate(
     pattern: Annotated[Path, argument("pattern.json of an attack, or a 400×400 picture.")],
-    controller: options.DriverSpec = "cil",
+    controller: options.DriverSpec = "pilotnet",
     scenario: options.ScenarioOrRecorded = None,
     scenarios: options.ScenarioFile = None,
     weathers: Annotated[

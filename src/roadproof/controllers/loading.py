@@ -68,7 +68,7 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
 
     Args:
         spec: one of
-            `cil`, `pilotnet` …: one that comes with the package, see `shipped`;
+            `cil`, `pilotnet` …: one that comes with roadproof, see `shipped` (`cil` and `cil-small`: extra `cil`);
             `FILE.safetensors`: weights; the card in its header (`save_controller`) or beside it as `FILE.json` says
             of which network;
             `cil:FILE.safetensors`, `pilotnet:FILE.safetensors`: weights without a card, of the published network on
@@ -81,7 +81,8 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
         dtype: precision in which the network computes: "float32", "bfloat16" or "float64". Frames may stay in float32.
 
     Raises:
-        ControllerError: the spec or file does not exist, the weights do not fit, or the object is no controller.
+        ControllerError: the spec or file does not exist, the weights are not installed or do not fit, or the object is
+            no controller.
         DeviceError: the device or dtype is not available.
 
     Note:
