@@ -116,13 +116,17 @@ def on_a_cluster(tmp_path_factory):
         write_plan(place, plan)
     (folder / "node").mkdir()
     words = [f"{place}:{work.__name__}" for work, place in done.items()]
-    script = Path(__file__).parents[1] / "support" / "study_on_ray.py"
+    on_ray("study_on_ray.py", folder / "node", *words)
+    return done
+
+
+def on_ray(script, *words):
+    """Run a script of `support` in a process of its own, where it begins a cluster."""
     # By default Ray's workers let all others go first, so that beside other tests they hardly get to work.
     fair = os.environ | {"RAY_raylet_start_wait_time_s": "240", "RAY_worker_niceness": "0"}
-    command = [sys.executable, str(script), str(folder / "node"), *words]
+    command = [sys.executable, str(Path(__file__).parents[1] / "support" / script), *map(str, words)]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=600, env=fair)
     assert ran.returncode == 0, ran.stderr
-    return done
 
 
 @pytest.mark.slow
@@ -149,12 +153,7 @@ def test_a_cluster_loses_a_node_and_goes_on_with_the_others(tmp_path):
     pytest.importorskip("ray", reason="ray is not installed")
     write_plan(tmp_path, COUNTED.replace("[1, 2]", "[1, 2, 3]"))
     (tmp_path / "nodes").mkdir()
-    script = Path(__file__).parents[1] / "support" / "study_on_nodes.py"
-    fair = os.environ | {"RAY_raylet_start_wait_time_s": "240", "RAY_worker_niceness": "0"}
-    ran = subprocess.run(
-        [sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, timeout=600, env=fair
-    )
-    assert ran.returncode == 0, ran.stderr
+    on_ray("study_on_nodes.py", tmp_path)
     study = load_study(tmp_path / "plan.toml")
     began = [each.name.split("-") for each in (tmp_path / "nodes").iterdir()]
     by_job = {job.figures: [node for key, node in began if key == job.key] for job in study.jobs}
