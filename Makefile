@@ -12,7 +12,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  sys.exit(0 if sys.version_info >= (3, 11) else f"roadproof needs Python 3.11 or newer, this is {v}: set PYTHON=...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[blackbox,carla,onnx,ray,study,town,video]' --group dev
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[blackbox,carla,chessboard,onnx,ray,study,town,video]' --group dev
 	touch $(STAMP)
 
 # The whole loop on one scenario of the built-in town; given recorded drives of your own, they are attacked instead.
