@@ -13,7 +13,7 @@ $(STAMP): pyproject.toml weights/pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --group dev --editable ./weights \
-	  --editable '.[blackbox,carla,cil,onnx,ray,study,town,video]'
+	  --editable '.[blackbox,carla,chessboard,cil,onnx,ray,study,town,video]'
 	touch $(STAMP)
 
 # The whole loop on one scenario of the built-in town; given recorded drives of your own, they are attacked instead.

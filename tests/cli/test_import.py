@@ -1,7 +1,13 @@
 from __future__ import annotations
 
+import re
+
+import pytest
+
+from chessboards import poses, write_boards
 from command import answered, roadproof, stored
-from own_drives import write_own
+from lenses import BARREL, behind
+from own_drives import PLAN, write_own
 from roadproof.errors import RecordingError
 from roadproof.io.pictures import read_picture
 from roadproof.recordings import load_recordings
@@ -27,3 +33,24 @@ def test_what_is_there_already_is_kept_and_nothing_is_read(tmp_path):
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert [path.name for path in out.iterdir()] == ["mine.txt"]
+
+
+def test_chessboards_tell_the_camera_and_how_well(tmp_path, invoke):
+    pytest.importorskip("cv2", reason="chessboards need the extra roadproof[chessboard]")
+    plan = PLAN.replace("fov_deg = 100.0", "fov_deg = 70.0") + '\n[chessboard]\npictures = "boards"\ncorners = [9, 6]\n'
+    folder, true = write_own(tmp_path / "mine", ["clean"], plan=plan), behind(BARREL)
+    write_boards(folder / "boards", true, poses(true, 12))
+    code, printed = invoke("import", folder, "--out", tmp_path / "set")
+    assert (code, printed.err) == (0, "")
+    camera = load_recordings(tmp_path / "set").camera
+    assert camera.fov_deg == pytest.approx(100.0, abs=0.1)
+    assert camera.lens.coefficients == pytest.approx(BARREL.coefficients, abs=0.02)
+    assert (camera.up_m, camera.pitch_deg) == (true.up_m, true.pitch_deg)
+    told = re.search(
+        r"field of view (\S+)° ± (\S+)° \(95 %\) and lens from 12 pictures .* missed by (\S+) px", printed.out
+    )
+    fov_deg, error_deg, missed_px = map(float, told.groups())
+    assert fov_deg == pytest.approx(camera.fov_deg, abs=0.006)
+    assert 0.0 < error_deg < 0.1
+    assert 0.0 < missed_px < 0.3
+    assert "behind a brown-conrady lens" in printed.out

@@ -20,6 +20,8 @@ from roadproof.io.pictures import read_picture
 from roadproof.recordings import Side
 from roadproof.search_space import SearchSpace
 
+CHESSBOARD = '\n[chessboard]\npictures = "boards"\ncorners = [9, 6]\n'
+
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
@@ -84,6 +86,9 @@ def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():
     found = fitted_camera(CIL_CAMERA, ground)
     assert (found.up_m, found.pitch_deg, found.fov_deg) == pytest.approx((1.62, -11.0, 88.0), abs=1e-3)
     assert fitted_camera(CIL_CAMERA, ()) == CIL_CAMERA
+    known = fitted_camera(replace(true, up_m=1.3, pitch_deg=-5.0), ground, fov_known=True)
+    assert (known.up_m, known.pitch_deg) == pytest.approx((1.62, -11.0), abs=1e-3)
+    assert known.fov_deg == true.fov_deg
     with pytest.raises(RecordingError, match="expected 3 or more"):
         fitted_camera(CIL_CAMERA, ground[:2])
     with pytest.raises(RecordingError, match=r"missed by up to \d+\.\d px"):
@@ -156,6 +161,13 @@ def test_black_and_white_are_seen_as_stated(tmp_path):
         (through(BARREL).replace("-0.12", "-0.9"), "camera lens folds the picture 1"),
         (PLAN.replace("fov_deg = 100.0", 'fov_deg = "wide"'), "camera.fov_deg is 'wide', expected float"),
         (PLAN.replace("fov_deg = 100.0\n", ""), "camera lacks fov_deg"),
+        (PLAN + CHESSBOARD.replace("[9, 6]", "[9, 2]"), r"has corners \[9, 2\], expected 3 to 25 in a row and 3 to 25"),
+        (PLAN + CHESSBOARD.replace("[9, 6]", "[900, 6]"), r"has corners \[900, 6\], expected 3 to 25"),
+        (PLAN + CHESSBOARD.replace("[9, 6]", "9"), r"chessboard.corners is 9, expected array"),
+        (PLAN + CHESSBOARD + 'lens = "tessar"', "chessboard.lens is 'tessar', expected one of brown-conrady, fisheye"),
+        (PLAN + CHESSBOARD + "square_m = 0.03", "chessboard has an unknown key 'square_m'"),
+        (through(BARREL) + CHESSBOARD, r"\[camera.lens\] and \[chessboard\] both tell the lens"),
+        (PLAN + CHESSBOARD.replace("boards", "nowhere"), "cannot read the folder"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused(tmp_path, own, plan, message):

@@ -30,7 +30,8 @@ def import_(
         say(f"canvas {canvas.width_m:.2f} m across the road, {canvas.length_m:.2f} m along it")
     for drive in recordings.recordings:
         say(f"  {drive.name:8} {len(drive.frames)} frames, steps {drive.frame_number[0]} to {drive.frame_number[-1]}")
-    say(f"  {recordings.origin}")
+    for told in recordings.origin.split("; "):
+        say(f"  {told}")
     say(f"Is the canvas where it should be? {shown}")
     say(f"Recordings in {out}; next: roadproof attack {out} --objective deviation --controller ...")
     answer(stored(out / "recordings.json"))

@@ -96,12 +96,13 @@ def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
     return CanvasPlacement(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, **size)
 
 
-def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint]) -> CameraModel:
+def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint], *, fov_known: bool = False) -> CameraModel:
     """The camera with height, pitch and field of view fitted so that known ground points are where they are seen.
 
     Args:
         camera: camera from which the fit begins; it is returned unchanged if no points are given.
         ground: none, or at least three known points of the ground.
+        fov_known: whether the field of view stays as it is.
 
     Raises:
         RecordingError: there are one or two points, or the fit misses them by more than 5 px.
@@ -113,21 +114,21 @@ def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint]) -> CameraM
     place = np.array([[each.ahead_m, each.left_m, 0.0, 1.0] for each in ground])
     seen = np.array([[each.x_px, each.y_px] for each in ground])
 
-    def placed_as(numbers: Float[np.ndarray, " 3"]) -> CameraModel:
-        up_m, pitch_deg, fov_deg = numbers.tolist()
-        return replace(camera, up_m=up_m, pitch_deg=pitch_deg, fov_deg=fov_deg)
+    names = ("up_m", "pitch_deg", "fov_deg")[: 2 if fov_known else 3]
 
-    def missed(numbers: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " m"]:
+    def placed_as(numbers: Float[np.ndarray, " p"]) -> CameraModel:
+        return replace(camera, **dict(zip(names, numbers.tolist(), strict=True)))
+
+    def missed(numbers: Float[np.ndarray, " p"]) -> Float[np.ndarray, " m"]:
         tried = placed_as(numbers)
         shown = place @ tried.image_from_world(_ORIGIN).T
         shown[:, 2] = np.maximum(shown[:, 2], 1e-3)
         return (tried.distorted(shown) - seen).T.ravel()
 
     widest_deg = math.degrees(2 * math.atan2(camera.width_px / 2, camera.least_focal_px))
-    begin = np.array([camera.up_m, camera.pitch_deg, camera.fov_deg])
-    found = cast("Any", optimize).least_squares(
-        missed, begin, bounds=([0.1, -80.0, 5.0], [10.0, 45.0, min(170.0, widest_deg)]), x_scale=(0.1, 1.0, 1.0)
-    )
+    begin = np.array([getattr(camera, name) for name in names])
+    bounds = np.array([[0.1, -80.0, 5.0], [10.0, 45.0, min(170.0, widest_deg)]])[:, : len(names)]
+    found = cast("Any", optimize).least_squares(missed, begin, bounds=bounds, x_scale=(0.1, 1.0, 1.0)[: len(names)])
     off_px = float(np.hypot(*missed(found.x).reshape(2, -1)).max())
     if off_px > _MOST_MISSED_PX:
         raise RecordingError(

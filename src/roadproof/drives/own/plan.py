@@ -9,6 +9,7 @@ from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
 from roadproof.io.files import read_toml
 from roadproof.io.tables import build
+from roadproof.lens import LensModel
 from roadproof.recordings import Side
 
 PLAN = "drives.toml"
@@ -29,6 +30,28 @@ class GroundPoint:
     y_px: float
     ahead_m: float
     left_m: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Chessboard:
+    """Pictures of a printed chessboard, which tell the field of view and the lens of the camera that took them.
+
+    Args:
+        pictures: folder of the pictures, in the folder of drives.toml; every PNG and JPEG there counts.
+        corners: inner corners in a row of the board, and rows of them, 3 to 25 each: places where four squares meet.
+        lens: kind of the lens.
+    """
+
+    pictures: str
+    corners: tuple[int, int]
+    lens: LensModel = "brown-conrady"
+
+    def __post_init__(self) -> None:
+        if not (min(self.corners) >= 3 and max(self.corners) <= 25):
+            raise RecordingError(
+                f"[chessboard] has corners {list(self.corners)}, expected 3 to 25 in a row and 3 to 25 rows: places "
+                "where four squares meet, so that a board of 10 by 7 squares has [9, 6]"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -93,7 +116,10 @@ class OwnDrives:
         drive: the drives, one of which is clean.
         canvas: place of the canvas; None if the tables give its corners.
         colour: how black and white paint look in the pictures.
-        ground: known ground points to which the camera's height, pitch and field of view are fitted.
+        chessboard: pictures of a chessboard to which the camera's field of view and lens are fitted; None if they are
+            as `camera` states them.
+        ground: known ground points to which the camera's height, pitch and field of view are fitted; the field of view
+            stays where a chessboard tells it.
         origin: where the drives come from, in words.
     """
 
@@ -103,6 +129,7 @@ class OwnDrives:
     drive: tuple[OwnDrive, ...]
     canvas: OwnCanvas | None = None
     colour: OwnColour = OwnColour()
+    chessboard: Chessboard | None = None
     ground: tuple[GroundPoint, ...] = ()
     origin: str = ""
 
@@ -114,6 +141,8 @@ class OwnDrives:
             raise RecordingError(
                 f"the camera has up_m {camera.up_m:g}, pitch_deg {camera.pitch_deg:g}; expected above 0, and −90 to 90"
             )
+        if camera.lens is not None and self.chessboard is not None:
+            raise RecordingError("[camera.lens] and [chessboard] both tell the lens; leave one of them out")
         if not 0.0 < self.dt_s <= 1.0:
             raise RecordingError(f"dt_s is {self.dt_s:g}, expected seconds above 0 and at most 1")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,10 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw
 
+from roadproof.drives.own.boards import boards_in
+from roadproof.drives.own.chessboard import calibrated
 from roadproof.drives.own.motion import motion_of
+from roadproof.drives.own.pictures import camera_picture
 from roadproof.drives.own.place import canvas_on, fitted_camera, track_of
 from roadproof.drives.own.plan import PLAN, OwnColour, OwnDrives, read_plan
 from roadproof.drives.own.table import CORNERS, Table, read_table
@@ -25,8 +28,7 @@ from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, homography_from_pose
 from roadproof.homographies import apply_homography, homogeneous, homography_from_points
-from roadproof.io.files import AnyPath, as_path, inside
-from roadproof.io.pictures import read_picture
+from roadproof.io.files import AnyPath, as_path
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded import placed
 from roadproof.recordings import Recording, RecordingSet, Track, evenly
@@ -52,24 +54,34 @@ def import_drives(folder: AnyPath) -> RecordingSet:
 
     Raises:
         RecordingError: a file is missing or damaged, a column is missing or has no number, poses jump, the canvas is
-            not in view, or known points do not agree with the camera; the message names it.
+            not in view, or known points or chessboards do not agree with the camera; the message names it.
     """
     folder = as_path(folder)
     own = read_plan(folder)
-    own = replace(own, camera=fitted_camera(own.camera, own.ground))
     tables = [read_table(folder, drive) for drive in own.drive]
     given: dict[str, Any] = {
-        "camera": own.camera,
         "view": own.input,
         "colour": _colour(own.colour),
         "origin": own.origin or f"imported from {folder.name}",
     }
+    own, told = _with_camera(folder, own)
+    given |= {"camera": own.camera, "origin": given["origin"] + told}
     if len(tables) == 1 and tables[0].tells_no_place:
         tables, agreed = _with_motion(folder, own, tables[0])
         given["origin"] += f"; speed and yaw rate seen in {agreed}"
     if all(name in table.numbers for table in tables for name in CORNERS):
         return _from_corners(folder, own, tables, given)
     return _from_poses(folder, own, tables, given)
+
+
+def _with_camera(folder: Path, own: OwnDrives) -> tuple[OwnDrives, str]:
+    """The plan with the camera that chessboards and known points tell, and what chessboards say of it."""
+    camera, told = own.camera, ""
+    if own.chessboard is not None:
+        found = calibrated(camera, boards_in(folder, camera, own.chessboard), own.chessboard.lens)
+        camera, told = found.camera, f"; {found}"
+    camera = fitted_camera(camera, own.ground, fov_known=own.chessboard is not None)
+    return replace(own, camera=camera, chessboard=None), told
 
 
 def _with_motion(folder: Path, own: OwnDrives, table: Table) -> tuple[list[Table], str]:
@@ -156,17 +168,7 @@ def _recording(
 
 
 def _picture(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    path = folder
-    for part in PurePosixPath(name).parts:
-        path = inside(path, part, f"picture {name!r:.80}", RecordingError)
-    picture = read_picture(path, RecordingError, "check the column picture")
-    camera = own.camera
-    if picture.shape[:2] != (camera.height_px, camera.width_px):
-        raise RecordingError(
-            f"{path} has {picture.shape[1]}×{picture.shape[0]} pixels, expected {camera.width_px}×{camera.height_px} "
-            f"as the camera in {PLAN}"
-        )
-    return picture
+    return camera_picture(folder, own.camera, name, "check the column picture")
 
 
 def _frame(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
