@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -75,7 +75,7 @@ class Strip:
 class _Side:
     """One of the two drives: its title, colour and episode, and its camera pictures as JPEG, a tenth of the memory.
 
-    There is a picture of the first of `shown` steps and of every `each`-th after it.
+    There is a picture of the first of `shown` steps, of every `each`-th after it, and of those of the strip.
     """
 
     title: str
@@ -83,11 +83,12 @@ class _Side:
     episode: Episode
     each: int
     shown: int
-    pictures: Sequence[bytes]
+    pictures: Mapping[int, bytes]
 
     def picture(self, step: int) -> Image.Image:
-        """The picture of a step, or the last one before it."""
-        return Image.open(io.BytesIO(self.pictures[min(step, self.shown - 1) // self.each])).convert("RGB")
+        """The picture of a step; after the last picture, that one stays."""
+        taken = self.pictures.get(step) or self.pictures[max(self.pictures)]
+        return Image.open(io.BytesIO(taken)).convert("RGB")
 
     def told(self, step: int) -> int:
         """The step whose state is told beside the picture: with the last picture, that of the last step."""
@@ -115,17 +116,16 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     start = trial.start.of(evaluation.scenario)
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
     predicted = ", predicted" if painted.paint.predicted else ""
-    sides = (
-        _filmed(f"without paint{predicted}", CLEAN, simulator, start, clean, None),
-        _filmed(f"with paint{predicted}", PAINTED, simulator, start, painted, paint),
-    )
-    beside_m = lateral_m(path_of(clean), path_of(painted))
     last = min(len(clean), len(painted)) - 1
     seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
     first, end = min(seen.start, last), min(seen.stop - 1, last)
+    steps: list[int] = sorted({round(first + (end - first) * k / (MOMENTS - 1)) for k in range(MOMENTS)})
+    sides = (
+        _filmed(f"without paint{predicted}", CLEAN, simulator, start, clean, None, steps),
+        _filmed(f"with paint{predicted}", PAINTED, simulator, start, painted, paint, steps),
+    )
+    beside_m = lateral_m(path_of(clean), path_of(painted))
     each = sides[0].each
-    wanted = (first + (end - first) * k / (MOMENTS - 1) for k in range(MOMENTS))
-    steps: list[int] = sorted({min(each * round(step / each), last // each * each) for step in wanted})
     bare, driven = (
         np.stack([np.asarray(side.picture(k).resize(STRIP_SIZE, Image.Resampling.LANCZOS)) for k in steps])
         for side in sides
@@ -151,23 +151,24 @@ def _filmed(
     start: Scenario,
     episode: Episode,
     paint: PatternImage | None,
+    strip: Sequence[int],
 ) -> _Side:
-    """A drive again, with the camera's pictures.
+    """A drive again, with the camera's pictures at the film's steps and at those of the strip.
 
     A car that stands for good, at a rail until its time is up, say, is shown for a moment only.
     """
-    kept: list[bytes] = []
+    kept: dict[int, bytes] = {}
     moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
     enough = min(int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s), len(episode)) if moving.size else 1
     each = max(1, round(PICTURE_S / episode.dt_s))
-    wanted, steps = frozenset(range(0, enough, each)), itertools.count()
+    wanted, steps = frozenset((*range(0, enough, each), *(step for step in strip if step < enough))), itertools.count()
 
     def keep(seen: Observation, _: Control | None) -> None:
-        if next(steps) not in wanted:
+        if (step := next(steps)) not in wanted:
             return
         file = io.BytesIO()
         Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
-        kept.append(file.getvalue())
+        kept[step] = file.getvalue()
 
     drive_again(simulator, episode, start, pattern=paint, steps=enough, full_pictures=wanted, on_step=keep)
     return _Side(title, colour, episode, each, enough, kept)
