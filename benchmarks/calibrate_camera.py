@@ -145,7 +145,7 @@ def main() -> None:
     """Fit cameras and say how well."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--corners", type=int, nargs=2, default=CORNERS)
     parser.add_argument("--lens", choices=["brown-conrady", "fisheye"], default="brown-conrady")
