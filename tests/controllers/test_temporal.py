@@ -19,6 +19,7 @@ from roadproof.controllers import (
     temporal_controller,
 )
 from roadproof.controllers.history import TICK_S, kept_after
+from roadproof.controllers.identity import identity_of
 from roadproof.controllers.temporal import NOTES, WINDOW
 from roadproof.datatypes import Command, Observation, VehicleState
 from roadproof.driving.rollout import _remembering
@@ -287,3 +288,14 @@ def test_an_exported_network_and_its_card_must_agree(tmp_path):
     (tmp_path / "one.json").write_text(ControllerCard(frames_apart_s=0.1).to_json())
     with pytest.raises(ControllerError, match=r"takes one frame at once and its card says frames_apart_s 0\.1"):
         load_controller(tmp_path / "one.pt2")
+
+
+def test_what_is_remembered_tells_controllers_apart():
+    networks = [temporal_controller(seed=1).eval() for _ in range(2)]
+    with torch.no_grad():
+        networks[1].network.note[2].weight.mul_(5.0)  # says nothing of a first frame
+    first = [network.controls(frames(2, (88, 200)), *asked(2)) for network in networks]
+    torch.testing.assert_close(*first, atol=0.0, rtol=0.0)
+    answers = [identity_of(each, (88, 200)) for each in (*networks, three(0.1), three(0.2))]
+    assert len(set(answers)) == 4
+    assert identity_of(networks[0], (88, 200)) == answers[0]

@@ -83,7 +83,7 @@ def controls_after_of(
     return controls, after
 
 
-def answers_of(
+def next_controls_of(
     controller: Controller,
     memory: object,
     frames: Float[Tensor, "b 3 h w"],

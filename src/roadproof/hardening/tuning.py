@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import answers_of
+from roadproof.controllers.asking import next_controls_of
 from roadproof.controllers.conditional import ConditionalNetwork
 from roadproof.controllers.precision import multiplies_bfloat16
 from roadproof.errors import TrainingError
@@ -116,7 +116,7 @@ def answers(
     with _mixed(frames.device):
         if isinstance(controller, ConditionalNetwork):
             return controller(frames, speed_mps, command).controls.float()
-        return answers_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
+        return next_controls_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
 
 
 def training_step(model: nn.Module, batch: TuningBatch) -> Float[Tensor, ""]:

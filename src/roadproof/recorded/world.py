@@ -16,7 +16,7 @@ from torch import Tensor
 from roadproof.compositing.composite import composite_own
 from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import answers_of, steer_of
+from roadproof.controllers.asking import next_controls_of, steer_of
 from roadproof.driving.deviation import deviation_m
 from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
@@ -202,7 +202,7 @@ class RecordedWorld:
                 frames = self._frames(pattern, poses, gap, looks, step)
                 seen = (frames, car.speed_mps.float(), self.bank.command[gap.frame])
                 elapsed_s = min(step, every) * self.vehicle.dt_s
-                found, memory = answers_of(controller, memory, *seen, elapsed_s)
+                found, memory = next_controls_of(controller, memory, *seen, elapsed_s)
                 answer = found.double()
                 past = place.s_m > self._shown_m
                 steer = torch.where(past, course.law(place), answer[:, 0] + off + course.feedback(place))

@@ -77,11 +77,11 @@ def spread(
         try:
             for future in as_completed(waiting):
                 yield waiting[future], future.result()
-        except BaseException as error:
+        except BrokenProcessPool:
+            raise SimulatorError(DIED) from None
+        except BaseException:
             # Not where all went well: a pool that is not waited for may complain when Python ends.
             pool.shutdown(wait=False, cancel_futures=True)
-            if isinstance(error, BrokenProcessPool):
-                raise SimulatorError(DIED) from None
             raise
 
 
