@@ -118,7 +118,7 @@ def rows_of(cell: Cell) -> list[Row]:
                 clean=drives.drives[0].episode,
             )
             judged = evaluate(
-                town, controller, scenario, found.pattern, folder=place / "evaluation", runs=0,
+                town, controller, scenario, found.pattern, folder=place / "evaluation", starts=1, runs=0,
                 driver_name=cell.controller,
             )  # fmt: skip
             row = {
