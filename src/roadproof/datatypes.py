@@ -82,9 +82,9 @@ class VehicleState:
 
     x_m: float
     y_m: float
-    z_m: float
-    yaw_rad: float
-    speed_mps: float
+    z_m: float = 0.0
+    yaw_rad: float = 0.0
+    speed_mps: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

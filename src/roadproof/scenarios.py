@@ -11,18 +11,17 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, cast
 
 from roadproof.datatypes import VehicleState
-from roadproof.errors import GeometryError, ScenarioError
+from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml, write_text
-from roadproof.io.tables import first_twice
+from roadproof.io.tables import build, first_twice
 
 Kind = Literal["straight", "left", "right"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 
 BUILTIN_FILE = Path(__file__).with_name("scenarios.toml")
 MAX_TIME_S, MAX_SPEED_MPS, MAX_CANVAS_M = 3600.0, 100.0, 100.0
@@ -55,10 +54,12 @@ class Scenario:
 
     def __post_init__(self) -> None:
         check_name(self.name, "scenario", ScenarioError)
-        numbers = {**asdict(self.start), **asdict(self.canvas), "goal x": self.goal_m[0], "goal y": self.goal_m[1]}
-        for what, value in {**numbers, "time_limit_s": self.time_limit_s}.items():
-            if not math.isfinite(value):
-                raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number")
+        numbers = {"goal x": self.goal_m[0], "goal y": self.goal_m[1], "time_limit_s": self.time_limit_s}
+        for what, place in (("start", self.start), ("canvas", self.canvas)):
+            numbers |= {f"{what} {key}": value for key, value in asdict(place).items()}
+        for what, value in numbers.items():
+            if not abs(value) < 1e9:
+                raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number below 1e9")
         if not 0 < self.time_limit_s <= MAX_TIME_S:
             raise ScenarioError(
                 f"scenario {self.name}: time_limit_s is {self.time_limit_s}, expected more than 0, at most "
@@ -125,12 +126,10 @@ def load_scenarios(path: AnyPath) -> tuple[Scenario, ...]:
     entries = read_toml(path, ScenarioError).get("scenario")
     if not isinstance(entries, list) or not entries:
         raise ScenarioError(f"scenarios {path} has no [[scenario]], expected at least one")
-    scenarios: list[Scenario] = []
-    for k, entry in enumerate(cast("list[object]", entries)):
-        try:
-            scenarios.append(_scenario(entry, path.parent))
-        except (ScenarioError, GeometryError) as error:
-            raise ScenarioError(f"scenarios {path}, entry {k + 1}: {error}") from error
+    scenarios = [
+        _scenario(entry, f"scenarios {path}, entry {k + 1}", path.parent)
+        for k, entry in enumerate(cast("list[object]", entries))
+    ]
     if (name := first_twice(scenario.name for scenario in scenarios)) is not None:
         raise ScenarioError(f"scenarios {path}: the name {name!r} is used twice; names must differ")
     return tuple(scenarios)
@@ -167,68 +166,11 @@ def _table(values: Mapping[str, float]) -> str:
     return "{ " + ", ".join(f"{key} = {float(value)!r}" for key, value in values.items()) + " }"
 
 
-def _scenario(entry: object, folder: Path) -> Scenario:
-    values = _known(entry, {field.name for field in fields(Scenario)}, "the scenario")
-    missing = [field.name for field in fields(Scenario) if field.name not in values]
-    if missing:
-        raise ScenarioError(f"{missing[0]} is missing")
-    goal = cast("list[object]", values["goal_m"])
-    if not isinstance(values["goal_m"], list) or len(goal) != 2:
-        raise ScenarioError(f"goal_m is {goal!r}, expected [x, y]")
-    start = _numbers(values["start"], {field.name for field in fields(VehicleState)}, "start")
-    canvas = _numbers(values["canvas"], {field.name for field in fields(CanvasPlacement)}, "canvas")
-    for key in ("x_m", "y_m"):
-        for what, table in (("start", start), ("canvas", canvas)):
-            if key not in table:
-                raise ScenarioError(f"{what} has no {key}")
-    return Scenario(
-        name=_string(values, "name"),
-        kind=_kind(_string(values, "kind")),
-        map_name=_map_name(_string(values, "map_name"), folder),
-        start=VehicleState(**{"z_m": 0.0, "yaw_rad": 0.0, "speed_mps": 0.0, **start}),
-        goal_m=(_float(goal[0], "goal_m"), _float(goal[1], "goal_m")),
-        canvas=CanvasPlacement(**canvas),
-        time_limit_s=_float(values["time_limit_s"], "time_limit_s"),
-    )
-
-
-def _kind(text: str) -> Kind:
-    for kind in KINDS:
-        if text == kind:
-            return kind
-    raise ScenarioError(f"kind is {text!r}, expected straight, left or right")
-
-
-def _map_name(name: str, folder: Path) -> str:
-    if not name.endswith(".xodr"):
-        return name
-    return str(inside(folder, name, "map_name", ScenarioError))
-
-
-def _known(entry: object, keys: set[str], what: str) -> dict[str, Any]:
+def _scenario(entry: object, what: str, folder: Path) -> Scenario:
     if not isinstance(entry, dict):
-        raise ScenarioError(f"{what} is {entry!r}, expected a table")
-    table = cast("dict[str, Any]", entry)  # TOML's keys are strings
-    for key in table:
-        if key not in keys:
-            nearest = difflib.get_close_matches(key, sorted(keys), n=1, cutoff=0.0)
-            raise ScenarioError(f"{what} has an unknown key {key!r}; did you mean {nearest[0]!r}?")
-    return table
-
-
-def _numbers(entry: object, keys: set[str], what: str) -> dict[str, float]:
-    return {key: _float(value, f"{what} {key}") for key, value in _known(entry, keys, what).items()}
-
-
-def _float(value: object, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScenarioError(f"{what} is {value!r:.120}, expected a number")
-    if not abs(value) < 1e9:
-        raise ScenarioError(f"{what} is {value!r:.40}, expected a finite number below 1e9")
-    return float(value)
-
-
-def _string(values: Mapping[str, Any], key: str) -> str:
-    if not isinstance(values[key], str) or not values[key]:
-        raise ScenarioError(f"{key} is {values[key]!r}, expected a text")
-    return values[key]
+        raise ScenarioError(f"{what} is {entry!r:.60}, expected a table")
+    values = cast("dict[str, Any]", entry)  # TOML's keys are strings
+    name = values.get("map_name")
+    if isinstance(name, str) and name.endswith(".xodr"):
+        values = values | {"map_name": str(inside(folder, name, f"{what}: map_name", ScenarioError))}
+    return build(Scenario, values, what, ScenarioError)
