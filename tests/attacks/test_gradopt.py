@@ -22,8 +22,9 @@ from roadproof.attacks.gradopt import Rung, dropping, gradopt, random_search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.methods import method_of
 from roadproof.attacks.published import PublishedMeasure
-from roadproof.compositing import composite, view_canvas
+from roadproof.compositing import Variation, composite, view_canvas
 from roadproof.coverage import Shape
+from roadproof.datatypes import Control
 from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
 from roadproof.patterns import Pattern, boxes_from_published
 from roadproof.search_space import SearchSpace
@@ -309,9 +310,11 @@ def test_a_result_is_the_same_when_loaded(tmp_path):
 
 def test_a_search_that_was_kept_is_read_and_one_of_other_parts_is_refused(tmp_path):
     controller, asked = pull_to_the_right(), {"objective": SteeringShift(), "method": QUICK}
+    trained_again = pull_to_the_right()
+    trained_again.act = lambda *_: Control(steer=0.1)
 
-    def kept(recordings=recording_set(), space=SearchSpace(figures=1), **changed):  # noqa: B008
-        return kept_attack(tmp_path, recordings, controller, space, **asked | changed)
+    def kept(recordings=recording_set(), space=SearchSpace(figures=1), driver=controller, **changed):  # noqa: B008
+        return kept_attack(tmp_path, recordings, driver, space, **asked | changed)
 
     first = kept()
     stamp = (tmp_path / "result.json").stat().st_mtime_ns
@@ -322,11 +325,15 @@ def test_a_search_that_was_kept_is_read_and_one_of_other_parts_is_refused(tmp_pa
         "holds a search with seed 0, now it is 1": {"seed": 1},
         "holds a search with space.figures 1, now it is 2": {"space": SearchSpace(figures=2)},
         "holds a search with method.iterations 20, now it is 30": {"method": dataclasses.replace(QUICK, iterations=30)},
-        "holds a search with recordings '": {
+        "holds a search with drives '": {
             "recordings": dataclasses.replace(
                 recording_set(), recordings=(dataclasses.replace(one, frames=one.frames // 2), *others)
             )
         },
+        "objective 'steering shift', now it is 'steering shift over var": {
+            "objective": SteeringShift(variation=Variation())
+        },
+        "holds a search of another controller, which answers otherwise": {"driver": trained_again},
     }.items():
         with pytest.raises(RoadproofError, match=message):
             kept(**changed)

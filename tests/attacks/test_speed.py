@@ -145,6 +145,8 @@ def test_the_result_of_another_objective_is_not_gone_on_from(road, tmp_path):
     assert (found.group, found.predicted_m) == ("all", None)
     with pytest.raises(RoadproofError, match="a search with objective 'speed change', now it is 'path deviation'"):
         kept_attack(tmp_path, road, Careful(), SPACE, objective=PathDeviation(), **given)
+    with pytest.raises(RoadproofError, match=r"with objective_fields\.every 2, now it is 3"):
+        kept_attack(tmp_path, road, Careful(), SPACE, objective=SpeedChange(every=3), **given)
 
 
 def test_every_seed_has_looks_of_its_own_on_the_bare_road_too(road):

@@ -127,7 +127,7 @@ def test_a_search_through_a_lens_is_not_taken_for_that_of_a_pinhole(tmp_path):
     found = kept_attack(tmp_path, road, RampFollower(), space, **given)
     assert found.surrogate_shift != 0.0
     assert kept_attack(tmp_path, road, RampFollower(), space, **given).surrogate_shift == found.surrogate_shift
-    with pytest.raises(RoadproofError, match="with recordings"):
+    with pytest.raises(RoadproofError, match="with drives"):
         kept_attack(tmp_path, dataclasses.replace(road, camera=CIL_CAMERA), RampFollower(), space, **given)
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lenses import LENSES, behind
+from roadproof.datatypes import Obstacle
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
@@ -64,11 +65,25 @@ def test_a_saved_set_is_the_same_when_loaded(tmp_path, compact):
     assert loaded.camera == original.camera
     assert loaded.view == original.view
     assert loaded.colour.to_dict() == original.colour.to_dict()
+    assert loaded.digest() == original.digest()
     for ours, theirs in zip(loaded.recordings, original.recordings, strict=True):
         assert (ours.name, ours.side) == (theirs.name, theirs.side)
         for field in PER_FRAME:
             np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+def test_sets_that_differ_in_what_is_driven_over_have_other_digests(saved_placed):
+    original, obstacle = placed_set(), Obstacle(x_m=1.0, y_m=2.0, yaw_rad=0.0, half_length_m=1.0, half_width_m=1.0)
+    clean, *others = original.recordings
+    assert load_recordings(saved_placed).digest() == original.digest()
+    slower = replace(clean, track=replace(clean.track, speed_mps=clean.track.speed_mps / 2))
+    lens = replace(original.camera, lens=LENSES[0])
+    rainy = replace(clean, weather="rainy-noon")
+    changed = [{"obstacles": (obstacle,)}, {"canvas": replace(CANVAS, x_m=0.5)}, {"camera": lens}]
+    changed += [{"recordings": (one, *others)} for one in (slower, rainy, replace(clean, steer=clean.steer + 0.1))]
+    digests = {replace(original, **each).digest() for each in [{}, *changed]}
+    assert len(digests) == 1 + len(changed)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=str)

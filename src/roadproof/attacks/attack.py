@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,14 +26,15 @@ from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import Grouped, Measure, Objective, RecordedMeasure, SteeringShift, variation_of
+from roadproof.attacks.objective import ClosedLoop, Grouped, Measure, Objective, RecordedMeasure, SteeringShift
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
 from roadproof.controllers import Controller
+from roadproof.controllers.identity import identity_of
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.identity import require_same
+from roadproof.io.identity import ANSWERS, require_same
 from roadproof.io.records import plain
 from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
@@ -201,20 +200,15 @@ def kept_attack(
         RoadproofError: the stored result is damaged or belongs to another search, or the search itself fails.
         OutputError: the folder cannot be written.
     """
-    frames = hashlib.sha256()
-    for drive in recordings.recordings:
-        for values in (drive.frames, drive.frame_number, drive.image_from_canvas):
-            frames.update(np.ascontiguousarray(values).tobytes())
-    if recordings.camera.lens is not None:
-        frames.update(repr(recordings.camera.lens).encode())
     made_of = {
         "space": space.stated,
         "objective": objective.name,
-        "variation": plain(variation_of(objective)),
+        "objective_fields": plain(objective) if isinstance(objective, SteeringShift | ClosedLoop) else None,
         "method": stored(method),
         "groups": groups and list(map(str, groups)),
         "seed": seed,
-        "recordings": frames.hexdigest()[:16],
+        "drives": recordings.digest()[:16],
+        ANSWERS: identity_of(controller, (recordings.view.height_px, recordings.view.width_px)),
     }
     checkpoint, path = folder / "search.safetensors", folder / "result.json"
     if path.exists():

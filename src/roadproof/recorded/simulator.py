@@ -8,11 +8,9 @@ What comes of it is predicted: nothing is driven for real. There is no map eithe
 
 from __future__ import annotations
 
-import hashlib
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,6 +23,7 @@ from roadproof.errors import SimulatorError
 from roadproof.geometry import CanvasPlacement, homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import is_plain_name
+from roadproof.io.identity import digest
 from roadproof.recorded.pictures import Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recorded.world import RecordedWorld, Start
@@ -129,17 +128,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     @cached_property
     def identity(self) -> str:
         """A hash of frames, poses, colours and vehicle: other recordings are another world."""
-        recordings = self._world.recordings
-        said = (asdict(self._world.vehicle), recordings.colour.to_dict(), recordings.obstacles)
-        found = hashlib.sha256(repr(said).encode())
-        for drive in recordings.recordings:
-            track = drive.track
-            arrays: list[Any] = [drive.frames, drive.frame_number, drive.image_from_canvas]
-            arrays += [] if track is None else [track.x_m, track.y_m, track.yaw_rad, track.speed_mps]
-            arrays += [] if drive.maps is None else [drive.maps.gain, drive.maps.offset, drive.maps.visible]
-            for values in arrays:
-                found.update(np.ascontiguousarray(values).tobytes())
-        return found.hexdigest()
+        return digest(f"{self._world.vehicle} {self._world.recordings.digest()}")
 
     @cached_property
     def scenario(self) -> Scenario:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -14,6 +17,7 @@ from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.homographies import check_image_from_canvas
 from roadproof.io.files import check_name
+from roadproof.io.records import plain
 from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps
 from roadproof.recordings.track import FASTEST_MPS, Track
@@ -177,6 +181,21 @@ class RecordingSet:
     def is_placed(self) -> bool:
         """Whether the set can be driven in: its canvas and the poses of all drives are known."""
         return self.canvas is not None and all(recording.track is not None for recording in self.recordings)
+
+    def digest(self) -> str:
+        """SHA-256 of what a search or a drive in these recordings depends on; the same for a set that was loaded."""
+        told = plain((self.camera, self.view, self.colour.to_dict(), self.canvas, self.obstacles))
+        # A number that was given as an integer is read as a float.
+        found = hashlib.sha256(repr(json.loads(json.dumps(told), parse_int=float)).encode())
+        for drive in self.recordings:
+            found.update(f"{drive.side} {drive.weather}".encode())
+            small = [getattr(drive, name) for name in PER_FRAME]
+            small += [] if drive.track is None else [getattr(drive.track, field.name) for field in fields(drive.track)]
+            large: list[Any] = [drive.frames]
+            large += [] if drive.maps is None else [drive.maps.gain, drive.maps.offset, drive.maps.visible]
+            for values in [*(np.asarray(each, np.float64) for each in small), *map(np.ascontiguousarray, large)]:
+                found.update(values.tobytes())
+        return found.hexdigest()
 
     def by_weather(self) -> tuple[RecordingSet, ...]:
         """The drives of each weather as a set of their own, in the order of their first drives."""
