@@ -59,6 +59,8 @@ def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, tmp_path):
     deviation = second.values(SPACE, unit)
     assert second.calls == 1  # the clean one again
     assert first.fingerprint() != second.fingerprint()
+    with pytest.raises(RoadproofError, match=r"driven\.json holds drives over patterns by another controller"):
+        DrivenMeasure(place, load_controller("pilotnet-b"), PathDeviation())
     damaged = {"format": "roadproof-driven", "version": 1, "drives": [["a", "b"]]}
     (tmp_path / "damaged.json").write_text(json.dumps(damaged))
     with pytest.raises(RoadproofError, match="incomplete or damaged"):

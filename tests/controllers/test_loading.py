@@ -120,6 +120,20 @@ def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
     assert sys.path == before
 
 
+def test_what_a_users_module_adds_to_the_path_stays_and_the_current_directory_goes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "adds_a_folder.py").write_text(
+        "import sys\n"
+        "from roadproof import load_controller\n"
+        "sys.path.append('/nowhere/of/theirs')\n"
+        "def make():\n    return load_controller('pilotnet')\n"
+    )
+    before = list(sys.path)
+    load_controller("adds_a_folder:make")
+    assert sys.path == [*before, "/nowhere/of/theirs"]
+
+
 def test_a_factory_is_given_other_weights_and_learns_unmerged(tmp_path, monkeypatch):
     (tmp_path / "small_driver.py").write_text(
         "from roadproof.controllers import CIL\none = CIL(width=0.1, seed=9)\ndef make():\n    return one\n"

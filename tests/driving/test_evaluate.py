@@ -1,6 +1,7 @@
 """Evaluations in the town itself: what is driven, what is judged, what is not driven twice."""
 
 import dataclasses
+import functools
 import json
 import math
 
@@ -13,7 +14,7 @@ import needs
 from paint_shy import PaintShy, along_a_street, magenta
 from roadproof.datatypes import Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
-from roadproof.driving.drive_store import load_episodes
+from roadproof.driving.drive_store import driver_in_words, load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import evaluate, random_patterns
 from roadproof.driving.evaluation import Evaluation, load_paint
@@ -253,6 +254,23 @@ def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(st
     with pytest.raises(ControllerError, match=r"pickling the controller raised \w+: Can't.* its class in a module"):
         evaluate(TownSimulator, Local(), street, MAGENTA, folder=tmp_path, processes=2)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_what_fails_in_one_process_stops_the_others(street, tmp_path):
+    driver = bad_drivers.FailingInOneWorker(str(tmp_path / "taken"))
+    with pytest.raises(ControllerError, match="ZeroDivisionError"):
+        evaluate(
+            TownSimulator, driver, street, MAGENTA, folder=tmp_path / "drives", weathers=WEATHERS, starts=20, runs=0,
+            processes=2,
+        )  # fmt: skip
+    assert len(list((tmp_path / "drives" / "episodes").iterdir())) < 20
+
+
+def test_a_function_with_arguments_is_known_by_them():
+    drive = functools.partial(random_patterns, seed=1)
+    assert driver_in_words(drive) == "random_patterns with (), {'seed': 1}"
+    assert driver_in_words(drive) != driver_in_words(functools.partial(random_patterns, seed=2))
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import sys
 import time
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -203,6 +204,18 @@ class FailingInWorkers(Honest):
 class DyingInWorkers(FailingInWorkers):
     def fail(self):
         os._exit(3)
+
+
+class FailingInOneWorker(FailingInWorkers):
+    """Fails once, in the process that comes first; `taken` is a file that is not there yet."""
+
+    def __init__(self, taken):
+        self.taken = taken
+
+    def fail(self):
+        with suppress(FileExistsError):
+            os.close(os.open(self.taken, os.O_CREAT | os.O_EXCL))
+            return 1 / 0
 
 
 # For the command line: bad_drivers:steers.column and so on.

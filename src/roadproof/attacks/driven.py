@@ -94,8 +94,6 @@ class DrivenMeasure:
             )
         self._deviates = isinstance(objective, PathDeviation)
         self._place, self._known = place, dict[str, Effect]()
-        if place.keep is not None and place.keep.exists():
-            self._known = _FILE.read(place.keep).drives
         self.calls, self.frames_evaluated = 0, 0
 
         def drive(pattern: PatternImage | None, until: Callable[[Observation], bool] | None) -> Episode:
@@ -106,6 +104,14 @@ class DrivenMeasure:
 
         self._drive = drive
         self.clean = drive(None, None)
+        if place.keep is not None and place.keep.exists():
+            kept = _FILE.read(place.keep)
+            if kept.clean not in ("", self._told()):
+                raise RoadproofError(
+                    f"{place.keep} holds drives over patterns by another controller, or elsewhere: its clean drive is "
+                    "another; give another file, or remove it"
+                )
+            self._known = kept.drives
 
     def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
         """Values of R points of a search space; each takes one drive, unless its pattern was driven over before."""
@@ -120,13 +126,16 @@ class DrivenMeasure:
         if key not in self._known:
             self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._place.scenario.canvas)
             if self._place.keep is not None:
-                _FILE.write(self._place.keep, _Kept(self._known))
+                _FILE.write(self._place.keep, _Kept(self._known, self._told()))
         return self._known[key]
 
     def fingerprint(self) -> str:
         """A digest of the clean drive and the objective, which tells this measure from others."""
-        told = hashlib.sha256(path_of(self.clean).tobytes() + self.clean.steer.tobytes())
-        return f"{told.hexdigest()} {self._deviates}"
+        return f"{self._told()} {self._deviates}"
+
+    def _told(self) -> str:
+        """A digest of the clean drive."""
+        return hashlib.sha256(path_of(self.clean).tobytes() + self.clean.steer.tobytes()).hexdigest()
 
     def _enough(self) -> Callable[[Observation], bool]:
         """A condition that ends a drive after the last frame that either effect needs, for a car off the road."""
@@ -155,9 +164,10 @@ def _counted_frames(clean: Episode) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """The file of effects: the key of each is a digest of its paint."""
+    """The file of effects, each by a digest of its paint, with one of the clean drive; older files have none."""
 
     drives: dict[str, Effect]
+    clean: str = ""
 
 
 _ROWS = Form(

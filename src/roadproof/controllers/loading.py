@@ -306,13 +306,15 @@ def _from_python(module_name: str, factory_name: str) -> Controller:
 
 @contextmanager
 def _current_directory_importable() -> Generator[None, None, None]:
-    before = list(sys.path)
+    added = str(Path.cwd())
     # Last, so that nothing in the folder hides an installed module.
-    sys.path.append(str(Path.cwd()))
+    sys.path.append(added)
     try:
         yield
     finally:
-        sys.path[:] = before
+        # What the user's module added stays.
+        if added in sys.path:
+            del sys.path[-1 - sys.path[::-1].index(added)]
 
 
 def _placed(controller: Controller | nn.Module, device: torch.device, dtype: torch.dtype) -> Controller:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -167,7 +168,9 @@ def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
 
 
 def driver_in_words(driver: AnyDriver) -> str:
-    """A controller's type, or a function's name."""
+    """A controller's type, or a function's name, with what a partial one has been given."""
+    if isinstance(driver, partial):
+        return f"{driver_in_words(driver.func)} with {driver.args}, {driver.keywords}"
     return type(driver).__name__ if isinstance(driver, Controller) else str(getattr(driver, "__qualname__", driver))
 
 

@@ -12,6 +12,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import cycle
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
 
 import torch
 
@@ -29,6 +31,9 @@ from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFact
 
 PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 _LOOK_S = 0.5
+
+_stop: Event | None = None
+"""In a process that shares drives with others: set once one of them has failed."""
 
 
 def evaluate(
@@ -187,7 +192,8 @@ def make_together(
         ControllerError: the driver raises, or answers wrongly.
     """
     shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
-    with processes_beside(len(shares)) as pool:
+    stop = get_context("spawn").Event()
+    with processes_beside(len(shares), _until, stop) as pool:
         running = [pool.submit(_make_share, factory, episodes, share) for share in shares]
         try:
             while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
@@ -198,7 +204,17 @@ def make_together(
                 future.result()
         except BrokenProcessPool:
             raise SimulatorError(DIED) from None
+        except BaseException:
+            # The pool waits for its processes, which would drive on for as long as there is something to drive.
+            stop.set()
+            raise
     on_done(len(drives))
+
+
+def _until(stop: Event) -> None:
+    """Have this process make drives until an event is set."""
+    global _stop
+    _stop = stop
 
 
 def _make_share(factory: SimulatorFactory, episodes: Episodes, drives: Sequence[Conditions]) -> None:
@@ -206,4 +222,5 @@ def _make_share(factory: SimulatorFactory, episodes: Episodes, drives: Sequence[
     torch.set_num_threads(1)
     with factory() as world:
         for drive in drives:
-            episodes.make(world, drive)
+            if _stop is None or not _stop.is_set():
+                episodes.make(world, drive)

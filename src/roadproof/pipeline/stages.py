@@ -19,6 +19,7 @@ from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.io.files import read_json, write_json
 from roadproof.io.identity import ANSWERS, digest, require_same
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
@@ -34,6 +35,7 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
 CHEAPEST = "cheapest"
+_NONE = "roadproof-cheapest-none", 1
 """The folder of a run with the least paint for a deviation."""
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
@@ -182,6 +184,9 @@ class Stages:
         """The least paint for a deviation, and the drive over it; None if nothing found reaches that deviation."""
         folder, total = self.folder / CHEAPEST, MOST_LEVELS + 1
         made_of = {"wanted_m": wanted_m, "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]}
+        none = folder / "none.json"
+        if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
+            return None
         if (folder / "cheapest.json").exists():
             require_same(folder, "a search", FILE.content(folder / "cheapest.json")["made_of"], made_of, RoadproofError)
             less = Cheapest.load(folder)
@@ -197,6 +202,7 @@ class Stages:
                 on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
             )
             if less is None:
+                write_json(none, {"format": _NONE[0], "version": _NONE[1], "made_of": made_of})
                 return None
             less.save(folder, made_of)
         driven = select_by_driving(
