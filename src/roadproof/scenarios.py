@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
@@ -22,6 +22,7 @@ from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml, 
 from roadproof.io.tables import build, first_twice
 
 Kind = Literal["straight", "left", "right"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 BUILTIN_FILE = Path(__file__).with_name("scenarios.toml")
 MAX_TIME_S, MAX_SPEED_MPS, MAX_CANVAS_M = 3600.0, 100.0, 100.0

@@ -302,6 +302,7 @@ DAMAGE = {
     "is not a plain name": lambda text: text.replace('"clean": "', '"clean": "../'),
     "has version 9": lambda text: text.replace('"version": 1', '"version": 9'),
     "Invalid enum value 'dry'": lambda text: text.replace('"clear-noon"', '"dry"'),
+    "no drive over its pattern alone": lambda text: json.dumps(json.loads(text) | {"trials": []}),
 }
 
 

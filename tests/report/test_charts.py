@@ -5,12 +5,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from roadproof.driving.deviation import path_of
 from roadproof.driving.intervals import Mean
 from roadproof.patterns import raster
 from roadproof.report import charts
 from roadproof.report.formatting import mean_in_words
+from roadproof.report.plots import save
 from roadproof.report.top_view import top_view
 from roadproof.scenarios import find_scenario
 from runs import CRASH, PATTERN, driven
@@ -47,6 +49,16 @@ def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drive
         assert {"muted", "sans"} <= asked
         assert "<script" not in chart.svg
         assert not re.search(r'<svg[^>]* (width|height)="', chart.svg), "as wide as the page allows"
+
+
+def test_dollars_in_names_are_no_mathematics(tmp_path):
+    name = r"$\foo$ of $x"
+    chart = charts.search(np.zeros((5, 1, 3)), [name], "path deviation")
+    assert r"$\foo$ of $x" in chart.svg
+    figure = Figure()
+    figure.add_subplot().set_title(name)
+    save(figure, tmp_path / "titled.png")
+    assert (tmp_path / "titled.png").exists()
 
 
 def test_the_view_from_above_numbers_the_infractions(drives):

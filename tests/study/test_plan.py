@@ -37,6 +37,36 @@ random_calls = 40
 """
 
 
+@pytest.mark.parametrize("spec", ["own_driver_of_mine:make@FILE", "own_driver_of_mine:Driver.make"])
+def test_hardened_weights_and_methods_of_a_class_are_known_by_their_files(tmp_path, monkeypatch, spec):
+    monkeypatch.chdir(tmp_path)
+    weights, source = tmp_path / "hardened.safetensors", tmp_path / "own_driver_of_mine.py"
+    spec = spec.replace("FILE", str(weights))
+    study = dataclasses.replace(load_study(written(tmp_path, TEXT)), controller=spec)
+    keys = []
+    for text, content in (("make = None", b"one"), ("make = 1", b"one"), ("make = 1", b"other")):
+        source.write_text(text)
+        weights.write_bytes(content)
+        keys.append(study.jobs[0].key)
+    assert len(set(keys)) == (3 if "@" in spec else 2)
+
+
+def test_jobs_on_a_map_of_the_users_are_known_by_what_is_in_it_wherever_it_lies(tmp_path):
+    job = load_study(written(tmp_path, TEXT)).jobs[0]
+    keys = []
+    for folder, content in (("one", "<OpenDRIVE/>"), ("two", "<OpenDRIVE/>"), ("two", "<OpenDRIVE />")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        own = tmp_path / folder / "own.xodr"
+        own.write_text(content)
+        keys.append(dataclasses.replace(job, scenario=dataclasses.replace(job.scenario, map_name=str(own))).key)
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_the_keys_of_jobs_stay_what_they_were():
+    jobs = load_study(Path(__file__).parents[2] / "studies" / "small.toml").jobs
+    assert (jobs[0].key, jobs[-1].key) == ("69869b0d41cbf22d", "bae7e71332f47d46")
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [

@@ -11,7 +11,7 @@ import typer
 from roadproof.cli.group import Verbs
 from roadproof.cli.options import Out, Trust, argument, number, unset
 from roadproof.cli.output import answer, say
-from roadproof.cli.verbs import begin, verb
+from roadproof.cli.verbs import begin, is_dry_run, verb
 from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
@@ -43,12 +43,13 @@ def run(
     from roadproof.study.summary import failures, summary
 
     chosen = load_study(plan, trust=trust)
-    begun = sum(is_done(job, out) for job in chosen.jobs)
-    if begun < len(chosen.jobs):
+    jobs = chosen.jobs
+    begun = sum(is_done(job, out) for job in jobs)
+    if begun < len(jobs) or is_dry_run():
         # One that is not there is refused at once, not job by job.
         begin(_estimate(chosen, load_controller(chosen.controller), workers), out)
     failed = 0
-    with progress("Jobs", len(chosen.jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
+    with progress("Jobs", len(jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
 
         def told(done: int, _: Job, result: JobResult) -> None:
             nonlocal failed

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import copy
-import importlib
+import importlib.util
 import re
 import sys
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -152,6 +152,23 @@ def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | 
             "or name a function of yours that returns it: module:factory"
         )
     raise ControllerError(f"unknown controller {text!r}, expected {SPECS}")
+
+
+def files_of(spec: str) -> tuple[Path, ...]:
+    """The files that are there of a user's controller: its weights or network, and its function's module.
+
+    Nothing is imported, but for the packages that a module lies in. A controller that comes with roadproof has none.
+    """
+    head, _, tail = spec.partition(":")
+    factory, at, weights = tail.partition("@")
+    named = [Path(weights)] if at else []
+    if factory and all(part.isidentifier() for part in (*head.split("."), *factory.split("."))):
+        with _current_directory_importable(), suppress(ImportError, ValueError):
+            found = importlib.util.find_spec(head)
+            named = [*([Path(found.origin)] if found and found.origin else []), *named]
+    elif head not in ARCHITECTURES or tail:
+        named = [Path(tail if head in ARCHITECTURES else spec)]
+    return tuple(path for path in named if path.suffix and path.is_file())
 
 
 PICKLES = (".pt", ".pth", ".ckpt", ".pkl", ".ts", ".torchscript", ".jit")

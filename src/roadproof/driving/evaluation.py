@@ -109,6 +109,9 @@ class Evaluation:
         simulator_calls: number of drives that the evaluation takes, clean ones included; 0 if they are predicted.
         seconds: wall time in seconds of the drives made in this call; those found in the folder cost nothing.
         paint: how the simulator put a pattern on the road; rendered in older files, which are all of the town.
+
+    Raises:
+        EpisodeError: no drive over the pattern is without traffic.
     """
 
     scenario: Scenario
@@ -124,6 +127,10 @@ class Evaluation:
     paint: PaintKind = PaintKind.RENDERED
     starts: int = 0
     start_range: StartRange = USUAL_STARTS
+
+    def __post_init__(self) -> None:
+        if not self.of(traffic=False):
+            raise EpisodeError("the evaluation has no drive over its pattern alone, expected one or more; drive again")
 
     @property
     def predicted(self) -> bool:

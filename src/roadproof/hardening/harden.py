@@ -365,7 +365,7 @@ def _claim(run: _Run) -> None:
         "space": repr(run.space),
         "variation": repr(variation_of(run.budget.attack.objective)),
         "seed": run.seed,
-        "training step": f"{run.step.__module__}:{run.step.__qualname__}",
+        "training step": f"{run.step.__module__}:{getattr(run.step, '__qualname__', type(run.step).__qualname__)}",
     }
     path = run.folder / "plan.json"
     if path.exists():

@@ -24,7 +24,7 @@ from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
 from roadproof.report.formatting import in_words
-from roadproof.report.plots import LINE_STYLES, draw_search, in_units
+from roadproof.report.plots import LINE_STYLES, draw_search, in_units, show_as_it_is
 
 VARIABLES = {
     "ink": "#010101",
@@ -88,7 +88,8 @@ def svg_of(figure: Figure, name: str, description: str, marks: Iterable[Mark] = 
         marks: what is shown at one moment of the passage only, on the figure's one pair of axes.
     """
     out = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "text.parse_math": False}):
+    show_as_it_is(figure)
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from roadproof.attacks import AttackResult, ShownDrive
 from roadproof.io.files import write_atomically
@@ -96,12 +98,19 @@ def _film_strip(drive: ShownDrive, columns: int = 6) -> Figure:
     return figure
 
 
+def show_as_it_is(figure: Figure) -> None:
+    """Have no text of a figure taken for mathematics: names are the user's, and may have dollars in them."""
+    for text in figure.findobj(Text):
+        cast("Text", text).set_parse_math(False)
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, whole or not at all.
 
     Raises:
         OutputError: the folder cannot be written.
     """
+    show_as_it_is(figure)
     write_atomically(path, lambda part: figure.savefig(part, format="png", dpi=110))
 
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from roadproof.errors import OutputError, ScenarioError
 from roadproof.io.files import write_atomically
+from roadproof.report.plots import show_as_it_is
 from roadproof.report.road_view import DAYLIGHT, Plan, draw_road, in_world, plan_of
 from roadproof.roads.maps import scenario_route
 from roadproof.roads.roadmap import RoadMap
@@ -39,6 +40,7 @@ def draw_scenarios(scenarios: Sequence[Scenario], road_map: RoadMap, path: Path)
     for scenario, route in zip(scenarios, routes, strict=True):
         _draw_scenario(axes, scenario, route.points[:, :2], taken)
     _draw_legend(axes, scenarios)
+    show_as_it_is(figure)
     try:
         write_atomically(path, lambda part: figure.savefig(part, dpi=DPI))
     except ValueError as error:

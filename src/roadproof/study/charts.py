@@ -198,5 +198,5 @@ def legend(figure: Figure) -> None:
 
 
 def plain(text: str) -> str:
-    """A name that Matplotlib prints as it is: neither mathematics nor a hidden label."""
-    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
+    """A name that Matplotlib lists among its labels, whatever it begins with."""
+    return (" " if text.startswith("_") else "") + text

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import hashlib
-import importlib.util
 import json
-import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from itertools import product
@@ -14,14 +12,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from roadproof.compositing import Variation
+from roadproof.controllers.loading import files_of
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
-from roadproof.errors import StudyError
+from roadproof.errors import RoadproofError, StudyError
 from roadproof.io.files import AnyPath, as_path, read_toml
 from roadproof.io.tables import build, first_twice
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
-from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
+from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, identity, load_scenarios
 from roadproof.simulators.loading import SPECS, is_server
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
 from roadproof.study.reading import paint_of, refuse_untrusted
@@ -140,9 +139,14 @@ class Job(Conditions):
     @property
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
-        told: dict[str, Any] = {"job_version": JOB_VERSION, **asdict(self)}
-        # Jobs are older than these words.
-        for table, names in ((told, ("weights", "paint", "variation")), (told["method"], ("attack_weathers",))):
+        told: dict[str, Any] = {"job_version": JOB_VERSION, **asdict(self), "scenario": identity(self.scenario)}
+        # Jobs are older than these words; a map of the user's is known by what is in it, not by where it lies.
+        tables = (
+            (told, ("weights", "paint", "variation")),
+            (told["method"], ("attack_weathers",)),
+            (told["scenario"], ("map",)),
+        )
+        for table, names in tables:
             for name in names:
                 if not table.get(name):
                     table.pop(name, None)
@@ -233,7 +237,7 @@ def load_study(path: AnyPath, *, trust: bool = False) -> Study:
         study = _study(content, path.parent)
         if not trust:
             refuse_untrusted(study.controller, study.simulator)
-    except StudyError as error:
+    except RoadproofError as error:
         raise StudyError(f"{path}: {error}") from None
     return study
 
@@ -291,21 +295,6 @@ def _chosen(patterns: Iterable[str], scenarios: tuple[Scenario, ...]) -> tuple[S
 
 
 def _digest(controller: str) -> str:
-    """The digest of the file that a spec names, `cil:FILE.safetensors`, or that a function's module is written in."""
-    module, _, name = controller.partition(":")
-    path = Path(name or controller)
-    if not path.suffix and name.isidentifier() and (found := _source(module)):
-        path = found
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16] if path.suffix and path.is_file() else ""
-
-
-def _source(module: str) -> Path | None:
-    """The file of a module, here or installed, without importing it; of one in a package, its parents are."""
-    try:
-        sys.path.insert(0, "")  # as when it is loaded: modules may lie in the folder where the command is given
-        found = importlib.util.find_spec(module)
-    except (ImportError, ValueError):
-        return None
-    finally:
-        sys.path.remove("")
-    return Path(found.origin) if found and found.origin else None
+    """The digest of the files that a spec names: weights, and the module that a function is written in."""
+    contents = [file.read_bytes() for file in files_of(controller)]
+    return hashlib.sha256(b"".join(contents)).hexdigest()[:16] if contents else ""

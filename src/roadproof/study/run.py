@@ -16,7 +16,7 @@ from roadproof.io.locks import working_in
 from roadproof.machine import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
-from roadproof.study.folder import is_done, write_result, write_study, write_table
+from roadproof.study.folder import is_done, pandas, write_result, write_study, write_table
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, failed
 
@@ -57,16 +57,18 @@ def run_study(
         raise StudyError(f"workers is {workers}, expected 1 or more")
     if is_server(study.simulator) and (workers > 1 or cluster is not None):
         raise StudyError(f"the simulator {study.simulator} drives one job at a time; use one worker and no cluster")
+    pandas()  # what writes the table is missed now, not after the night
     with working_in(folder):
         write_study(study, folder)
-        left = [job for job in study.jobs if not is_done(job, folder)]
-        done = len(study.jobs) - len(left)
+        jobs = study.jobs  # once: the controller's file may be written again meanwhile
+        left = [job for job in jobs if not is_done(job, folder)]
+        done = len(jobs) - len(left)
         results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)
         for job, result in results:
             write_result(job, result, folder)
             done += 1
             on_job(done, job, result)
-        return write_table(study.jobs, folder)
+        return write_table(jobs, folder)
 
 
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:

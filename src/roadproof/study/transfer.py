@@ -16,6 +16,7 @@ from roadproof.controllers import Controller, load_controller
 from roadproof.driving.evaluate import evaluate
 from roadproof.errors import ScenarioError, StudyError
 from roadproof.io.files import inside, write_atomically
+from roadproof.io.locks import working_in
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
@@ -50,9 +51,10 @@ def transfer(
     if not found:
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
+    pandas()  # what writes the table is missed now, not after the last drive
     rows: list[TransferRow] = []
     done = 0
-    with open_simulator(study.simulator) as world:
+    with working_in(folder), open_simulator(study.simulator) as world:
         for spec, driver in drivers.items():
             for job in found:
                 rows += _rows(job, folder, world, spec, driver)
