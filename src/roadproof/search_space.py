@@ -175,7 +175,7 @@ class SearchSpace:
         parameters = self._shape_parameters
         low = constant(tuple(p.low for p in parameters), unit)
         natural = low + unit[..., : len(parameters)] * constant(self.shape_ranges, unit)
-        boxes = natural if self.family == "free" else self._published_boxes(natural)
+        boxes = natural if self.family == "free" else boxes_from_published(natural, rotate_about=self._rotate_about)
         if self.shape is Shape.TRIANGLE:
             # A triangle looks the same only after a full turn.
             boxes = boxes / constant(_HALF_TURN, boxes)
@@ -211,9 +211,6 @@ class SearchSpace:
     @property
     def _rotate_about(self) -> Literal["figure", "canvas"]:
         return "canvas" if self.family == "published-canvas-centre" else "figure"
-
-    def _published_boxes(self, natural: Float[Tensor, "*b k 4"]) -> Float[Tensor, "*b k 5"]:
-        return boxes_from_published(natural, rotate_about=self._rotate_about)
 
 
 def derived_seed(seed: int, number: int) -> int:

@@ -7,12 +7,12 @@ from references import approach
 from roadproof.compositing import composite, view_canvas
 from roadproof.compositing.published import (
     canvas_mask,
-    composite_published,
     nearest_canvas_pixels,
+    pasted,
     view_canvas_published,
 )
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_INPUT
-from roadproof.patterns import rectangles_from_published
+from roadproof.patterns import rectangles_from_published, visibilities
 from scenes import PLAIN, road_frames
 
 ROWS = [[70.5, 191.5, 56.7, 37.7, 143.2, 196.7, 112.2], [154.4, 176.0, 44.0, 0.8, 8.4, 150.4, 193.1]]
@@ -34,7 +34,8 @@ def test_a_mask_covers_the_rectangles_area():
 def test_published_frames_are_ours_without_antialiasing():
     frames, homographies = road_frames(3, 0), approach(3)
     pattern = rectangles_from_published(ROWS)
-    published = composite_published(pattern, view_canvas_published(frames, homographies, CIL_INPUT, PLAIN))
+    view = view_canvas_published(frames, homographies, CIL_INPUT, PLAIN)
+    published = pasted(view, view.pixels(visibilities(view.masks(pattern.boxes)), pattern.colours))
     ours = composite(pattern, view_canvas(frames, homographies, CIL_INPUT, PLAIN)).permute(0, 2, 3, 1)
     clean = torch.as_tensor(frames) / 255
     painted = (published != clean).any(-1)

@@ -170,14 +170,6 @@ class ClosedLoop:
         """The name of the objective in words, for results and reports."""
         return self.word + _over(self.variation)
 
-    def check(self, controller: Controller) -> None:
-        """Refuse a controller that this objective cannot be searched with, before any work begins.
-
-        Raises:
-            ControllerError: the recorded world does not drive it as a simulator does.
-        """
-        del controller
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PathDeviation(ClosedLoop):
@@ -236,14 +228,6 @@ class SpeedChange(ClosedLoop):
 
     word: ClassVar[str] = "speed change"
 
-    def check(self, controller: Controller) -> None:
-        """Refuse a controller that only steers, before any work begins.
-
-        Raises:
-            ControllerError: the controller has no batched `controls`.
-        """
-        require_pedals(controller)
-
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
     ) -> SpeedMeasure:
@@ -252,7 +236,7 @@ class SpeedChange(ClosedLoop):
         Raises:
             ControllerError: the controller only steers.
         """
-        self.check(controller)
+        require_pedals(controller)
         return SpeedMeasure(
             recordings,
             controller,

@@ -148,14 +148,15 @@ def _check_attacked(
     Raises:
         ControllerError: the controller fails on frames like the recorded ones, or lacks what the objective needs.
     """
-    from roadproof.attacks.objective import ClosedLoop
+    from roadproof.attacks import SpeedChange
+    from roadproof.attacks.speed import require_pedals
     from roadproof.controllers.checks import require_usable
     from roadproof.controllers.precision import multiplies_bfloat16
 
     size = (drives.view.height_px, drives.view.width_px)
     require_usable(attacked, size=size, device=device, drives=False, gradients=method.by_gradient)
-    if isinstance(objective, ClosedLoop):
-        objective.check(attacked)
+    if isinstance(objective, SpeedChange):
+        require_pedals(attacked)
     if dtype == "bfloat16" and not multiplies_bfloat16(device):
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
 

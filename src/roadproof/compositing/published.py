@@ -12,7 +12,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -22,35 +22,9 @@ from torch import Tensor
 from roadproof.compositing.view import CanvasView
 from roadproof.coverage import Shape, coverage, polygon_vertices
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
-from roadproof.patterns import Pattern, visibilities
 from roadproof.photometry import ColourTransform
 
 _OFF_CANVAS = CANVAS_SIZE_PX**2
-
-
-@runtime_checkable
-class MaskedView(Protocol):
-    """Frames and the P pixels of theirs through which the canvas shows, painted by masks."""
-
-    @property
-    def frames(self) -> Float[Tensor, "f h w 3"]:
-        """Clean frames, in [0, 1]."""
-        ...
-
-    @property
-    def index(self) -> Int[Tensor, " p"]:
-        """Where in the flattened frames the canvas' pixels are."""
-        ...
-
-    def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
-        """The share of each pixel that a rectangle covers, in [0, 1]."""
-        ...
-
-    def pixels(
-        self, visibility: Float[Tensor, "*b k q"], colours: Float[Tensor, "k 3"], among: Int[Tensor, " q"] | None = None
-    ) -> Float[Tensor, "*b q 3"]:
-        """Colours of the canvas' pixels, or of some among them, differentiable in the paint's colours."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +92,10 @@ class AntialiasedView:
         return (view.clean[which] + painted).clamp(0.0, 1.0)
 
 
+MaskedView: TypeAlias = BinaryView | AntialiasedView
+"""Frames and the P pixels of theirs through which the canvas shows, painted by masks."""
+
+
 def view_canvas_published(
     frames: UInt8[np.ndarray, "f h w 3"],
     image_from_canvas: Float[np.ndarray, "f 3 3"],
@@ -155,12 +133,6 @@ def nearest_canvas_pixels(
     on_canvas = (mapped[:, 2] > 0) & (x >= 0) & (x < CANVAS_SIZE_PX) & (y >= 0) & (y < CANVAS_SIZE_PX)
     index = np.where(on_canvas, y * CANVAS_SIZE_PX + x, _OFF_CANVAS).astype(np.int64)
     return index.reshape(len(image_from_canvas), view.height_px, view.width_px)
-
-
-def composite_published(pattern: Pattern, view: MaskedView) -> Float[Tensor, "f h w 3"]:
-    """Whole frames with one pattern of rectangles painted on the canvas."""
-    pixels = view.pixels(visibilities(view.masks(pattern.boxes)), pattern.colours)
-    return pasted(view, pixels)
 
 
 def pasted(view: MaskedView, pixels: Float[Tensor, "p 3"]) -> Float[Tensor, "f h w 3"]:

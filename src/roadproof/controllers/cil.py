@@ -107,11 +107,6 @@ class CIL(ConditionalNetwork):
         self.speed_branch = head(1)
 
     @property
-    def configuration(self) -> dict[str, float]:
-        """The arguments that a file needs to build the same network again."""
-        return {"width": self.width}
-
-    @property
     def is_folded(self) -> bool:
         """Whether batch normalisation has been merged into the convolutions."""
         return not any(isinstance(module, CentredBatchNorm2d) for module in self.modules())

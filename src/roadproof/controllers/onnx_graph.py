@@ -54,7 +54,7 @@ class OnnxGraph(nn.Module):
             raise ControllerError(f"{path} holds an ONNX graph that cannot be read: {in_one_line(error)}") from error
 
     def _build(self, model: Any) -> None:  # noqa: ANN401
-        from onnx import helper, numpy_helper
+        from onnx import TensorProto, helper, numpy_helper
 
         path, graph = self.path, model.graph
         versions = [opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")]
@@ -77,7 +77,7 @@ class OnnxGraph(nn.Module):
         nodes: list[tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]] = []
         for node in graph.node:
             attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}
-            if isinstance(attributes.get("value"), _tensor_type()):
+            if isinstance(attributes.get("value"), TensorProto):
                 attributes["value"] = torch.tensor(numpy_helper.to_array(attributes["value"]))
             if node.op_type == "Constant":
                 self._keep(node.output[0], torch.as_tensor(next(iter(attributes.values()))))
@@ -146,9 +146,3 @@ def _read(path: Path) -> Any:  # noqa: ANN401
     except Exception as error:  # the reader raises its own, protobuf's and the system's
         raise ControllerError(f"{path} is not a valid ONNX file: {in_one_line(error)}") from error
     return model
-
-
-def _tensor_type() -> type:
-    from onnx import TensorProto
-
-    return TensorProto

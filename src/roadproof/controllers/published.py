@@ -26,6 +26,7 @@ from roadproof.controllers.conditional import BRANCHES
 from roadproof.controllers.loading import save_controller
 from roadproof.errors import ControllerError, OutputError
 from roadproof.io.arrays import archive_names, read_archive
+from roadproof.io.files import one_line
 
 _MOST_NAMES = 5
 
@@ -115,7 +116,7 @@ def _from_checkpoint(path: Path, names: Collection[str]) -> dict[str, np.ndarray
         tensorflow: Any = importlib.import_module("tensorflow")
     except ImportError as error:
         raise ControllerError(
-            f"reading {path} needs TensorFlow, which cannot be imported ({_first_line(error)}); where it can, make an "
+            f"reading {path} needs TensorFlow, which cannot be imported ({one_line(error)}); where it can, make an "
             f".npz file and give that instead: {_recipe(path.name, 'cil.npz')}"
         ) from error
     try:
@@ -127,11 +128,7 @@ def _from_checkpoint(path: Path, names: Collection[str]) -> dict[str, np.ndarray
     except ControllerError:
         raise
     except Exception as error:  # the reader raises its own and the system's
-        raise ControllerError(f"{path} is not a TensorFlow checkpoint or is damaged: {_first_line(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ControllerError(f"{path} is not a TensorFlow checkpoint or is damaged: {one_line(error)}") from error
 
 
 def _recipe(checkpoint: str, archive: str) -> str:

@@ -158,18 +158,12 @@ def _box(low: float, high: float) -> Planes:
 
 
 def _hull(points: Float[np.ndarray, "n 3"]) -> Planes:
-    """The planes of the convex hull: those through three points that have all other points on one side."""
-    rows: list[np.ndarray] = []
-    bounds: list[float] = []
-    for three in combinations(points, 3):
-        normal = np.cross(three[1] - three[0], three[2] - three[0])
-        if (length := float(np.linalg.norm(normal))) < 1e-9:
-            continue
-        for side in (normal / length, -normal / length):
-            if (points @ side <= side @ three[0] + 1e-9).all():
-                rows.append(side)
-                bounds.append(float(side @ three[0]))
-    return np.array(rows), np.array(bounds)
+    """The planes of the convex hull of some points."""
+    # Most patterns have no limits, and this takes a third of a second to import.
+    from scipy.spatial import ConvexHull
+
+    equations = np.asarray(ConvexHull(points).equations)
+    return equations[:, :3], -equations[:, 3]
 
 
 def _corners(rows: Float[np.ndarray, "p 3"], bounds: Float[np.ndarray, " p"]) -> Float[np.ndarray, "v 3"]:

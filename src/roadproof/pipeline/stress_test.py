@@ -21,9 +21,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from roadproof.attacks import AttackResult, Cheapest, PathDeviation
+from roadproof.attacks import AttackResult, Cheapest, PathDeviation, SpeedChange
 from roadproof.attacks.cheapest import check_wanted
-from roadproof.attacks.objective import ClosedLoop
+from roadproof.attacks.speed import require_pedals
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
@@ -159,8 +159,8 @@ def stress_test(
     if processes > 1:
         require_picklable(controller)
     require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
-    if isinstance(budget.objective, ClosedLoop):
-        budget.objective.check(controller)
+    if isinstance(budget.objective, SpeedChange):
+        require_pedals(controller)
     with working_in(folder):
         return _all_of(stages, film=film, cheapest_m=cheapest_m)
 
