@@ -54,6 +54,18 @@ def test_a_spiral_agrees_with_the_power_series_of_the_fresnel_integrals() -> Non
     np.testing.assert_allclose(mine[2], a * ds * ds / 2)
 
 
+def test_the_curvature_of_a_cubic_is_that_of_its_whole_length() -> None:
+    # v = c p² has the curvature 2c at its start; v = d p³ has 6dp / (1 + (3dp²)²)^1.5, which rises from nothing.
+    length, d = 20.0, 0.0002
+    p = np.linspace(0.0, length, 33)
+    expected = (6 * d * p / (1 + (3 * d * p * p) ** 2) ** 1.5).max()
+    by_arc = ParamCubic((0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, d), normalized=False)
+    assert by_arc.max_curvature(length) == pytest.approx(expected, rel=1e-6)
+    normalized = ParamCubic((0.0, length, 0.0, 0.0), (0.0, 0.0, 0.0, d * length**3), normalized=True)
+    assert normalized.max_curvature(length) == pytest.approx(expected, rel=1e-6)
+    assert Clothoid(0.01, -0.03).max_curvature(length) == 0.03
+
+
 def test_a_spiral_with_equal_ends_is_an_arc_and_one_without_curvature_a_line() -> None:
     ds = np.linspace(0.0, 10.0, 11)
     for got, expected in zip(Clothoid(0.0, 1e-12).local(ds, 10.0), (ds, 0 * ds, 0 * ds), strict=True):

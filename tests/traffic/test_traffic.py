@@ -160,6 +160,20 @@ def test_nobody_is_none_by_default_cost_and_size() -> None:
     assert len(traffic.cars) == len(traffic.pedestrians) == 0
 
 
+@pytest.mark.parametrize("length_m", [11.0, 12.3])
+def test_a_street_too_short_for_a_car_is_none(tmp_path: Path, length_m: float) -> None:
+    width = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
+    lane = f'<lanes><laneSection s="0"><right><lane id="-1" type="driving">{width}</lane></right></laneSection></lanes>'
+    (tmp_path / "short.xodr").write_text(
+        f'<OpenDRIVE><road id="7" length="{length_m}" junction="-1"><planView><geometry s="0" x="0" y="0" hdg="0" '
+        f'length="{length_m}"><line/></geometry></planView>{lane}</road></OpenDRIVE>'
+    )
+    road_map = load_map(str(tmp_path / "short.xodr"))
+    with pytest.raises(SimulatorError, match="1 cars do not fit on the map, which has no street"):
+        Traffic(road_map, cars=1, pedestrians=0, seed=0, ego=AWAY)
+    assert len(Traffic(road_map, cars=0, pedestrians=0, seed=0, ego=AWAY).cars) == 0
+
+
 def test_what_cannot_be_is_refused() -> None:
     road_map = load_map("town")
     with pytest.raises(SimulatorError, match="-1 cars were asked for"):

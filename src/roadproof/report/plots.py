@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from jaxtyping import Float
@@ -101,7 +100,7 @@ def _film_strip(drive: ShownDrive, columns: int = 6) -> Figure:
 def show_as_it_is(figure: Figure) -> None:
     """Have no text of a figure taken for mathematics: names are the user's, and may have dollars in them."""
     for text in figure.findobj(Text):
-        cast("Text", text).set_parse_math(False)
+        text.set_parse_math(False)
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -57,8 +57,6 @@ class Lane:
         right: points of its right border, one for each point of the centre, (N, 3), metres.
         headings_rad: direction of travel at each point of the centre.
         stations_m: arc length of the centre up to each of its points.
-        left_mark: the mark that holds over most of the left border; None where there is none.
-        right_mark: the mark that holds over most of the right border; None where there is none.
         successors: indices of the lanes that go on from its end.
         junction: id of the junction it lies in; None outside junctions.
     """
@@ -73,8 +71,6 @@ class Lane:
     right: Line
     headings_rad: Float[np.ndarray, " n"]
     stations_m: Float[np.ndarray, " n"]
-    left_mark: RoadMark | None
-    right_mark: RoadMark | None
     successors: tuple[int, ...]
     junction: str | None
 
@@ -116,8 +112,6 @@ def lane_from_borders(
         right=right,
         headings_rad=np.unwrap(np.arctan2(along[:, 1], along[:, 0])),
         stations_m=stations,
-        left_mark=None,
-        right_mark=None,
         successors=(),
         junction=junction,
     )
@@ -162,7 +156,7 @@ def _stations(road: Road, section: Section) -> Float[np.ndarray, " n"]:
     parts: list[Float[np.ndarray, " n"]] = []
     for start, end in pairwise(cuts):
         here = [p for p in road.plan if p.s_m <= 0.5 * (start + end)] or [road.plan[0]]
-        curvature = here[-1].shape.max_curvature()
+        curvature = here[-1].shape.max_curvature(here[-1].length_m)
         step = min(STEP_M, math.sqrt(8.0 * CHORD_ERROR_M / curvature)) if curvature > 0 else STEP_M
         parts.append(np.linspace(start, end, max(1, math.ceil((end - start) / step)) + 1)[:-1])
     return np.concatenate([*parts, [section.end_m]])
@@ -197,18 +191,12 @@ def _borders(road: Road, section: Section) -> _Borders:
 
 
 def _lane(road: Road, k: int, record: LaneRecord, borders: _Borders) -> Lane:
-    number, section = record.number, road.sections[k]
+    number = record.number
     left, right = borders.line(borders.inner[number]), borders.line(borders.outer[number])
     if number > 0:
         left, right = left[::-1].copy(), right[::-1].copy()
-    lane = lane_from_borders(
+    return lane_from_borders(
         left, right, road=road.name, section=k, number=number, kind=record.kind, junction=road.junction
-    )
-    towards_centre = section.lanes.get(number - (1 if number > 0 else -1))
-    return replace(
-        lane,
-        left_mark=None if towards_centre is None else _prevailing(section, towards_centre),
-        right_mark=_prevailing(section, record),
     )
 
 
@@ -219,14 +207,6 @@ def _spans(section: Section, record: LaneRecord) -> list[tuple[float, float, Roa
         for mark, start, end in zip(record.marks, starts[:-1], starts[1:], strict=True)
         if min(end, section.end_m) - start > 1e-6
     ]
-
-
-def _prevailing(section: Section, record: LaneRecord) -> RoadMark | None:
-    spans = _spans(section, record)
-    if not spans:
-        return None
-    start, end, mark = max(spans, key=lambda span: span[1] - span[0])
-    return None if mark.kind in UNPAINTED or end - start <= 0 else mark
 
 
 def _mark_lines(road: Road, section: Section, record: LaneRecord, borders: _Borders) -> Iterable[MarkLine]:

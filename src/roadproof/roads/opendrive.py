@@ -126,10 +126,8 @@ def _geometry(element: ET.Element, where: str) -> Geometry:
         )
     if not 0.0 <= length <= MAX_LENGTH_M:
         raise ScenarioError(f"{where}: <geometry> has length {length} m, expected 0 to {MAX_LENGTH_M:.0f}")
-    if length > 1e-9 and shape.max_curvature() > MAX_CURVATURE:
-        raise ScenarioError(
-            f"{where}: <geometry> has a curvature of {shape.max_curvature():.3g} 1/m, expected at most {MAX_CURVATURE}"
-        )
+    if length > 1e-9 and (most := shape.max_curvature(length)) > MAX_CURVATURE:
+        raise ScenarioError(f"{where}: <geometry> has a curvature of {most:.3g} 1/m, expected at most {MAX_CURVATURE}")
     heading = _number(element, "hdg", where)
     return Geometry(
         _number(element, "s", where), _number(element, "x", where), _number(element, "y", where), heading, length, shape

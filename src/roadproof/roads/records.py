@@ -51,8 +51,9 @@ class Clothoid:
         half = 0.5 * ds_m
         return half * (np.cos(phase) @ _WEIGHTS), half * (np.sin(phase) @ _WEIGHTS), heading
 
-    def max_curvature(self) -> float:
-        """Largest curvature in 1/m, without sign."""
+    def max_curvature(self, length_m: float) -> float:
+        """Largest curvature in 1/m, without sign, of a piece of this length."""
+        del length_m
         return max(abs(self.start_curvature), abs(self.end_curvature))
 
 
@@ -72,12 +73,10 @@ class ParamCubic:
         u, v = np.array(self.u), np.array(self.v)
         return u @ powers, v @ powers, np.unwrap(np.arctan2(v @ slopes, u @ slopes))
 
-    def max_curvature(self) -> float:
-        """Largest curvature in 1/m, without sign, over 33 points."""
-        p = np.linspace(0.0, 1.0, 33)
+    def max_curvature(self, length_m: float) -> float:
+        """Largest curvature in 1/m, without sign, over 33 points of a piece of this length."""
+        p = np.linspace(0.0, 1.0 if self.normalized else length_m, 33)
         u, v = np.polynomial.Polynomial(self.u), np.polynomial.Polynomial(self.v)
-        if not self.normalized:
-            p = p * max(abs(self.u[1]), 1.0)
         du, dv, ddu, ddv = u.deriv()(p), v.deriv()(p), u.deriv(2)(p), v.deriv(2)(p)
         return float(np.max(np.abs(du * ddv - dv * ddu) / np.maximum(du * du + dv * dv, 1e-9) ** 1.5))
 

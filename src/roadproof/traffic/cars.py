@@ -31,6 +31,7 @@ AHEAD_M = np.arange(2.5, 32.0, 1.5)
 STOP_LINE_M = 5.5
 CLEAR_M = 2.6
 SPACING_M = 14.0
+FIRST_M = 4.0
 FROM_EGO_M = 25.0
 ROOM_M = 9.0
 
@@ -61,13 +62,16 @@ class Cars:
 
     def _place(self, rng: np.random.Generator, ego: VehicleState) -> None:
         tracks = self._tracks
-        streets = [t for t, junction in enumerate(tracks.junction) if junction is None and tracks.length_m[t] > 12.0]
+        last_m = tracks.length_m - STOP_LINE_M - 3.0
+        streets = [t for t, junction in enumerate(tracks.junction) if junction is None and last_m[t] > FIRST_M]
+        if len(self._s_m) and not streets:
+            raise SimulatorError(f"{len(self._s_m)} cars do not fit on the map, which has no street; ask for none")
         share = tracks.length_m[streets] / tracks.length_m[streets].sum()
         taken = [(ego.x_m, ego.y_m, FROM_EGO_M)]
         for car in range(len(self._s_m)):
             for _ in range(500):
                 track = streets[int(rng.choice(len(streets), p=share))]
-                s = float(rng.uniform(4.0, float(tracks.length_m[track]) - STOP_LINE_M - 3.0))
+                s = float(rng.uniform(FIRST_M, float(last_m[track])))
                 x, y, _ = tracks.points(np.array([track]), np.array([s]))
                 if all(math.dist((float(x[0]), float(y[0])), (px, py)) > free for px, py, free in taken):
                     break

@@ -77,14 +77,15 @@ class Tracks:
 
     def _lay_out(self, lines: list[Float[np.ndarray, "_ 3"]]) -> None:
         counts = [max(2, math.ceil(line[-1, 0] / SPACING_M) + 1) for line in lines]
-        self._first: Int[np.ndarray, " t"] = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        self._first: Int[np.ndarray, " t"] = np.cumsum([0, *counts])[:-1]
         self._per_m = (np.array(counts) - 1) / np.maximum(self.length_m, 1e-6)
         self._last = np.array(counts) - 2
         stations: list[Float[np.ndarray, " _"]] = [
             np.linspace(0.0, float(line[-1, 0]), n) for line, n in zip(lines, counts, strict=True)
         ]
         points = [interpolated(s, line[:, 0], line[:, 1:]) for s, line in zip(stations, lines, strict=True)]
-        self._x, self._y = np.concatenate(points).T.copy()
+        # A map may have no lanes of a kind.
+        self._x, self._y = np.concatenate([np.empty((0, 2)), *points]).T.copy()
         yaws: list[Float[np.ndarray, " _"]] = []
         limits: list[Float[np.ndarray, " _"]] = []
         for first, n, s in zip(self._first.tolist(), counts, stations, strict=True):
@@ -93,8 +94,8 @@ class Tracks:
             curvature = np.abs(np.gradient(yaw, s)) if n > 2 and s[-1] > 1e-3 else np.zeros(n)
             yaws.append(yaw)
             limits.append(np.sqrt(SIDE_FORCE_MPS2 / np.maximum(curvature, 1e-3)))
-        self._yaw: Float[np.ndarray, " p"] = np.concatenate(yaws)
-        self._limit: Float[np.ndarray, " p"] = np.concatenate(limits)
+        self._yaw: Float[np.ndarray, " p"] = np.concatenate([np.empty(0), *yaws])
+        self._limit: Float[np.ndarray, " p"] = np.concatenate([np.empty(0), *limits])
 
     def _cells(
         self, track: Int[np.ndarray, "*n"], s_m: Float[np.ndarray, "*n"]

@@ -361,3 +361,17 @@ def test_closing_frees_the_town_so_that_memory_does_not_grow():
     command = [sys.executable, "-c", script, json.dumps(paths)]
     peaks = [int(v) for v in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
     assert peaks[-1] - peaks[1] < 40
+
+
+def test_what_was_opened_in_vain_is_closed(monkeypatch):
+    closed = []
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(TownSimulator, "_open", interrupted)
+    monkeypatch.setattr(TownSimulator, "_close", lambda self: closed.append(self))
+    town = TownSimulator()
+    with pytest.raises(KeyboardInterrupt), town:
+        pass
+    assert closed == [town]

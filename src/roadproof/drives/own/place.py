@@ -128,7 +128,9 @@ def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint], *, fov_kno
     widest_deg = math.degrees(2 * math.atan2(camera.width_px / 2, camera.least_focal_px))
     begin = np.array([getattr(camera, name) for name in names])
     bounds = np.array([[0.1, -80.0, 5.0], [10.0, 45.0, min(170.0, widest_deg)]])[:, : len(names)]
-    found = cast("Any", optimize).least_squares(missed, begin, bounds=bounds, x_scale=(0.1, 1.0, 1.0)[: len(names)])
+    found = cast("Any", optimize).least_squares(
+        missed, begin.clip(*bounds), bounds=bounds, x_scale=(0.1, 1.0, 1.0)[: len(names)]
+    )
     off_px = float(np.hypot(*missed(found.x).reshape(2, -1)).max())
     if off_px > _MOST_MISSED_PX:
         raise RecordingError(

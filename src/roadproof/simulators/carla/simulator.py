@@ -193,7 +193,6 @@ class CarlaSimulator(RouteSimulator[_Drive]):
                 self.paint_by(PaintKind.NATIVE)
             except RoadproofError:
                 if self.session.lost:
-                    self._close()
                     raise
                 self.paint_by(PaintKind.INJECT)
 

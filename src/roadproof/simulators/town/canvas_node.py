@@ -75,8 +75,7 @@ class CanvasNode:
 
     def close(self) -> None:
         """Take the canvas out of the world."""
-        for path in self._paths:
-            path.remove_node()
+        self._root.remove_node()
 
     def hide(self) -> None:
         """Hide the canvas until the next `see`."""

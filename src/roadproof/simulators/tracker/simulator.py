@@ -70,16 +70,23 @@ class TrackedSimulator(ABC, Generic[DriveT]):
         return self._running().state
 
     def __enter__(self: Opened) -> Opened:
-        self._open()
+        try:
+            self._open()
+        except BaseException:
+            # What was opened, and changed on a server, is put back: nobody leaves a `with` that was not entered.
+            self._close()
+            raise
         self._is_open = True
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end_drive()
-        self._close()
-        self._is_open = False
+        try:
+            self._end_drive()
+        finally:
+            self._close()
+            self._is_open = False
 
     def reset(
         self,
