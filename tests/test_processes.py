@@ -1,5 +1,6 @@
-"""Processes beside this one end with it, also when it is killed."""
+"""Processes beside this one end with it, also when it is killed; pieces of work are done once, and nobody is left."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from roadproof.processes import processes_beside
+from roadproof.errors import TrainingError
+from roadproof.processes import processes_beside, spread, stopping
 
 SCRIPT = """
 import os, time
@@ -52,3 +54,45 @@ def test_each_begins_as_told():
     with processes_beside(2, os.putenv, "ROADPROOF_TOLD", "yes") as pool:
         assert pool.submit(subprocess.getoutput, "echo $ROADPROOF_TOLD").result() == "yes"
         assert pool.submit(os.getpid).result() != os.getpid()
+
+
+class Hand:
+    """A worker with nothing to close."""
+
+    def close(self):
+        pass
+
+
+def squared(hand, number):
+    del hand
+    return number**2, os.getpid()
+
+
+def refused_or_endless(hand, number):
+    """The second of two is at work for a minute unless it hears that the first one failed."""
+    del hand
+    if number == 1:
+        raise TrainingError(f"{number} is refused")
+    begun = time.monotonic()
+    while not stopping() and time.monotonic() < begun + 60:
+        time.sleep(0.05)
+
+
+def test_pieces_are_spread_and_nobody_is_left():
+    done = dict(spread(squared, [1, 2, 3, 4], Hand(), processes=2))
+    assert {work: result for work, (result, _) in done.items()} == {1: 1, 2: 4, 3: 9, 4: 16}
+    assert os.getpid() not in {process for _, process in done.values()}
+    # Waited for: a pool that is not may complain when Python ends.
+    assert multiprocessing.active_children() == []
+
+
+def test_one_process_is_this_one():
+    assert dict(spread(squared, [3], Hand(), processes=4)) == {3: (9, os.getpid())}
+    assert not stopping()
+
+
+def test_what_a_piece_raises_comes_through_and_ends_the_others():
+    begun = time.monotonic()
+    with pytest.raises(TrainingError, match="is refused"):
+        list(spread(refused_or_endless, [1, 2], Hand(), processes=2))
+    assert time.monotonic() < begun + 45

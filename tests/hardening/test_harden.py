@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import partial
 
 import pytest
 import torch
@@ -103,6 +104,27 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
         run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, batch=8)))
 
 
+@pytest.mark.slow
+def test_two_processes_attack_a_street_each_and_one_goes_on_from_there(town, tmp_path):
+    streets = [street(tmp_path, "near", 15.0), street(tmp_path, "far", 115.0)]
+    given = {"rounds": 1, "budget": TINY, "space": SearchSpace(figures=1)}
+    told = []
+    found = harden(
+        town,
+        "pilotnet",
+        streets,
+        tmp_path / "out",
+        **given,
+        factory=partial(TownSimulator, dt_s=0.2),
+        processes=2,
+        on_progress=lambda title, done, total, word: told.append((title, done, total, word)),
+    )
+    assert {each[3] for each in told if each[0] == "Round 1"} == {"streets, near is done", "streets, far is done"}
+    assert [each[1:3] for each in told if each[0] == "Round 0"] == [(1, 2), (2, 2)]
+    assert set(found.rounds[1].deviation_m) == {"near", "far"}
+    assert harden(town, "pilotnet", streets, tmp_path / "out", **given) == found
+
+
 def check_result(found, out):
     assert [each.number for each in found.rounds] == [0, 1]
     assert found.best == 1
@@ -126,6 +148,7 @@ def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
     for options, message in (
         ({"judge_on": [street(tmp_path, "next", 40.0)]}, "lie 25 m apart, on one street; expected at least 40 m"),
         ({"rounds": 0}, "rounds is 0"),
+        ({"processes": 2}, "2 processes; expected 1, or more with a factory"),
     ):
         with pytest.raises(TrainingError, match=message):
             run(town, folder, **options)

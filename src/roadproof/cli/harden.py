@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -39,6 +40,7 @@ def harden(
     seed: options.Seed = 0,
     simulator: options.SimulatorSpec = "town",
     device: options.Device = "auto",
+    processes: options.Processes = 1,
     out: options.Out = Path("out/harden"),
     *,
     paint: Paint,
@@ -55,6 +57,7 @@ def harden(
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
+    options.check_simulator(simulator, processes)
     known = options.scenarios_of(scenarios)
 
     def named(names: str) -> list[Scenario]:
@@ -84,6 +87,8 @@ def harden(
             training_step=step,
             seed=seed,
             device=device,
+            factory=partial(open_simulator, simulator),
+            processes=processes,
             on_progress=show,
         )
     page = write_hardening(found, out)

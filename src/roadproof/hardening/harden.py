@@ -30,7 +30,7 @@ import torch
 from torch import nn
 
 from roadproof.attacks.objective import variation_of
-from roadproof.controllers import CIL, ConditionalPilotNet, Controller, load_controller
+from roadproof.controllers import CIL, ConditionalPilotNet, Controller
 from roadproof.controllers.identity import identity_of
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
 from roadproof.controllers.steering import NetworkController
@@ -38,26 +38,25 @@ from roadproof.driving.evaluation import ATTACK
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
 from roadproof.hardening.judgement import Clean, Judge, Judged, Judgement, clean_drives
+from roadproof.hardening.run import WEIGHTS, Run
+from roadproof.hardening.together import StreetWork, attack_street, judge_street, together
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
 from roadproof.io.files import AnyPath, as_path, read_json, write_atomically, write_json, write_tensors
 from roadproof.io.identity import ANSWERS, require_same, stated
 from roadproof.io.locks import working_in
-from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
+from roadproof.pipeline.stress_test import OnProgress, StressTest
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario, identity
-from roadproof.search_space import SearchSpace, derived_seed
-from roadproof.simulators.protocol import Simulator
+from roadproof.search_space import SearchSpace
+from roadproof.simulators.protocol import Simulator, SimulatorFactory
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.collection import CollectionPlan, record_drive
 from roadproof.training.dataset import Dataset
 
 FORMAT = "roadproof-hardening"
 FORMAT_VERSION = 1
-WEIGHTS = "hardened.safetensors"
-_FRESH = 1000
-"""Distance between the seeds of training and those of judging."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +112,8 @@ def harden(
     training_step: TrainingStep = usual_step,
     seed: int = 0,
     device: str = "cpu",
+    factory: SimulatorFactory | None = None,
+    processes: int = 1,
     on_progress: OnProgress = lambda _stage, _done, _total, _word: None,
 ) -> Hardened:
     """Make a controller robust against paint, and judge on other streets whether that helped.
@@ -131,6 +132,8 @@ def harden(
         training_step: gives the loss of a batch; your own where the usual one does not fit your controller.
         seed: the seed of everything random; judging has fresh ones.
         device: the torch device on which to search and learn, such as "cpu" or "cuda".
+        factory: opens one more simulator of the same kind; needed for several processes.
+        processes: how many streets are attacked at once, each in a process with a simulator of its own.
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
@@ -146,38 +149,39 @@ def harden(
     budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
     if judge_on:
         budget.require_libraries(space)
+    if processes < 1 or (processes > 1 and factory is None):
+        raise TrainingError(
+            f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
+        )
     load_trainable(controller)
-    run = _Run(
-        simulator=simulator,
+    run = Run(
         spec=controller,
-        teacher=load_controller(controller, device=device),
         scenarios=tuple(scenarios),
         folder=folder,
         budget=budget,
         space=space,
-        step=training_step,
         seed=seed,
         device=device,
-        on_progress=on_progress,
     )
+    hardening = _Hardening(run, simulator, run.controller(0), training_step, factory, processes, on_progress)
     with working_in(folder):
-        _claim(run)
+        hardening.claim()
         tests, done = list[list[StressTest]](), list[Round]()
         for number in range(rounds + 1):
             if number:
-                _tuned(run, number, tests)
-            tests.append([_attacked(run, number, scenario) for scenario in scenarios])
+                hardening.tune(number, tests)
+            tests.append(hardening.attack(number))
             done.append(_round(number, tests[-1]))
         best = min(done[1:], key=lambda each: each.mean_m).number
         weights = folder / WEIGHTS
         write_atomically(weights, lambda part: shutil.copyfile(run.weights(best), part))
         judgement = None
         if judge_on:
-            clean = _clean(run, best, clean_on or (*scenarios, *judge_on))
-            judgement = Judgement(_judged(run, best, judge_on), clean)
+            clean = hardening.drive_clean(best, clean_on or (*scenarios, *judge_on))
+            judgement = Judgement(hardening.judge(best, judge_on), clean)
         found = Hardened(
             controller=controller,
-            hardened=_spec(controller, weights),
+            hardened=run.spec_with(weights),
             rounds=tuple(done),
             best=best,
             judgement=judgement,
@@ -186,63 +190,138 @@ def harden(
     return found
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class _Run:
-    """The arguments of `harden`."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hardening:
+    """A run with what it is done with: the other arguments of `harden`, and the controller before."""
 
+    run: Run
     simulator: Simulator
-    spec: str
     teacher: Controller
-    scenarios: tuple[Scenario, ...]
-    folder: Path
-    budget: HardeningBudget
-    space: SearchSpace
     step: TrainingStep
-    seed: int
-    device: str
+    factory: SimulatorFactory | None
+    processes: int
     on_progress: OnProgress
 
-    def weights(self, number: int) -> Path:
-        """The weights file of a round's controller."""
-        return self.folder / f"round-{number}" / WEIGHTS
+    def claim(self) -> None:
+        """Write what was asked for into the folder, or refuse a folder that was begun with something else."""
+        run, view, step = self.run, self.simulator.input, self.step
+        asked = {
+            "controller": run.spec,
+            ANSWERS: identity_of(self.teacher, (view.height_px, view.width_px)),
+            "scenarios": [identity(each) for each in run.scenarios],
+            "budget": repr(replace(run.budget, judge=run.budget.attack)),
+            "space": repr(run.space),
+            "variation": repr(variation_of(run.budget.attack.objective)),
+            "seed": run.seed,
+            "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
+        }
+        path = run.folder / "plan.json"
+        if path.exists():
+            kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("asked")
+            require_same(run.folder, "a hardening", kept, asked, TrainingError)
+        else:
+            write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "asked": json.loads(stated(asked))})
 
-    def spec_of(self, number: int) -> str:
-        """The spec of a round's controller."""
-        return _spec(self.spec, self.weights(number)) if number else self.spec
+    def attack(self, number: int) -> list[StressTest]:
+        """Attack the controller of a round afresh on every street for training."""
+        self._together(f"Round {number}", attack_street, number, self.run.scenarios)
+        return [
+            self.run.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
+            for each in self.run.scenarios
+        ]
 
-    def name(self, number: int) -> str:
-        """The name of a round's controller in reports; the same wherever the folder lies."""
-        return f"{self.spec}, hardened in round {number}" if number else self.spec
+    def tune(self, number: int, tests: Sequence[Sequence[StressTest]]) -> None:
+        """Tune on what all attacks so far found, from the weights of the round before."""
+        run, tuning = self.run, self.run.budget.tuning
+        if run.weights(number).exists():
+            return
+        town = self._town()
+        network = load_trainable(run.spec_of(number - 1))
+        # It learns from paint of all kinds, also where attacks are limited.
+        space = run.space.unlimited
+        streets: list[Street] = []
+        found: list[torch.Tensor] = []
+        for past, attacked in enumerate(tests):
+            driver = run.controller(past)
+            for scenario, test in zip(run.scenarios, attacked, strict=True):
+                recordings = load_recordings(run.round(past) / scenario.name / "recordings")
+                points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
+                street = Street(recordings, self.teacher, device=run.device)
+                street.add_ways(driver, space.pattern(points.to(run.device)))
+                streets.append(street)
+                found.append(points)
+        title = f"Round {number}: learning"
+        tune(
+            network,
+            self.teacher,
+            streets,
+            space,
+            torch.cat(found),
+            town,
+            tuning,
+            seed=run.seed_of(number),
+            device=run.device,
+            step=self.step,
+            on_step=lambda step, loss: self.on_progress(title, step, tuning.steps, f"loss {loss:.4f}"),
+        )
+        _save(network, run, number)
 
-    def under(self, title: str) -> OnProgress:
+    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
+        """Judge the controllers before and after on other streets."""
+        # All before come first: the one after also drives over what was found against the one before.
+        for number, when in ((0, "before"), (best, "after")):
+            self._together(f"Judging {when}", judge_street, number, judge_on)
+        judged: list[Judged] = []
+        for scenario in judge_on:
+            for number, when in ((0, "before"), (best, "after")):
+                judged += Judge(
+                    run=self.run,
+                    simulator=self.simulator,
+                    number=number,
+                    scenario=scenario,
+                    on_progress=self._under(f"Judging {when}, {scenario.name}"),
+                ).judge()
+        return tuple(judged)
+
+    def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, Clean]:
+        """Drive over the bare road with the controllers before and after."""
+
+        def of(number: int) -> Clean:
+            title = f"Bare road, {'after' if number else 'before'}"
+            return clean_drives(
+                self.simulator,
+                self.run.controller(number),
+                scenarios,
+                self.run.budget.clean_weathers,
+                self.run.round(number) / "clean",
+                on_drive=lambda done, total: self.on_progress(title, done, total, "drives"),
+            )
+
+        return of(0), of(best)
+
+    def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
+        """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
+        if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
+            done = together(work, self.run, number, scenarios, self.factory, self.processes)
+            for count, scenario in enumerate(done, 1):
+                self.on_progress(title, count, len(scenarios), f"streets, {scenario.name} is done")
+
+    def _town(self) -> Dataset | None:
+        """Frames of the controller's clean drives through the town, where there is one."""
+        drives = self.run.budget.town_drives
+        if not drives or not isinstance(self.simulator, TownSimulator):
+            return None
+        plan = CollectionPlan(drives=drives, seed=self.run.seed, controller=self.run.spec)
+        paths = [self.run.folder / "town" / f"drive-{number:05d}.npz" for number in range(drives)]
+        for number, path in enumerate(paths):
+            if not path.exists():
+                record_drive(self.simulator, plan, number, self.teacher).save(path)
+            self.on_progress("Driving through the town", number + 1, drives, "drives")
+        return Dataset.load(paths)
+
+    def _under(self, title: str) -> OnProgress:
         """Progress of the stages of one attack, told under one title."""
         return lambda stage, done, total, word: self.on_progress(title, done, total, f"{stage.lower()} {word}".strip())
-
-    def controller(self, number: int) -> Controller:
-        """The controller of a round."""
-        return load_controller(self.spec_of(number), device=self.device) if number else self.teacher
-
-
-def _spec(controller: str, weights: Path) -> str:
-    """How the controller of a spec is loaded with other weights."""
-    return f"{controller.partition('@')[0]}@{weights}" if runs_code(controller) else str(weights)
-
-
-def _attacked(run: _Run, number: int, scenario: Scenario) -> StressTest:
-    title = f"Round {number}, {scenario.name}"
-    return stress_test(
-        run.simulator,
-        run.controller(number),
-        scenario,
-        run.folder / f"round-{number}" / scenario.name,
-        budget=run.budget.attack,
-        space=run.space,
-        seed=derived_seed(run.seed, number) % _FRESH,
-        controller_name=run.name(number),
-        device=run.device,
-        film=False,
-        on_progress=run.under(title),
-    )
 
 
 def _round(number: int, tests: Sequence[StressTest]) -> Round:
@@ -252,43 +331,8 @@ def _round(number: int, tests: Sequence[StressTest]) -> Round:
     return Round(number, deviations, float(np.mean(left)))
 
 
-def _tuned(run: _Run, number: int, tests: Sequence[Sequence[StressTest]]) -> None:
-    """Tune on what all attacks so far found, from the weights of the round before."""
-    if run.weights(number).exists():
-        return
-    town = _town(run)
-    network = load_trainable(run.spec_of(number - 1))
-    streets: list[Street] = []
-    found: list[torch.Tensor] = []
-    # It learns from paint of all kinds, also where attacks are limited.
-    space = run.space.unlimited
-    for past, attacked in enumerate(tests):
-        driver = run.controller(past)
-        for scenario, test in zip(run.scenarios, attacked, strict=True):
-            recordings = load_recordings(run.folder / f"round-{past}" / scenario.name / "recordings")
-            points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
-            street = Street(recordings, run.teacher, device=run.device)
-            street.add_ways(driver, space.pattern(points.to(run.device)))
-            streets.append(street)
-            found.append(points)
-    tuning = run.budget.tuning
-    tune(
-        network,
-        run.teacher,
-        streets,
-        space,
-        torch.cat(found),
-        town,
-        tuning,
-        seed=derived_seed(run.seed, number) % _FRESH,
-        device=run.device,
-        step=run.step,
-        on_step=lambda step, loss: run.on_progress(f"Round {number}: learning", step, tuning.steps, f"loss {loss:.4f}"),
-    )
-    _save(network, run, run.weights(number), number)
-
-
-def _save(network: nn.Module, run: _Run, path: Path, number: int) -> None:
+def _save(network: nn.Module, run: Run, number: int) -> None:
+    path = run.weights(number)
     origin = f"{run.spec}, hardened for {number} rounds on {', '.join(each.name for each in run.scenarios)}"
     if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(run.spec):
         save_controller(network, path, origin=origin)
@@ -297,79 +341,8 @@ def _save(network: nn.Module, run: _Run, path: Path, number: int) -> None:
     write_tensors(path, tensors, {"roadproof-origin": origin})
 
 
-def _town(run: _Run) -> Dataset | None:
-    """Frames of the controller's clean drives through the town, where there is one."""
-    drives = run.budget.town_drives
-    if not drives or not isinstance(run.simulator, TownSimulator):
-        return None
-    plan = CollectionPlan(drives=drives, seed=run.seed, controller=run.spec)
-    paths = [run.folder / "town" / f"drive-{number:05d}.npz" for number in range(drives)]
-    for number, path in enumerate(paths):
-        if not path.exists():
-            record_drive(run.simulator, plan, number, run.teacher).save(path)
-        run.on_progress("Driving through the town", number + 1, drives, "drives")
-    return Dataset.load(paths)
-
-
-def _judged(run: _Run, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
-    judged: list[Judged] = []
-    for scenario in judge_on:
-        for number in (0, best):
-            title = f"Judging {'after' if number else 'before'}, {scenario.name}"
-            judged += Judge(
-                simulator=run.simulator,
-                controller=run.controller(number),
-                scenario=scenario,
-                folder=run.folder / f"round-{number}" / "judged" / scenario.name,
-                budget=run.budget,
-                space=run.space,
-                seed=run.seed + _FRESH,
-                name=run.name(number),
-                device=run.device,
-                before=run.folder / "round-0" / "judged" / scenario.name if number else None,
-                on_progress=run.under(title),
-            ).judge()
-    return tuple(judged)
-
-
-def _clean(run: _Run, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, Clean]:
-    def of(number: int) -> Clean:
-        title = f"Bare road, {'after' if number else 'before'}"
-        return clean_drives(
-            run.simulator,
-            run.controller(number),
-            scenarios,
-            run.budget.clean_weathers,
-            run.folder / f"round-{number}" / "clean",
-            on_drive=lambda done, total: run.on_progress(title, done, total, "drives"),
-        )
-
-    return of(0), of(best)
-
-
 def _write(found: Hardened, folder: Path) -> None:
     content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(found)
     if found.judgement is not None:
         content["verdict"] = asdict(found.judgement.verdict())
     write_json(folder / "hardening.json", content)
-
-
-def _claim(run: _Run) -> None:
-    """Write what was asked for into the folder, or refuse a folder that was begun with something else."""
-    view = run.simulator.input
-    asked = {
-        "controller": run.spec,
-        ANSWERS: identity_of(run.teacher, (view.height_px, view.width_px)),
-        "scenarios": [identity(each) for each in run.scenarios],
-        "budget": repr(replace(run.budget, judge=run.budget.attack)),
-        "space": repr(run.space),
-        "variation": repr(variation_of(run.budget.attack.objective)),
-        "seed": run.seed,
-        "training step": f"{run.step.__module__}:{getattr(run.step, '__qualname__', type(run.step).__qualname__)}",
-    }
-    path = run.folder / "plan.json"
-    if path.exists():
-        kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("asked")
-        require_same(run.folder, "a hardening", kept, asked, TrainingError)
-    else:
-        write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "asked": json.loads(stated(asked))})

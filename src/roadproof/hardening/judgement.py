@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from roadproof.attacks import AttackResult, Method, kept_attack
+from roadproof.attacks import kept_attack
 from roadproof.controllers import Controller
 from roadproof.datatypes import Ending, Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
@@ -24,12 +25,11 @@ from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.infractions import counted
 from roadproof.driving.intervals import Mean, mean_95
-from roadproof.hardening.budget import HardeningBudget
+from roadproof.hardening.run import Run
 from roadproof.patterns import Pattern, load_pattern
-from roadproof.pipeline.stress_test import OnProgress, stress_test
-from roadproof.recordings import RecordingSet, load_recordings
+from roadproof.pipeline.stress_test import OnProgress
+from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
-from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator
 
 SEARCHED = "by gradient, as in training"
@@ -159,32 +159,20 @@ class Judgement:
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
 class Judge:
-    """Attacks one controller on one street by every kind of search, and drives over what each found.
+    """Attacks a round's controller on one street by every kind of search, and drives over what each found.
 
     Args:
+        run: the hardening.
         simulator: an open simulator.
-        controller: the controller that is attacked, on `device`.
+        number: the number of the round whose controller is judged; 0 judges the one before hardening.
         scenario: the scenario of the street.
-        folder: the folder that keeps everything.
-        budget: the attack to judge with, and the kinds of attack that training did not use.
-        space: the search space of the attack that training used.
-        seed: the seed of everything random; not one of training.
-        name: the controller's name in reports.
-        device: the torch device on which to search.
-        before: folder of the same judgement of the controller before hardening; None where that one is judged.
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
     """
 
+    run: Run
     simulator: Simulator
-    controller: Controller
+    number: int
     scenario: Scenario
-    folder: Path
-    budget: HardeningBudget
-    space: SearchSpace
-    seed: int
-    name: str
-    device: str
-    before: Path | None
     on_progress: OnProgress
 
     def judge(self) -> list[Judged]:
@@ -193,60 +181,47 @@ class Judge:
         Raises:
             RoadproofError: a stage refuses; the message says why.
         """
-        tested = stress_test(
-            self.simulator,
-            self.controller,
-            self.scenario,
-            self.folder,
-            budget=self.budget.judge,
-            space=self.space,
-            seed=self.seed,
-            controller_name=self.name,
-            device=self.device,
-            film=False,
-            on_progress=self.on_progress,
-        )
+        run, folder = self.run, self.run.judged(self.number, self.scenario)
+        tested = run.attack_to_judge(self.simulator, self.number, self.scenario, self.on_progress)
         judged = [self._judged(tested.evaluation, SEARCHED)]
-        recordings = load_recordings(self.folder / "recordings")
-        for number, (kind, (method, space)) in enumerate(self.budget.kinds(self.space).items(), 1):
-            place = self.folder / f"kind-{number}"
-            found = self._searched(recordings, kind, method, space, place / "attack")
-            judged.append(self._driven(found.pattern, place / "evaluation", kind))
-        if self.before is not None:
-            judged.append(self._driven(load_pattern(self.before / "pattern.json"), self.folder / "old", OLD))
+        controller, recordings = run.controller(self.number), load_recordings(folder / "recordings")
+        for number, (kind, (method, space)) in enumerate(run.budget.kinds(run.space).items(), 1):
+            place = folder / f"kind-{number}"
+            steps = method.steps(run.budget.judge.objective)
+            found = kept_attack(
+                place / "attack",
+                recordings,
+                controller,
+                space,
+                objective=run.budget.judge.objective,
+                method=method,
+                seed=run.judging_seed,
+                device=run.device,
+                on_step=partial(self._searching, f"Searching, {kind}", steps),
+            )
+            judged.append(self._driven(controller, found.pattern, place / "evaluation", kind))
+        if self.number:
+            old = load_pattern(run.judged(0, self.scenario) / "pattern.json")
+            judged.append(self._driven(controller, old, folder / "old", OLD))
         return judged
 
-    def _searched(
-        self, recordings: RecordingSet, kind: str, method: Method, space: SearchSpace, place: Path
-    ) -> AttackResult:
-        objective = self.budget.judge.objective
-        steps = method.steps(objective)
-        return kept_attack(
-            place,
-            recordings,
-            self.controller,
-            space,
-            objective=objective,
-            method=method,
-            seed=self.seed,
-            device=self.device,
-            on_step=lambda step, best: self.on_progress(f"Searching, {kind}", step, steps, f"{best:.2f}"),
-        )
+    def _searching(self, title: str, steps: int, step: int, best: float) -> None:
+        self.on_progress(title, step, steps, f"{best:.2f}")
 
-    def _driven(self, pattern: Pattern, place: Path, kind: str) -> Judged:
-        asked = self.budget.judge
+    def _driven(self, controller: Controller, pattern: Pattern, place: Path, kind: str) -> Judged:
+        asked = self.run.budget.judge
         evaluation = evaluate(
             self.simulator,
-            self.controller,
+            controller,
             self.scenario,
             pattern,
             folder=place,
-            driver_name=self.name,
+            driver_name=self.run.name(self.number),
             weathers=asked.weathers,
             starts=asked.starts,
             start_range=asked.start_range,
             runs=asked.runs,
-            seed=self.seed,
+            seed=self.run.judging_seed,
             on_drive=lambda done, total: self.on_progress(f"Driving, {kind}", done, total, ""),
         )
         return self._judged(evaluation, kind)
@@ -256,7 +231,7 @@ class Judge:
         return Judged(
             scenario=self.scenario.name,
             kind=kind,
-            after=self.before is not None,
+            after=self.number > 0,
             deviation_m=tuple(trial.deviation_m for trial in trials),
             left_lane=tuple(trial.leaves_lane for trial in trials),
         )

@@ -23,6 +23,7 @@ from roadproof.datatypes import Command, Control, Observation, VehicleState, Wea
 from roadproof.driving.rollout import Policy, policy_of, rollout
 from roadproof.errors import TrainingError
 from roadproof.patterns import raster
+from roadproof.processes import spread
 from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -31,7 +32,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
 from roadproof.training.random_scenarios import Displacement, Disturbance, random_scenario
 from roadproof.training.shards import Shard
-from roadproof.training.workers import Worker, spread
+from roadproof.training.workers import Worker
 
 STEP_S = 0.1
 FURTHEST_M = 2.6

@@ -10,11 +10,12 @@ import numpy as np
 from roadproof.controllers import Controller
 from roadproof.datatypes import Ending, Event, Observation, Weather
 from roadproof.driving.rollout import rollout
+from roadproof.processes import spread
 from roadproof.roads.routes import Crossing
 from roadproof.scenarios import Scenario
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
-from roadproof.training.workers import Worker, spread
+from roadproof.training.workers import Worker
 
 STEP_S = 0.05
 ASTRAY_M = 6.0

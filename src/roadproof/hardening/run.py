@@ -1,0 +1,123 @@
+"""A hardening as it was asked for: where each round lies, who drives there, and the attack on one of its streets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from roadproof.controllers import Controller, load_controller
+from roadproof.controllers.loading import runs_code
+from roadproof.hardening.budget import HardeningBudget
+from roadproof.pipeline.budget import Budget
+from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
+from roadproof.scenarios import Scenario
+from roadproof.search_space import SearchSpace, derived_seed
+from roadproof.simulators.protocol import Simulator
+
+WEIGHTS = "hardened.safetensors"
+_FRESH = 1000
+"""Distance between the seeds of training and those of judging."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Run:
+    """What `harden` was asked for, as far as its attacks need it; it travels between processes.
+
+    Args:
+        spec: the spec of the controller that it begins with.
+        scenarios: the scenarios on the streets for training.
+        folder: the folder that keeps everything.
+        budget: how much is spent.
+        space: the search space of the attacks.
+        seed: the seed of everything random.
+        device: the torch device on which to search and learn.
+    """
+
+    spec: str
+    scenarios: tuple[Scenario, ...]
+    folder: Path
+    budget: HardeningBudget
+    space: SearchSpace
+    seed: int
+    device: str
+
+    def round(self, number: int) -> Path:
+        """The folder of a round; 0 is the controller as it came."""
+        return self.folder / f"round-{number}"
+
+    def judged(self, number: int, scenario: Scenario) -> Path:
+        """The folder of the judgement of a round's controller on one street."""
+        return self.round(number) / "judged" / scenario.name
+
+    def weights(self, number: int) -> Path:
+        """The weights file of a round's controller."""
+        return self.round(number) / WEIGHTS
+
+    def spec_with(self, weights: Path) -> str:
+        """The spec of the controller with other weights."""
+        return f"{self.spec.partition('@')[0]}@{weights}" if runs_code(self.spec) else str(weights)
+
+    def spec_of(self, number: int) -> str:
+        """The spec of a round's controller."""
+        return self.spec_with(self.weights(number)) if number else self.spec
+
+    def name(self, number: int) -> str:
+        """The name of a round's controller in reports; the same wherever the folder lies."""
+        return f"{self.spec}, hardened in round {number}" if number else self.spec
+
+    def controller(self, number: int) -> Controller:
+        """The controller of a round, on the device."""
+        return load_controller(self.spec_of(number), device=self.device)
+
+    def seed_of(self, number: int) -> int:
+        """The seed of a round's attacks and of its tuning."""
+        return derived_seed(self.seed, number) % _FRESH
+
+    @property
+    def judging_seed(self) -> int:
+        """The seed of all judging, which no round has."""
+        return self.seed + _FRESH
+
+    def attack(self, simulator: Simulator, number: int, scenario: Scenario, on_progress: OnProgress) -> StressTest:
+        """Attack a round's controller afresh on a street for training.
+
+        Raises:
+            RoadproofError: a stage refuses; the message says why.
+        """
+        folder, seed = self.round(number) / scenario.name, self.seed_of(number)
+        return self._test(simulator, number, scenario, folder, self.budget.attack, seed, on_progress)
+
+    def attack_to_judge(
+        self, simulator: Simulator, number: int, scenario: Scenario, on_progress: OnProgress
+    ) -> StressTest:
+        """Attack a round's controller on a street for judging, as in training.
+
+        Raises:
+            RoadproofError: a stage refuses; the message says why.
+        """
+        folder, seed = self.judged(number, scenario), self.judging_seed
+        return self._test(simulator, number, scenario, folder, self.budget.judge, seed, on_progress)
+
+    def _test(
+        self,
+        simulator: Simulator,
+        number: int,
+        scenario: Scenario,
+        folder: Path,
+        budget: Budget,
+        seed: int,
+        on_progress: OnProgress,
+    ) -> StressTest:
+        return stress_test(
+            simulator,
+            self.controller(number),
+            scenario,
+            folder,
+            budget=budget,
+            space=self.space,
+            seed=seed,
+            controller_name=self.name(number),
+            device=self.device,
+            film=False,
+            on_progress=on_progress,
+        )
