@@ -13,7 +13,7 @@ from roadproof.attacks import GradOpt, RandomSearch
 from roadproof.controllers import ConditionalPilotNet, load_controller
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives import Trajectories, Window
-from roadproof.errors import TrainingError
+from roadproof.errors import RoadproofError, TrainingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
 from roadproof.hardening.harden import harden
@@ -95,12 +95,13 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     assert torch.equal(load_controller(again.hardened).image.weight, learnt.image.weight)
     check_result(found, out)
     told = []
-    assert run(town, out, on_progress=lambda title, _done, _total, word: told.append(f"{title}: {word}")) == found
+    same = run(town, out, on_progress=lambda title, _done, _total, word: told.append(f"{title}: {word}"))
     assert told
+    assert dataclasses.replace(same, cost=found.cost) == found
     assert not any("searching" in each or "learning" in each for each in told)
-    with pytest.raises(TrainingError, match="holds a hardening with seed 0, now it is 1"):
+    with pytest.raises(RoadproofError, match="holds a hardening with seed 0, now it is 1"):
         run(town, out, seed=1)
-    with pytest.raises(TrainingError, match="holds a hardening with budget"):
+    with pytest.raises(RoadproofError, match="holds a hardening with budget"):
         run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, batch=8)))
 
 
@@ -119,10 +120,14 @@ def test_two_processes_attack_a_street_each_and_one_goes_on_from_there(town, tmp
         processes=2,
         on_progress=lambda title, done, total, word: told.append((title, done, total, word)),
     )
-    assert {each[3] for each in told if each[0] == "Round 1"} == {"streets, near is done", "streets, far is done"}
-    assert [each[1:3] for each in told if each[0] == "Round 0"] == [(1, 2), (2, 2)]
+    assert {each[3] for each in told if each[0] == "Round 1"} == {
+        "streets",
+        "streets, near is done",
+        "streets, far is done",
+    }
+    assert [each[1:3] for each in told if each[0] == "Round 0"] == [(0, 2), (1, 2), (2, 2)]
     assert set(found.rounds[1].deviation_m) == {"near", "far"}
-    assert harden(town, "pilotnet", streets, tmp_path / "out", **given) == found
+    assert harden(town, "pilotnet", streets, tmp_path / "out", **given).rounds == found.rounds
 
 
 def check_result(found, out):
@@ -134,12 +139,16 @@ def check_result(found, out):
     assert [each.kind for each in judged if each.after] == [*kinds, "found against the controller before"]
     assert all(len(each.deviation_m) == 2 for each in judged)
     assert [each.drives for each in found.judgement.clean] == [2, 2]
+    assert list(found.cost) == ["town", "attack", "learn", "bare road", "judge"]
+    assert found.cost["learn"].seconds > 0
+    assert found.cost["judge"].simulator_calls == sum(each.simulator_calls for each in judged) > 4 * len(judged)
+    assert not (out / "round-1" / "learning.safetensors").exists()
     stored = json.loads((out / "hardening.json").read_text())
     assert stored["hardened"] == found.hardened
     assert stored["verdict"]["outcome"] == found.judgement.verdict().outcome
     page = write_hardening(found, out).read_text()
     assert found.judgement.verdict().sentence in page
-    for word in (*kinds, "far", "near, m", "data:image/png"):
+    for word in (*kinds, "far", "near, m", "data:image/png", "<svg", "What it took"):
         assert word in page
 
 

@@ -13,6 +13,7 @@ def judged(scenario, kind, before, after):
             after=bool(number),
             deviation_m=tuple(values),
             left_lane=tuple(value > 1.0 for value in values),
+            simulator_calls=2 * len(values),
         )
         for number, values in enumerate((before, after))
         if values

@@ -46,6 +46,31 @@ def test_the_same_seed_learns_the_same_and_buffers_stay(street):
         assert torch.equal(buffer, one.get_buffer(name))
 
 
+@pytest.mark.parametrize("frozen", [False, True])
+def test_an_interrupted_tuning_goes_on_to_the_same_weights(street, tmp_path, frozen):
+    def step(model, batch):
+        return (model.bias - 3.0).square() if frozen else training_step(model, batch)
+
+    def stop(done, loss):
+        if done == 20:
+            raise KeyboardInterrupt
+
+    tuning, seen = Tuning(steps=25, batch=4), []
+    whole = tuned(street, tuning=tuning, step=step)
+    with pytest.raises(KeyboardInterrupt):
+        tuned(street, tuning=tuning, step=step, checkpoint=tmp_path / "learning.safetensors", on_step=stop)
+    again = tuned(
+        street,
+        tuning=tuning,
+        step=step,
+        checkpoint=tmp_path / "learning.safetensors",
+        on_step=lambda done, loss: seen.append(done),
+    )
+    assert seen == [25]
+    assert torch.equal(again.weight, whole.weight)
+    assert torch.equal(again.bias, whole.bias)
+
+
 def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_small(street):
     seen = []
 

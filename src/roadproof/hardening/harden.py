@@ -1,6 +1,6 @@
 """Hardening a controller: attack, fine-tune on what was found, attack afresh; then the judgement on other streets.
 
-    OUT/plan.json                      what was asked for
+    OUT/run.json                       what was asked for, and what the stages took (`pipeline.stage_costs`)
     OUT/town/drive-00000.npz           clean drives through the town
     OUT/round-0/SCENARIO/              the attack on the controller as it came (`pipeline.stress_test`)
     OUT/round-1/hardened.safetensors   the controller after the first tuning
@@ -19,7 +19,6 @@ References:
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -43,9 +42,10 @@ from roadproof.hardening.together import StreetWork, attack_street, judge_street
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
-from roadproof.io.files import AnyPath, as_path, read_json, write_atomically, write_json, write_tensors
-from roadproof.io.identity import ANSWERS, require_same, stated
+from roadproof.io.files import AnyPath, as_path, write_atomically, write_json, write_tensors
+from roadproof.io.identity import ANSWERS
 from roadproof.io.locks import working_in
+from roadproof.pipeline.stage_costs import Ledger, StageCost
 from roadproof.pipeline.stress_test import OnProgress, StressTest
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario, identity
@@ -57,6 +57,7 @@ from roadproof.training.dataset import Dataset
 
 FORMAT = "roadproof-hardening"
 FORMAT_VERSION = 1
+STAGES = ("town", "attack", "learn", "bare road", "judge")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +90,7 @@ class Hardened:
         rounds: the re-tests on the streets for training, round 0 first.
         best: number of the round whose controller is kept: the one after a tuning with the least mean deviation.
         judgement: before and after on other streets; None where none were given.
+        cost: cost of each stage since the hardening began, by its name.
     """
 
     controller: str
@@ -96,6 +98,7 @@ class Hardened:
     rounds: tuple[Round, ...]
     best: int
     judgement: Judgement | None
+    cost: dict[str, StageCost]
 
 
 def harden(
@@ -137,10 +140,10 @@ def harden(
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
-        TrainingError: there are no rounds, streets for training and judging are not disjoint, the folder holds another
-            hardening, or the training step gives no finite loss.
+        TrainingError: there are no rounds, streets for training and judging are not disjoint, or the training step gives
+            no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
-        RoadproofError: a stage refuses; the message says why.
+        RoadproofError: the folder holds another hardening, or a stage refuses; the message says why.
     """
     folder = as_path(folder)
     check_streets(scenarios, judge_on)
@@ -163,15 +166,20 @@ def harden(
         seed=seed,
         device=device,
     )
-    hardening = _Hardening(run, simulator, run.controller(0), training_step, factory, processes, on_progress)
+    teacher = run.controller(0)
     with working_in(folder):
-        hardening.claim()
+        ledger = Ledger(folder, _made_of(run, simulator, teacher, training_step), STAGES, "a hardening")
+        hardening = _Hardening(run, simulator, teacher, training_step, factory, processes, ledger, on_progress)
+        town = hardening.town()
         tests, done = list[list[StressTest]](), list[Round]()
         for number in range(rounds + 1):
             if number:
-                hardening.tune(number, tests)
+                hardening.tune(number, tests, town)
             tests.append(hardening.attack(number))
             done.append(_round(number, tests[-1]))
+        ledger.calls(
+            "attack", sum(cost.simulator_calls for each in tests for test in each for cost in test.cost.values())
+        )
         best = min(done[1:], key=lambda each: each.mean_m).number
         weights = folder / WEIGHTS
         write_atomically(weights, lambda part: shutil.copyfile(run.weights(best), part))
@@ -185,6 +193,7 @@ def harden(
             rounds=tuple(done),
             best=best,
             judgement=judgement,
+            cost=ledger.cost,
         )
         _write(found, folder)
     return found
@@ -200,42 +209,28 @@ class _Hardening:
     step: TrainingStep
     factory: SimulatorFactory | None
     processes: int
+    ledger: Ledger
     on_progress: OnProgress
 
-    def claim(self) -> None:
-        """Write what was asked for into the folder, or refuse a folder that was begun with something else."""
-        run, view, step = self.run, self.simulator.input, self.step
-        asked = {
-            "controller": run.spec,
-            ANSWERS: identity_of(self.teacher, (view.height_px, view.width_px)),
-            "scenarios": [identity(each) for each in run.scenarios],
-            "budget": repr(replace(run.budget, judge=run.budget.attack)),
-            "space": repr(run.space),
-            "variation": repr(variation_of(run.budget.attack.objective)),
-            "seed": run.seed,
-            "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
-        }
-        path = run.folder / "plan.json"
-        if path.exists():
-            kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("asked")
-            require_same(run.folder, "a hardening", kept, asked, TrainingError)
-        else:
-            write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "asked": json.loads(stated(asked))})
+    def tell(self, title: str, done: int, total: int, word: str) -> None:
+        """Note the time, and tell the caller how far it is."""
+        self.ledger.step()
+        self.on_progress(title, done, total, word)
 
     def attack(self, number: int) -> list[StressTest]:
         """Attack the controller of a round afresh on every street for training."""
-        self._together(f"Round {number}", attack_street, number, self.run.scenarios)
-        return [
-            self.run.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
-            for each in self.run.scenarios
-        ]
+        with self.ledger.stage("attack"):
+            self._together(f"Round {number}", attack_street, number, self.run.scenarios)
+            return [
+                self.run.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
+                for each in self.run.scenarios
+            ]
 
-    def tune(self, number: int, tests: Sequence[Sequence[StressTest]]) -> None:
+    def tune(self, number: int, tests: Sequence[Sequence[StressTest]], town: Dataset | None) -> None:
         """Tune on what all attacks so far found, from the weights of the round before."""
         run, tuning = self.run, self.run.budget.tuning
         if run.weights(number).exists():
             return
-        town = self._town()
         network = load_trainable(run.spec_of(number - 1))
         # It learns from paint of all kinds, also where attacks are limited.
         space = run.space.unlimited
@@ -251,36 +246,36 @@ class _Hardening:
                 streets.append(street)
                 found.append(points)
         title = f"Round {number}: learning"
-        tune(
-            network,
-            self.teacher,
-            streets,
-            space,
-            torch.cat(found),
-            town,
-            tuning,
-            seed=run.seed_of(number),
-            device=run.device,
-            step=self.step,
-            on_step=lambda step, loss: self.on_progress(title, step, tuning.steps, f"loss {loss:.4f}"),
-        )
+        with self.ledger.stage("learn"):
+            tune(
+                network,
+                self.teacher,
+                streets,
+                space,
+                torch.cat(found),
+                town,
+                tuning,
+                seed=run.seed_of(number),
+                device=run.device,
+                step=self.step,
+                checkpoint=run.round(number) / "learning.safetensors",
+                on_step=lambda step, loss: self.tell(title, step, tuning.steps, f"loss {loss:.4f}"),
+            )
         _save(network, run, number)
+        (run.round(number) / "learning.safetensors").unlink(missing_ok=True)
 
     def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
         """Judge the controllers before and after on other streets."""
-        # All before come first: the one after also drives over what was found against the one before.
-        for number, when in ((0, "before"), (best, "after")):
-            self._together(f"Judging {when}", judge_street, number, judge_on)
         judged: list[Judged] = []
-        for scenario in judge_on:
+        with self.ledger.stage("judge"):
+            # All before come first: the one after also drives over what was found against the one before.
             for number, when in ((0, "before"), (best, "after")):
-                judged += Judge(
-                    run=self.run,
-                    simulator=self.simulator,
-                    number=number,
-                    scenario=scenario,
-                    on_progress=self._under(f"Judging {when}, {scenario.name}"),
-                ).judge()
+                self._together(f"Judging {when}", judge_street, number, judge_on)
+            for scenario in judge_on:
+                for number, when in ((0, "before"), (best, "after")):
+                    told = self._under(f"Judging {when}, {scenario.name}")
+                    judged += Judge(self.run, self.simulator, number, scenario, told).judge()
+            self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
         return tuple(judged)
 
     def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, Clean]:
@@ -294,34 +289,55 @@ class _Hardening:
                 scenarios,
                 self.run.budget.clean_weathers,
                 self.run.round(number) / "clean",
-                on_drive=lambda done, total: self.on_progress(title, done, total, "drives"),
+                on_drive=lambda done, total: self.tell(title, done, total, "drives"),
             )
 
-        return of(0), of(best)
+        with self.ledger.stage("bare road"):
+            both = of(0), of(best)
+            self.ledger.calls("bare road", sum(each.drives for each in both))
+        return both
 
-    def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
-        """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
-        if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
-            done = together(work, self.run, number, scenarios, self.factory, self.processes)
-            for count, scenario in enumerate(done, 1):
-                self.on_progress(title, count, len(scenarios), f"streets, {scenario.name} is done")
-
-    def _town(self) -> Dataset | None:
+    def town(self) -> Dataset | None:
         """Frames of the controller's clean drives through the town, where there is one."""
         drives = self.run.budget.town_drives
         if not drives or not isinstance(self.simulator, TownSimulator):
             return None
         plan = CollectionPlan(drives=drives, seed=self.run.seed, controller=self.run.spec)
         paths = [self.run.folder / "town" / f"drive-{number:05d}.npz" for number in range(drives)]
-        for number, path in enumerate(paths):
-            if not path.exists():
-                record_drive(self.simulator, plan, number, self.teacher).save(path)
-            self.on_progress("Driving through the town", number + 1, drives, "drives")
+        with self.ledger.stage("town"):
+            for number, path in enumerate(paths):
+                if not path.exists():
+                    record_drive(self.simulator, plan, number, self.teacher).save(path)
+                self.tell("Driving through the town", number + 1, drives, "drives")
+            self.ledger.calls("town", drives)
         return Dataset.load(paths)
+
+    def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
+        """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
+        if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
+            self.tell(title, 0, len(scenarios), "streets")
+            done = together(work, self.run, number, scenarios, self.factory, self.processes)
+            for count, scenario in enumerate(done, 1):
+                self.tell(title, count, len(scenarios), f"streets, {scenario.name} is done")
 
     def _under(self, title: str) -> OnProgress:
         """Progress of the stages of one attack, told under one title."""
-        return lambda stage, done, total, word: self.on_progress(title, done, total, f"{stage.lower()} {word}".strip())
+        return lambda stage, done, total, word: self.tell(title, done, total, f"{stage.lower()} {word}".strip())
+
+
+def _made_of(run: Run, simulator: Simulator, teacher: Controller, step: TrainingStep) -> dict[str, object]:
+    """What identifies a hardening; judging may be asked for later."""
+    view = simulator.input
+    return {
+        "controller": run.spec,
+        ANSWERS: identity_of(teacher, (view.height_px, view.width_px)),
+        "scenarios": [identity(each) for each in run.scenarios],
+        "budget": repr(replace(run.budget, judge=run.budget.attack)),
+        "space": repr(run.space),
+        "variation": repr(variation_of(run.budget.attack.objective)),
+        "seed": run.seed,
+        "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
+    }
 
 
 def _round(number: int, tests: Sequence[StressTest]) -> Round:

@@ -46,6 +46,7 @@ class Judged:
         after: whether the controller is the hardened one, not the one before hardening.
         deviation_m: deviation of each drive over the pattern, metres.
         left_lane: whether each drive over the pattern left its lane.
+        simulator_calls: number of simulator drives that the attack and these drives took.
     """
 
     scenario: str
@@ -53,6 +54,7 @@ class Judged:
     after: bool
     deviation_m: tuple[float, ...]
     left_lane: tuple[bool, ...]
+    simulator_calls: int
 
     @property
     def mean_m(self) -> float:
@@ -157,7 +159,7 @@ class Judgement:
         return max(tried, key=lambda each: each.mean_m)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Judge:
     """Attacks a round's controller on one street by every kind of search, and drives over what each found.
 
@@ -183,7 +185,8 @@ class Judge:
         """
         run, folder = self.run, self.run.judged(self.number, self.scenario)
         tested = run.attack_to_judge(self.simulator, self.number, self.scenario, self.on_progress)
-        judged = [self._judged(tested.evaluation, SEARCHED)]
+        calls = sum(cost.simulator_calls for cost in tested.cost.values())
+        judged = [self._judged(tested.evaluation, SEARCHED, calls)]
         controller, recordings = run.controller(self.number), load_recordings(folder / "recordings")
         for number, (kind, (method, space)) in enumerate(run.budget.kinds(run.space).items(), 1):
             place = folder / f"kind-{number}"
@@ -224,9 +227,9 @@ class Judge:
             seed=self.run.judging_seed,
             on_drive=lambda done, total: self.on_progress(f"Driving, {kind}", done, total, ""),
         )
-        return self._judged(evaluation, kind)
+        return self._judged(evaluation, kind, evaluation.simulator_calls)
 
-    def _judged(self, evaluation: Evaluation, kind: str) -> Judged:
+    def _judged(self, evaluation: Evaluation, kind: str, calls: int) -> Judged:
         trials = evaluation.of(ATTACK, traffic=False)
         return Judged(
             scenario=self.scenario.name,
@@ -234,6 +237,7 @@ class Judge:
             after=self.number > 0,
             deviation_m=tuple(trial.deviation_m for trial in trials),
             left_lane=tuple(trial.leaves_lane for trial in trials),
+            simulator_calls=calls,
         )
 
 

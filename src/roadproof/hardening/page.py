@@ -12,6 +12,7 @@ from roadproof.hardening.judgement import Judged
 from roadproof.io.files import write_text
 from roadproof.io.html import encoded
 from roadproof.patterns import load_pattern, raster
+from roadproof.report.charts import by_round
 from roadproof.report.html import environment
 
 _BADGES = {"helped": "holds", "not shown": "swayed", "did not help": "fails"}
@@ -35,6 +36,7 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
         verdict=verdict,
         badge="" if verdict is None else _BADGES[verdict.outcome],
         pairs=_pairs(judged),
+        curve=by_round([each.deviation_m for each in found.rounds]),
         patterns=[
             {
                 "name": name,

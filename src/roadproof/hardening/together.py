@@ -53,7 +53,7 @@ def attack_street(run: Run, simulator: Simulator, number: int, scenario: Scenari
 
 def judge_street(run: Run, simulator: Simulator, number: int, scenario: Scenario) -> None:
     """Judge a round's controller on a street for judging."""
-    Judge(run=run, simulator=simulator, number=number, scenario=scenario, on_progress=_go_on).judge()
+    Judge(run, simulator, number, scenario, _go_on).judge()
 
 
 class _Beside:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple, TypeAlias, cast
 
 import torch
@@ -22,6 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of
 from roadproof.controllers.conditional import ConditionalNetwork
@@ -138,6 +140,7 @@ def tune(
     seed: int,
     device: torch.device | str = "cpu",
     step: TrainingStep = training_step,
+    checkpoint: Path | None = None,
     on_step: OnStep = lambda _step, _loss: None,
 ) -> None:
     """Fine-tune a controller in place.
@@ -153,6 +156,7 @@ def tune(
         seed: the seed of everything drawn.
         device: the torch device on which the controller learns.
         step: the function that gives the loss of a batch.
+        checkpoint: the file that keeps an interrupted tuning, which goes on from there; None for none.
         on_step: called at every tenth step and at the last with the step and the mean loss since the call before.
 
     Raises:
@@ -166,7 +170,8 @@ def tune(
     optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
     paint = _Paint(space, found.to(device), tuning)
     paste, weights, total = PastedPaint(0.5), None if town is None else town.weights(), 0.0
-    for number in range(tuning.steps):
+    begun = 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
+    for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
         parts = [_of_street(streets[number % len(streets)], teacher, network, paint, tuning, town is None, draw)]
         if town is not None and weights is not None:
@@ -186,8 +191,32 @@ def tune(
         optimiser.step()
         total += float(loss.detach())
         if (number + 1) % 10 == 0 or number + 1 == tuning.steps:
+            if checkpoint is not None:
+                _keep(parameters, optimiser, checkpoint, number + 1)
             on_step(number + 1, total / (number % 10 + 1))
             total = 0.0
+
+
+def _keep(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, path: Path, steps: int) -> None:
+    """Keep the parameters and AdamW's moments after so many steps."""
+    kept = {"steps": torch.tensor(steps)}
+    for k, each in enumerate(parameters):
+        kept |= {f"{k}.value": each} | {f"{k}.{name}": moment for name, moment in optimiser.state[each].items()}
+    save_checkpoint(path, "", kept)
+
+
+def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, path: Path) -> int:
+    """Put back what a file keeps, where there is one that is whole; the number of steps done."""
+    kept = load_checkpoint(path, "", parameters[0].device)
+    if kept is None:
+        return 0
+    for k, each in enumerate(parameters):
+        own = {name.partition(".")[2]: value for name, value in kept.items() if name.startswith(f"{k}.")}
+        each.data.copy_(own.pop("value"))
+        # A parameter that had no gradient has no moments.
+        if own:
+            optimiser.state[each] = own
+    return int(kept["steps"])
 
 
 class _Paint:

@@ -67,13 +67,14 @@ class Ledger:
         folder: path of the run folder.
         made_of: identity of the run, by name (`io.identity`).
         stages: names of all stages of the run, in order.
+        what: the run in a word, for a message that refuses its folder.
 
     Raises:
         RoadproofError: the folder belongs to another run; the message names what differs.
         OutputError: run.json cannot be written.
     """
 
-    def __init__(self, folder: Path, made_of: Mapping[str, object], stages: Sequence[str]) -> None:
+    def __init__(self, folder: Path, made_of: Mapping[str, object], stages: Sequence[str], what: str = "a run") -> None:
         self._path, self._made_of = folder / FILE, cast("dict[str, Any]", plain(made_of))
         self._current, self._since = "", 0.0
         self.cost = {stage: StageCost() for stage in stages}
@@ -81,7 +82,7 @@ class Ledger:
             self._write()
             return
         before = _FILE.read(self._path)
-        require_same(folder, "a run", before.parts, self._made_of, RoadproofError)
+        require_same(folder, what, before.parts, self._made_of, RoadproofError)
         self.cost |= before.cost
 
     @contextmanager

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
@@ -223,6 +223,25 @@ def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], objective
     _legend(axes, columns=1)
     words = "What the search gained on composited frames, every start and the best of each group"
     return Chart(svg_of(figure, "search", words), words + ".")
+
+
+def by_round(deviation_m: Sequence[Mapping[str, float]]) -> Chart:
+    """What an attack afresh reaches on each street after each tuning of a controller: streets thin, their mean bold.
+
+    Args:
+        deviation_m: for each number of tunings, from none on, the driven deviation by the street's name, metres.
+    """
+    figure, axes = _axes("tunings", "deviation, m")
+    table = np.array([list(each.values()) for each in deviation_m])
+    axes.plot(table, color=MUTED, linewidth=0.8)
+    axes.plot(table.mean(1), color=PAINTED, linewidth=2.2, marker="o", label="mean over the streets")
+    axes.set_xticks(range(len(table)))
+    axes.set_ylim(bottom=0.0)
+    _legend(axes, columns=1)
+    words = (
+        "How far the strongest paint leads the controller astray, attacked afresh after each tuning, street by street"
+    )
+    return Chart(svg_of(figure, "rounds", words), words + ".")
 
 
 def _axes(x: str, y: str) -> tuple[Figure, Axes]:
