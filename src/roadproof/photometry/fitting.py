@@ -8,14 +8,15 @@ linear for large ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy import optimize
 from torch import Tensor
 
 from roadproof.errors import ColourError
-from roadproof.photometry.least_squares import least_squares
 from roadproof.photometry.responses import (
     SATURATED,
     AffineResponse,
@@ -28,6 +29,7 @@ from roadproof.photometry.transform import ColourTransform, RadialShading, squar
 
 _LARGE = 8 / 255
 _FOLDS = 12
+_MOST_STEPS = 100
 # Logarithms of exposure, contrast and encoding, for pictures encoded twice and once.
 _FILM_STARTS = ((-1.5, -1.5, -1.5, 0.4, 0.0), (0.0, 0.0, 0.0, 0.3, 0.9))
 
@@ -175,11 +177,21 @@ def _solve(samples: ColourSamples, kind: FittedKind, shade: bool, start: Tensor 
     else:
         _check_film(painted, seen)
         starts = [torch.tensor(values, dtype=torch.float64) for values in _FILM_STARTS]
-    problem = _ColourProblem(samples, kind, shade)
     if start is not None:
-        return least_squares(problem, [start])
-    padding = torch.zeros(2 if shade else 0, dtype=torch.float64)
-    return least_squares(problem, [torch.cat([values, padding]) for values in starts])
+        starts = [start]
+    elif shade:
+        starts = [torch.cat([values, torch.zeros(2)]) for values in starts]
+    problem = _ColourProblem(samples, kind, shade)
+
+    def residuals(at: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        return problem.residuals(torch.tensor(at)).numpy()
+
+    def jacobian(at: Float[np.ndarray, " p"]) -> Float[np.ndarray, "n p"]:
+        return problem.jacobian(torch.tensor(at)).numpy()
+
+    solve = cast("Any", optimize).least_squares
+    ends = [solve(residuals, begin, jacobian, x_scale="jac", max_nfev=_MOST_STEPS) for begin in starts]
+    return torch.tensor(min(ends, key=lambda end: end.cost).x)
 
 
 class _ColourProblem:
