@@ -12,7 +12,7 @@ from roadproof.geometry import CameraModel
 from roadproof.roads.roadmap import RoadMap, Surface
 from roadproof.simulators.town.engine import Node, Path, Texture, core
 from roadproof.simulators.town.ground import LitGround
-from roadproof.simulators.town.meshes import MeshBuilder
+from roadproof.simulators.town.meshes import Mesh, MeshBuilder
 from roadproof.simulators.town.models import PAINTS, Body, car, person
 from roadproof.simulators.town.shading import Layer, dress, mesh_node, shaded, turned
 from roadproof.simulators.town.streets import KERB_M
@@ -20,9 +20,8 @@ from roadproof.traffic.agents import NOBODY, Agents
 
 HEADINGS = 8
 PERSON_LOOKS = 12
-STRIDES = (-1.0, -0.4, 0.4, 1.0)
 STEPS_M = 1.5
-STRIDE_OF_STEP = (0, 1, 2, 3, 2, 1)
+STRIDES = (-1.0, -0.4, 0.4, 1.0, 0.4, -0.4)
 REACH_M, TALL_M = 3.0, 2.2
 CAR_SHADE_M, PERSON_SHADE_M = (2.55, 1.25), (0.42, 0.42)
 
@@ -34,7 +33,7 @@ class AgentNodes:
         self._root, self._roads, self._camera, self._shade = root, roads, camera, shade
         self._cars, self._people = NOBODY, NOBODY
         self._nodes: tuple[list[_Figure], list[_Figure]] = ([], [])
-        self._models: dict[tuple[bool, int, int], list[Node]] = {}
+        self._models: dict[tuple[int, float | None], list[Node]] = {}
         self._lit: LitGround
 
     def relight(self, lit: LitGround) -> None:
@@ -80,18 +79,17 @@ class AgentNodes:
             shaded_m = self._lit.shaded_at(points)
             for k, i in enumerate(chosen.tolist()):
                 yaw = float(agents.yaw_rad[i])
-                step = int(agents.travelled_m[i] / STEPS_M * 6) % 6 if on_foot else 0
-                models = self._lit_models(on_foot, int(agents.look[i]), STRIDE_OF_STEP[step])
+                stride = stride_at(float(agents.travelled_m[i])) if on_foot else None
+                models = self._lit_models(int(agents.look[i]), stride)
                 heading = round(yaw / (2 * math.pi / HEADINGS)) % HEADINGS
                 model = models[heading + (HEADINGS if shaded_m[k] else 0)]
                 figures[i].show(model, float(points[k, 0]), float(points[k, 1]), yaw, raised=bool(raised[k]))
 
-    def _lit_models(self, on_foot: bool, look: int, stride: int) -> list[Node]:
+    def _lit_models(self, look: int, stride: float | None) -> list[Node]:
         """Nodes of an agent's mesh, lit for each heading, in the sun and then in the shade."""
-        look %= PERSON_LOOKS if on_foot else len(Body) * len(PAINTS)
-        key = (on_foot, look, stride)
+        key = (look % (len(Body) * len(PAINTS) if stride is None else PERSON_LOOKS), stride)
         if key not in self._models:
-            mesh = person(look, STRIDES[stride]) if on_foot else car(Body(look % len(Body)), PAINTS[look // len(Body)])
+            mesh = figure(*key)
             self._models[key] = [
                 mesh_node(
                     mesh,
@@ -101,6 +99,19 @@ class AgentNodes:
                 for k in range(HEADINGS)
             ]
         return self._models[key]
+
+
+def stride_at(travelled_m: float) -> float:
+    """Phase of the step of someone who has walked this far, −1 to 1."""
+    return STRIDES[int(travelled_m / STEPS_M * 6) % 6]
+
+
+def figure(look: int, stride: float | None) -> Mesh:
+    """The shape of an agent: a person at this phase of the step, or a car if there is none."""
+    if stride is not None:
+        return person(look % PERSON_LOOKS, stride)
+    look %= len(Body) * len(PAINTS)
+    return car(Body(look % len(Body)), PAINTS[look // len(Body)])
 
 
 def in_view(camera: CameraModel, state: VehicleState, points_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:

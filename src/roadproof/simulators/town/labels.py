@@ -7,7 +7,7 @@ pixel give the depth in closed form; what no triangle covers is the ground (z = 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -19,7 +19,7 @@ from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
 from roadproof.roads.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.town import textures
-from roadproof.simulators.town.agent_nodes import PERSON_LOOKS, STEPS_M, STRIDE_OF_STEP, STRIDES
+from roadproof.simulators.town.agent_nodes import figure, stride_at
 from roadproof.simulators.town.air import dome
 from roadproof.simulators.town.engine import (
     VERTEX,
@@ -32,8 +32,7 @@ from roadproof.simulators.town.engine import (
     make_pipe,
     make_texture,
 )
-from roadproof.simulators.town.meshes import Mesh, MeshBuilder
-from roadproof.simulators.town.models import PAINTS, Body, car, person
+from roadproof.simulators.town.meshes import Mesh, MeshBuilder, Pose
 from roadproof.simulators.town.renderer import CULL_M, whole
 from roadproof.simulators.town.scenery import TREES, Scenery
 from roadproof.simulators.town.screens import Screens
@@ -47,7 +46,6 @@ MAX_FACES = 2 ** (3 * BITS) - 1
 FAR_M = 1000.0
 PLAN_PIXEL_M, MAX_PLAN_PX = 0.1, 8192
 GROUND_M, GROUND_PIECE_M = 120.0, 30.0
-PLACE = ("x_m", "y_m", "yaw_rad")
 
 
 class Label(IntEnum):
@@ -87,16 +85,6 @@ class LabelledPicture:
     depth_m: Float[np.ndarray, "h w"]
 
 
-@dataclass(slots=True)
-class _Moving:
-    """One car or person in the scene: where it hangs, its shapes, and its numbers."""
-
-    path: Path
-    shapes: list[tuple[Node, Float[np.ndarray, "t 4"]]]
-    first: int
-    shown: int = -1
-
-
 class LabelScene:
     """The town as numbered faces, beside its picture in the `Renderer`."""
 
@@ -125,7 +113,7 @@ class LabelScene:
         self._ground = self._root.attach_new_node(_numbered(_around(), 0))
         dress(self._ground, Layer.GROUND)
         self._still = self._count
-        self._moving: list[_Moving] = []
+        self._agents = self._root.attach_new_node("agents")
 
     def close(self) -> None:
         """Give back everything that the scene holds."""
@@ -137,44 +125,21 @@ class LabelScene:
         self._screens.close()
 
     def set_agents(self, cars: Agents, people: Agents) -> None:
-        """Replace all cars and people; afterwards `move_agents` moves as many."""
-        for moving in self._moving:
-            moving.path.remove_node()
-        self._moving.clear()
-        self._cut(self._still)
-        for agents, label in ((cars, Label.VEHICLE), (people, Label.PEDESTRIAN)):
-            for look in agents.look.tolist():
-                meshes = _shapes(look, label)
-                shapes = [(_numbered(mesh, self._count), _planes(mesh)) for mesh in meshes]
-                path = self._root.attach_new_node(core.PandaNode("agent"))
-                dress(path, Layer.SOLID)
-                self._moving.append(_Moving(path, shapes, self._count))
-                self._number(np.zeros((max(len(mesh.triangles) for mesh in meshes), 4)), label)
-        self.move_agents(cars, people)
-
-    def move_agents(self, cars: Agents, people: Agents) -> None:
-        """Put the cars and people of `set_agents` where they are now."""
+        """Replace all cars and people."""
+        self._agents.remove_node()
+        self._agents = self._root.attach_new_node("agents")
+        dress(self._agents, Layer.SOLID)
+        self._planes, self._labels = [self._all_planes()[: self._still]], [np.concatenate(self._labels)[: self._still]]
+        self._count = self._still
         raised = self._roads.surface_at(np.stack([people.x_m, people.y_m], axis=1)) == Surface.SIDEWALK
-        heights = np.concatenate([np.zeros(len(cars)), np.where(raised, KERB_M, 0.0)])
-        steps = (people.travelled_m / STEPS_M * 6).astype(np.int64) % 6
-        strides = [0] * len(cars) + [STRIDE_OF_STEP[step] for step in steps.tolist()]
-        places = np.stack([np.concatenate([getattr(a, name) for a in (cars, people)]) for name in PLACE], axis=1)
-        for moving, stride, (x, y, yaw), z in zip(
-            self._moving, strides, places.tolist(), heights.tolist(), strict=True
-        ):
-            self._move(moving, stride, (x, y, z), yaw)
-
-    def _move(self, moving: _Moving, stride: int, place: tuple[float, float, float], yaw_rad: float) -> None:
-        node, local = moving.shapes[stride]
-        if stride != moving.shown:
-            moving.path.node().remove_all_children()
-            moving.path.node().add_child(node)
-            moving.shown = stride
-        moving.path.set_pos_hpr(*place, math.degrees(yaw_rad), 0.0, 0.0)
-        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        normals = local[:, :3] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        offsets = local[:, 3] + normals @ place
-        self._all_planes()[moving.first : moving.first + len(local)] = np.column_stack([normals, offsets])
+        heights = np.concatenate([np.zeros(len(cars)), np.where(raised, KERB_M, 0.0)]).tolist()
+        for k, height in enumerate(heights):
+            on_foot = k >= len(cars)
+            agents, i = (people, k - len(cars)) if on_foot else (cars, k)
+            mesh = figure(int(agents.look[i]), stride_at(float(agents.travelled_m[i])) if on_foot else None)
+            pose = Pose(float(agents.x_m[i]), float(agents.y_m[i]), float(agents.yaw_rad[i]), height)
+            placed = replace(mesh, points=pose.place(mesh.points))
+            self._attach(self._agents, placed, Label.PEDESTRIAN if on_foot else Label.VEHICLE)
 
     def look(self, camera: CameraModel, state: VehicleState) -> LabelledPicture:
         """What the camera of a vehicle sees."""
@@ -201,22 +166,19 @@ class LabelScene:
 
     def _add(self, mesh: Mesh, label: Label, layer: Layer, texture: Texture | None = None) -> None:
         for _, part in mesh.cells(CULL_M):
-            path = self._root.attach_new_node(_numbered(part, self._count))
+            path = self._attach(self._root, part, label)
             if texture is not None:
                 path.set_texture(texture)
             dress(path, layer)
-            self._number(_planes(part), label)
 
-    def _number(self, planes: Float[np.ndarray, "t 4"], label: Label) -> None:
-        if self._count + len(planes) > MAX_FACES:
+    def _attach(self, parent: Path, mesh: Mesh, label: Label) -> Path:
+        path = parent.attach_new_node(_numbered(mesh, self._count))
+        self._count += len(mesh.triangles)
+        if self._count > MAX_FACES:
             raise SimulatorError(f"the map has more than {MAX_FACES} faces, too many for depth pictures; cut it down")
-        self._planes.append(planes)
-        self._labels.append(np.full(len(planes), label, np.uint8))
-        self._count += len(planes)
-
-    def _cut(self, count: int) -> None:
-        self._planes, self._labels = [self._all_planes()[:count]], [np.concatenate(self._labels)[:count]]
-        self._count = count
+        self._planes.append(_planes(mesh))
+        self._labels.append(np.full(len(mesh.triangles), label, np.uint8))
+        return path
 
     def _all_planes(self) -> Float[np.ndarray, "t 4"]:
         if len(self._planes) > 1:
@@ -260,14 +222,6 @@ def _around() -> Mesh:
             s, t = x + GROUND_PIECE_M, y + GROUND_PIECE_M
             builder.quad(np.array([(x, y, 0.0), (s, y, 0.0), (s, t, 0.0), (x, t, 0.0)]))
     return builder.build()
-
-
-def _shapes(look: int, label: Label) -> list[Mesh]:
-    """The shapes an agent takes as it goes."""
-    if label is Label.PEDESTRIAN:
-        return [person(look % PERSON_LOOKS, stride) for stride in STRIDES]
-    look %= len(Body) * len(PAINTS)
-    return [car(Body(look % len(Body)), PAINTS[look // len(Body)])]
 
 
 def _planes(mesh: Mesh) -> Float[np.ndarray, "t 4"]:
