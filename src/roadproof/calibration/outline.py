@@ -20,11 +20,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch.nn.functional import avg_pool2d, max_pool2d
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from roadproof.coverage import FOOTPRINT_VARIANCE
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
@@ -147,19 +148,9 @@ def moved(
         camera: camera of the frames.
     """
     K = camera.intrinsics
-    turned = _rotation(moves[:, :3]) @ (np.linalg.inv(K) @ image_from_canvas)
+    turned = Rotation.from_rotvec(moves[:, :3]).as_matrix() @ (np.linalg.inv(K) @ image_from_canvas)
     turned[..., 2] += moves[:, 3:]
     return K @ turned
-
-
-def _rotation(vector: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
-    """Rotation matrices from rotation vectors, by Rodrigues' formula."""
-    angle = np.linalg.norm(vector, axis=-1)[:, None, None]
-    x, y, z = vector.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    safe = np.maximum(angle, 1e-12)
-    return np.eye(3) + np.sin(angle) / safe * cross + (1 - np.cos(angle)) / safe**2 * cross @ cross
 
 
 class _Outline:
@@ -252,11 +243,7 @@ def _over_gain(
     contrast: Float[np.ndarray, "f h w"], expected: Float[np.ndarray, "f h w"]
 ) -> Float[np.ndarray, "f h w"]:
     """D / g with the g that suits a pixel's neighbourhood best; 0 where nothing is expected or seen."""
-    size = 2 * _GAIN_PX + 1
-    fit, power = (
-        avg_pool2d(torch.tensor(values)[:, None], size, 1, _GAIN_PX)[:, 0].numpy()
-        for values in (contrast * expected, expected**2)
-    )
+    fit, power = (_box_mean(values, _GAIN_PX) for values in (contrast * expected, expected**2))
     known = (power > 1e-3) & (fit > _SEEN * power)
     return np.where(known, np.clip(contrast / np.where(known, fit / np.maximum(power, 1e-9), 1.0), 0.0, 1.5), 0.0)
 
@@ -276,21 +263,22 @@ def _blurred(
     """Contrast averaged over a tent of this half-width, and where that did not need pixels beyond the picture."""
     if blur_px == 0:
         return contrast, np.ones(contrast.shape, bool)
-    shares = torch.tensor(contrast)[:, None]
-    for _ in range(2):
-        # Two boxes make a tent.
-        shares = avg_pool2d(shares, 2 * (blur_px // 2) + 1, 1, blur_px // 2)
+    # Two boxes make a tent.
+    shares = _box_mean(_box_mean(contrast, blur_px // 2), blur_px // 2)
     whole = np.zeros(contrast.shape, bool)
     whole[:, blur_px:-blur_px, blur_px:-blur_px] = True
-    return shares[:, 0].numpy(), whole
+    return shares, whole
+
+
+def _box_mean(pictures: Float[np.ndarray, "f h w"], reach_px: int) -> Float[np.ndarray, "f h w"]:
+    """Means over squares around each pixel; beyond the pictures there is 0."""
+    return cast("Any", ndimage).uniform_filter(pictures, 2 * reach_px + 1, mode="constant", axes=(1, 2))
 
 
 def _near_edge(contrast: Float[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
     """The pixels within reach of a place where the contrast changes."""
-    shown = torch.tensor(contrast)[:, None]
     size = 2 * _REACH_PX + 1
-    most, least = max_pool2d(shown, size, 1, _REACH_PX), -max_pool2d(-shown, size, 1, _REACH_PX)
-    return (most - least)[:, 0].numpy() > 0.25
+    return ndimage.morphological_gradient(contrast, (1, size, size)) > 0.25
 
 
 def _arrow_step(
