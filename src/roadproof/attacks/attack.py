@@ -26,10 +26,11 @@ from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import ClosedLoop, Grouped, Measure, Objective, RecordedMeasure, SteeringShift
+from roadproof.attacks.objective import ClosedLoop, Measure, Objective, RecordedMeasure, SteeringShift
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
+from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import identity_of
 from roadproof.errors import RoadproofError
@@ -105,7 +106,7 @@ def attack(
         on_step=on_step,
     )
     frames = measure.frames_evaluated
-    if search.gave_way and isinstance(measure, Grouped):
+    if search.gave_way and isinstance(measure, Surrogate | ClosedLoopMeasure):
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
     told, groups = groups, measure.groups
     candidates = _candidates(measure, search, space, groups)

@@ -12,12 +12,12 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import torch
 
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.attacks.step import State, corrected, require_finite_step, stepped
+from roadproof.attacks.surrogate import Surrogate
 from roadproof.errors import RoadproofError
 from roadproof.foreign import in_one_line
 from roadproof.search_space import SearchSpace
@@ -28,21 +28,12 @@ LOOK_S = 0.5
 _HELD = ("unit", "best_unit", "best", "exp_avg", "exp_avg_sq")
 
 
-@runtime_checkable
-class Replayable(Protocol):
-    """A measure that may have steps of the same operations on tensors of the same shapes."""
-
-    def replayable(self) -> RecordedMeasure | None:
-        """The measure with such steps, whose frames are counted from nought; None if it has none."""
-        ...
-
-
 class Replay:
     """The steps of one rung, on tensors that stay where they are.
 
     Args:
         measure: the measure that is made large, whose frames are counted.
-        same: the measure whose steps are the same operations every time, see `Replayable`.
+        same: the measure whose steps are the same operations every time, see `Surrogate.replayable`.
         space: the search space.
         learning_rate: Adam's learning rate.
         momentum: Adam's β₁.
@@ -140,7 +131,7 @@ def replay_of(
     """
     if measure.device.type not in RECORDERS or int(state["done"]) >= iterations:
         return None
-    same = measure.replayable() if isinstance(measure, Replayable) else None
+    same = measure.replayable() if isinstance(measure, Surrogate) else None
     if same is None:
         return "their operations differ from step to step"
     try:

@@ -25,10 +25,11 @@ from torch import Tensor
 
 from roadproof.attacks.captured import Replay, in_words, replay_of
 from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
-from roadproof.attacks.objective import Grouped, Measure, RecordedMeasure, Varied
+from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.objective import Measure, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
-from roadproof.attacks.surrogate import FIXED
+from roadproof.attacks.surrogate import FIXED, Surrogate
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
@@ -44,7 +45,7 @@ class Rung:
         every: use every n-th frame of each drive; in the recorded world, a picture every n-th step. 1 uses all.
         open_loop: whether to climb the steering shift on recorded frames, whatever the objective of the search.
         groups_compete: whether a group whose best is below `BEHIND` of the best of all gives its starts to the others
-            before this rung, if the measure can be had of some groups alone (`Grouped`).
+            before this rung, unless the measure is a user's own.
         screened: how many of the random starts of every group are the best of `DRAWN` that are valued first.
         offspring: how many children of the rung before's best points compete with these for the places of this one.
 
@@ -178,7 +179,7 @@ def gradopt(
         measure.frames_evaluated += int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung = rungs[number]
-        if number > at and rung.groups_compete and isinstance(measure, Grouped):
+        if number > at and rung.groups_compete and isinstance(measure, Surrogate | ClosedLoopMeasure):
             state, behind = _without_those_behind(state, behind)
         climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
         beside = side_by_side(climbed)
@@ -196,7 +197,7 @@ def gradopt(
         replay = replay_of(climbed, space, iterations=rung.iterations, state=state, **adam)
         run["" if isinstance(replay, Replay) else replay] += rung.iterations - int(state["done"])
         while int(state["done"]) < rung.iterations:
-            if isinstance(climbed, Varied):
+            if isinstance(climbed, Surrogate | ClosedLoopMeasure):
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
             state = replay.go_on() if isinstance(replay, Replay) else _step(beside, space, state, **adam)
             on_step(done + int(state["done"]), float(state["best"].max()))
@@ -209,7 +210,7 @@ def gradopt(
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
     best, last = state["best"], _of_groups(measure, behind)
-    if isinstance(last, Varied) and last.variation is not None:
+    if isinstance(last, Surrogate | ClosedLoopMeasure) and last.variation is not None:
         # Every step had looks of its own; results are compared in the same ones.
         last.redraw(FIXED)
         best = last.values(space, state["best_unit"])
@@ -248,7 +249,9 @@ def _at(unit: Float[Tensor, "g r k n"], index: Int64[Tensor, "g i"]) -> Float[Te
 def _of_groups(measure: RecordedMeasure, behind: Float[Tensor, " g"]) -> RecordedMeasure:
     """The measure of the groups that have not given way."""
     kept = cast("list[int]", behind.isnan().nonzero()[:, 0].tolist())
-    return measure.of_groups(kept) if len(kept) < len(behind) and isinstance(measure, Grouped) else measure
+    if len(kept) < len(behind) and isinstance(measure, Surrogate | ClosedLoopMeasure):
+        return measure.of_groups(kept)
+    return measure
 
 
 def _without_those_behind(state: State, behind: Float[Tensor, " g"]) -> tuple[State, Float[Tensor, " g"]]:

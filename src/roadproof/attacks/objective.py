@@ -78,26 +78,6 @@ class RecordedMeasure(Measure, Protocol):
 
 
 @runtime_checkable
-class Varied(Protocol):
-    """A measure that can take its mean over new looks at every step."""
-
-    variation: Variation | None
-
-    def redraw(self, seed: int) -> None:
-        """Take the mean over the looks drawn from a seed from now on."""
-        ...
-
-
-@runtime_checkable
-class Grouped(Protocol):
-    """A measure that can be had of some of its groups alone."""
-
-    def of_groups(self, kept: Sequence[int]) -> RecordedMeasure:
-        """The same measure of the groups with these numbers; its frames are counted from nought."""
-        ...
-
-
-@runtime_checkable
 class Objective(Protocol):
     """What a search makes large, such as a steering shift or a path deviation."""
 
