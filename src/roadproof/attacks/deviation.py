@@ -32,16 +32,7 @@ class DeviationMeasure(ClosedLoopMeasure):
     """Predicted offset of patterns in a recorded world, for every group at once.
 
     Args:
-        recordings: recordings with canvas and tracks; the drives of each weather are a world of their own.
-        controller: the controller that drives; it computes on `device`.
-        groups: groups that state the sides; whatever group they belong to, all drives of the set are driven in.
-        saturation_m: the s of the formula above, metres.
-        **rolling: starts, every, device and variation; see `closed_loop.Rolling`.
-
-    Raises:
-        RecordingError: the poses of a drive are not known, the vehicle cannot be identified, or a group is one of the
-            speed.
-        ControllerError: the controller takes frames of another size, or answers NaN to clean frames.
+        saturation_m: the s of the formula above, metres; the others and the errors are those of `ClosedLoopMeasure`.
     """
 
     def __init__(

@@ -156,10 +156,8 @@ class PathDeviation(ClosedLoop):
     """How far aside the car goes in the recorded world, closed loop; its value is metres.
 
     Args:
-        starts: offsets from the clean drive at which drives begin, one or more; several make the result more general.
-        every: number of steps from one picture to the next during the search; a prediction has a picture at every step.
-        saturation_m: offset in metres, above 0, beyond which a larger one hardly counts more.
-        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
+        saturation_m: offset in metres, above 0, beyond which a larger one hardly counts more; the others are those of
+            `ClosedLoop`.
 
     Raises:
         RoadproofError: `starts` is empty, or `every` or `saturation_m` is not positive.
@@ -195,15 +193,8 @@ class SpeedChange(ClosedLoop):
     """How much slower, or faster, the car goes in the recorded world, closed loop; its value is m/s.
 
     It is the mean over the passage of the speed less that of the drive over the bare road there. The controller must
-    say throttle and brake (`PedalController`). The groups are "slower" and "faster".
-
-    Args:
-        starts: offsets from the clean drive at which drives begin, one or more; several make the result more general.
-        every: number of steps from one picture to the next during the search; a prediction has a picture at every step.
-        variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
-
-    Raises:
-        RoadproofError: `starts` is empty, or `every` is not positive.
+    say throttle and brake (`PedalController`). The groups are "slower" and "faster". Arguments and errors are those of
+    `ClosedLoop`.
     """
 
     word: ClassVar[str] = "speed change"

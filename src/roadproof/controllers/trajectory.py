@@ -36,11 +36,8 @@ class TrajectoryController(NetworkController):
     to far. Points at known times say how fast to drive too.
 
     Args:
-        network: network that takes the `inputs`, in order.
-        preparation: how the network's frames are made from those of a recording.
-        law: law that steers along the points.
+        law: law that steers along the points; arguments that are not named here are those of `NetworkController`.
         dt_s: time from point to point, seconds, the first one lying that far ahead; None where points have no times.
-        inputs: what the network takes: "frames", and "speed_mps" and "command" if it wants them.
         cruise: cruise control that approaches the speed of the plan, or holds its own where the plan has none.
 
     Raises:
