@@ -9,7 +9,7 @@ An episode is one file that explains itself: a NumPy archive of named arrays and
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import chain
+from itertools import chain, count
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -159,14 +159,7 @@ def drive_again(
     Raises:
         SimulatorError, ScenarioError, PatternError: as `rollout` does.
     """
-    seen = 0
-
-    def told(observation: Observation, control: Control | None) -> None:
-        nonlocal seen
-        seen += 1
-        if on_step is not None:
-            on_step(observation, control)
-
+    seen = count(1)
     return rollout(
         simulator,
         replay(episode),
@@ -177,9 +170,8 @@ def drive_again(
         pedestrians=episode.pedestrians,
         seed=episode.seed,
         full_pictures=full_pictures,
-        on_step=told,
-        # The last observation is told of, too, once the drive has ended.
-        until=lambda _: seen >= steps - 1,
+        on_step=on_step,
+        until=lambda _: next(seen) >= steps,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -190,13 +191,11 @@ def rendered_frames(
     if not wanted or min(wanted) < 0 or max(wanted) >= len(episode):
         raise RecordingError(f"frames up to {max(wanted, default=0)} are asked of a drive of {len(episode)} steps")
     frames: list[np.ndarray] = []
-    step = 0
+    steps = count()
 
     def keep(seen: Observation, _: Control | None) -> None:
-        nonlocal step
-        if step in wanted:
+        if next(steps) in wanted:
             frames.append(seen.frame)
-        step += 1
 
     drive_again(simulator, episode, scenario, pattern=pattern, steps=max(wanted) + 1, on_step=keep)
     return np.stack(frames)
