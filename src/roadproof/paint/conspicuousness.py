@@ -14,20 +14,11 @@ from typing import cast
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.coverage import Shape
+from roadproof.coverage import polygon_vertices
 from roadproof.paint.colours import contrast
 from roadproof.paint.limits import area_m2
-from roadproof.paint.site import Rgb, Site, half_edges_m, rgb_of
+from roadproof.paint.site import Rgb, Site, half_edges_m, metres_per_px, rgb_of
 from roadproof.patterns import Pattern
-
-_ANGLES = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
-_OUTLINES = {
-    Shape.RECTANGLE: np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]),
-    Shape.ELLIPSE: np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1),
-    Shape.TRIANGLE: np.array([[0, -1], [1, 1], [-1, 1]]),
-    Shape.DIAMOND: np.array([[0, -1], [1, 0], [0, 1], [-1, 0]]),
-}
-"""Corners of each shape, in halves of its box."""
 
 _OTHER_DIRECTION_RAD, _OTHER_COLOUR = np.pi / 4, 0.25
 
@@ -89,10 +80,10 @@ def _beside_marks(
     pattern: Pattern, colours: np.ndarray, site: Site, size_m: tuple[float, float]
 ) -> tuple[float, float]:
     ends, widths, paints = site.segments
-    centre, across, along = (part.numpy() for part in half_edges_m(pattern.boxes, size_m))
+    _, across, along = (part.numpy() for part in half_edges_m(pattern.boxes, size_m))
     distance, likeness = np.inf, 0.0
     for k, shape in enumerate(pattern.shapes):
-        corners = centre[k] + _OUTLINES[shape] @ np.stack([across[k], along[k]])
+        corners = (polygon_vertices(shape, pattern.boxes[k]).numpy() + 0.5) * metres_per_px(size_m)
         clear = _apart_m(corners, ends) - widths / 2
         distance = min(distance, float(clear.min()))
         likeness = max(likeness, _likeness(across[k], along[k], colours[k], ends, widths, paints))
