@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from references import rectangles_from_published
 from roadproof.coverage import Shape, polygon_vertices
 from roadproof.errors import OutputError, PatternError
 from roadproof.patterns import (
@@ -17,7 +18,6 @@ from roadproof.patterns import (
     load_pattern,
     raster,
     read_paint,
-    rectangles_from_published,
     save_pattern,
     visibilities,
 )

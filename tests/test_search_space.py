@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from references import rectangles_from_published
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
-from roadproof.patterns import rectangles_from_published
 from roadproof.search_space import SearchSpace
 
 

@@ -8,7 +8,6 @@ Convention:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -109,27 +108,6 @@ def published_from_boxes(
         angle = torch.deg2rad(rotation_deg)
         arm = arm * torch.cos(angle) + (y - _MIDDLE) * torch.sin(angle)
     return torch.stack([rotation_deg, _MIDDLE + arm - 10 - width / 2, width - 5, (CANVAS_SIZE_PX - length) / 2 - 5], -1)
-
-
-def rectangles_from_published(
-    values: Sequence[Sequence[float]], *, rotate_about: Literal["figure", "canvas"] = "figure"
-) -> Pattern:
-    """A pattern from K rows of published parameters.
-
-    Args:
-        values: per rectangle rotation, position, width, length and, where it is not black, r, g, b in 0…255.
-        rotate_about: "figure" or "canvas", as in `boxes_from_published`.
-
-    Raises:
-        PatternError: a row has neither 4 nor 7 values.
-    """
-    lengths = {len(row) for row in values}
-    if len(lengths) != 1 or not lengths <= {4, 7}:
-        raise PatternError(f"published rectangles have rows of {sorted(lengths)} values, expected 4 (black) or 7 each")
-    rows = torch.tensor(values, dtype=torch.float32)
-    colours = rows[:, 4:] / 255 if rows.shape[1] == 7 else torch.zeros(len(rows), 3)
-    boxes = boxes_from_published(rows[:, :4], rotate_about=rotate_about)
-    return Pattern((Shape.RECTANGLE,) * len(rows), boxes, colours)
 
 
 def coverages(pattern: Pattern, footprints: Footprints) -> Float[Tensor, "*b k p"]:

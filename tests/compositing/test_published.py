@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from references import approach
+from references import approach, rectangles_from_published
 from roadproof.compositing import composite, view_canvas
 from roadproof.compositing.published import (
     canvas_mask,
@@ -12,7 +12,7 @@ from roadproof.compositing.published import (
     view_canvas_published,
 )
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_INPUT
-from roadproof.patterns import rectangles_from_published, visibilities
+from roadproof.patterns import visibilities
 from scenes import PLAIN, road_frames
 
 ROWS = [[70.5, 191.5, 56.7, 37.7, 143.2, 196.7, 112.2], [154.4, 176.0, 44.0, 0.8, 8.4, 150.4, 193.1]]

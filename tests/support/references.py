@@ -5,8 +5,10 @@ import torch
 
 from roadproof.coverage import Shape, polygon_vertices
 from roadproof.datatypes import VehicleState
+from roadproof.errors import PatternError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.homographies import apply_homography
+from roadproof.patterns import Pattern, boxes_from_published
 
 
 def homography_jacobian(b_from_a, points):
@@ -24,6 +26,16 @@ def approach(count=8, first_m=14.0, last_m=4.0, lateral_m=0.0):
         for i, distance in enumerate(np.linspace(first_m, last_m, count))
     ]
     return np.stack([homography_from_pose(CIL_CAMERA, pose, canvas) for pose in poses])
+
+
+def rectangles_from_published(values):
+    """A pattern from K rows of published parameters: rotation, position, width, length and, if not black, r, g, b."""
+    lengths = {len(row) for row in values}
+    if len(lengths) != 1 or not lengths <= {4, 7}:
+        raise PatternError(f"published rectangles have rows of {sorted(lengths)} values, expected 4 (black) or 7 each")
+    rows = torch.tensor(values, dtype=torch.float32)
+    colours = rows[:, 4:] / 255 if rows.shape[1] == 7 else torch.zeros(len(rows), 3)
+    return Pattern((Shape.RECTANGLE,) * len(rows), boxes_from_published(rows[:, :4]), colours)
 
 
 def inside(shape: Shape, box: np.ndarray, points: np.ndarray) -> np.ndarray:
