@@ -24,11 +24,13 @@ class Traffic:
         """Place everybody, away from the driven car.
 
         Raises:
-            SimulatorError: a number is negative, or they do not fit on the map.
+            SimulatorError: a number or the seed is negative, or they do not fit on the map.
         """
         for what, count in (("cars", cars), ("pedestrians", pedestrians)):
             if count < 0:
                 raise SimulatorError(f"{count} {what} were asked for, expected 0 or more")
+        if seed < 0:
+            raise SimulatorError(f"the seed of the traffic is {seed}, expected 0 or more")
         self._cars = Cars(road_map, cars, seed, ego)
         self._pedestrians = Pedestrians(road_map, pedestrians, seed)
         self.cars: Agents = self._cars.agents

@@ -18,7 +18,7 @@ from PIL import Image, ImageChops, ImageDraw, ImageFilter
 from scipy.spatial import ConvexHull
 
 from roadproof.roads.lanes import Lane
-from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.town.scenery import Scenery, Tree
 from roadproof.simulators.town.textures import fractal_noise
 from roadproof.simulators.town.weather import Sky
@@ -109,17 +109,16 @@ class _Canvas:
 
 
 def _surfaces(canvas: _Canvas, roads: RoadMap, scenery: Scenery) -> Image.Image:
-    """0 lawn, 1 pavement, 2 shoulder, 3 road."""
+    """`Surface` of each sample: 0 lawn, 1 pavement, 2 shoulder, 3 road."""
     image = canvas.blank()
     pen = ImageDraw.Draw(image)
     for outline in scenery.paved:
         pen.polygon(canvas.points(outline), fill=1)
-    layers = {"sidewalk": 1, "shoulder": 2, "border": 2, "parking": 2, "driving": 3}
-    for lane in sorted(roads.lanes, key=lambda lane: layers.get(lane.kind, 0)):
-        if lane.kind in layers:
-            pen.polygon(canvas.points(np.concatenate([lane.left, lane.right[::-1]])), fill=layers[lane.kind])
+    paved = [(SURFACE_OF_KIND[lane.kind], lane) for lane in roads.lanes if lane.kind in SURFACE_OF_KIND]
+    for surface, lane in sorted(paved, key=lambda pair: pair[0]):
+        pen.polygon(canvas.points(np.concatenate([lane.left, lane.right[::-1]])), fill=int(surface))
     for area in roads.junctions:
-        pen.polygon(canvas.points(area.outline), fill=3)
+        pen.polygon(canvas.points(area.outline), fill=int(Surface.DRIVING))
     # Sidewalks get an edge of stone, which also fills the chinks where strips meet at an angle.
     near = image.point([0, 255, 0, 0] + [0] * 252).filter(ImageFilter.BoxBlur(EDGE_M / canvas.pixel_m))
     bare = image.point([255] + [0] * 255)
