@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,6 +14,7 @@ from roadproof.simulators.town.engine import VERTEX, Path, Texture, fill_texture
 from roadproof.simulators.town.shading import Layer, dress
 
 PIECE_CORNERS = 12
+CORNERS = np.array([(x, y, 1.0) for x in (-0.5, CANVAS_SIZE_PX - 0.5) for y in (-0.5, CANVAS_SIZE_PX - 0.5)])
 # The renderer interpolates between the texel hit and the one before it: half a texel too late.
 LINEAR_SHIFT = 0.5
 
@@ -31,7 +31,6 @@ class CanvasNode:
         self._reductions: list[tuple[int, int]] = []
         self._textures: list[Texture] = []
         self._world_from_canvas: Float[np.ndarray, "4 3"] = np.zeros((4, 3))
-        self._corners: list[tuple[float, float, float]] = []
         self._shown = [False] * (COARSEST + 1)
         fan = np.array([[0, i, i + 1] for i in range(1, PIECE_CORNERS - 1)])
         self._fans = [make_node("canvas", np.zeros(PIECE_CORNERS, VERTEX), fan) for _ in range(COARSEST + 1)]
@@ -50,9 +49,6 @@ class CanvasNode:
             return
         self._placement, self._patch = placement, bake()
         self._world_from_canvas = placement.world_from_canvas
-        low, high = -0.5, CANVAS_SIZE_PX - 0.5
-        outline = np.array([(low, low, 1.0), (high, low, 1.0), (high, high, 1.0), (low, high, 1.0)])
-        self._corners = [(x, y, z) for x, y, z, _ in (outline @ self._world_from_canvas.T).tolist()]
         crop, magnified = self._crops[0]
         across, down = crop.input_from_camera[0, 0] * magnified, crop.input_from_camera[1, 1] * magnified
         focal = self._camera.focal_px
@@ -88,8 +84,8 @@ class CanvasNode:
         if self._placement is None:
             return
         outlines: dict[int, Float[np.ndarray, "n 2"]] = {}
-        if self._ahead_of(state):
-            homography = self._camera.image_from_world(state) @ self._world_from_canvas
+        homography = self._camera.image_from_world(state) @ self._world_from_canvas
+        if (CORNERS @ homography[2]).max() > NEAREST_M:
             outlines = {piece.copy: piece.outline for piece in self._rasters[which].pieces(homography)}
         for k, (path, shown) in enumerate(zip(self._paths, self._shown, strict=True)):
             if k in outlines:
@@ -97,17 +93,6 @@ class CanvasNode:
             if shown != (k in outlines):
                 self._shown[k] = not shown
                 (path.hide if shown else path.show)()
-
-    def _ahead_of(self, state: VehicleState) -> bool:
-        """Whether some corner is deep enough in front of the camera to be drawn."""
-        camera, (c, s) = self._camera, (math.cos(state.yaw_rad), math.sin(state.yaw_rad))
-        pitch = math.radians(camera.pitch_deg)
-        x, y = state.x_m + c * camera.forward_m, state.y_m + s * camera.forward_m
-        return any(
-            ((px - x) * c + (py - y) * s) * math.cos(pitch) + (pz - state.z_m - camera.up_m) * math.sin(pitch)
-            > NEAREST_M
-            for px, py, pz in self._corners
-        )
 
     def _vertices(self, copy: int, outline: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """A fan of fixed size: the last corner is repeated."""
