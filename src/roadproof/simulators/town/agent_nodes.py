@@ -42,17 +42,14 @@ class AgentNodes:
         self._models.clear()
 
     def populate(self, cars: Agents, people: Agents) -> None:
-        """Replace all cars and people; afterwards `move` moves as many."""
-        for figure in (*self._nodes[0], *self._nodes[1]):
-            figure.remove()
-        self._nodes = (
-            [_Figure(self._root, self._shade, CAR_SHADE_M) for _ in range(len(cars))],
-            [_Figure(self._root, self._shade, PERSON_SHADE_M) for _ in range(len(people))],
-        )
-        self.move(cars, people)
-
-    def move(self, cars: Agents, people: Agents) -> None:
-        """Take note of where everybody is now; nothing is moved before it is looked at."""
+        """Take note of who is there and where; nothing is moved before it is looked at."""
+        if (len(cars), len(people)) != (len(self._cars), len(self._people)):
+            for figure in (*self._nodes[0], *self._nodes[1]):
+                figure.remove()
+            self._nodes = (
+                [_Figure(self._root, self._shade, CAR_SHADE_M) for _ in range(len(cars))],
+                [_Figure(self._root, self._shade, PERSON_SHADE_M) for _ in range(len(people))],
+            )
         self._cars, self._people = cars, people
 
     def see(self, state: VehicleState, *, everybody: bool = False) -> None:

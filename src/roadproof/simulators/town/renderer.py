@@ -107,12 +107,8 @@ class Renderer:
         self._painted = dict(paints)
 
     def set_agents(self, cars: Agents, people: Agents) -> None:
-        """Replace all cars and people; afterwards `move_agents` moves as many."""
+        """Show these cars and people, and no others, from now on."""
         self._agents.populate(cars, people)
-
-    def move_agents(self, cars: Agents, people: Agents) -> None:
-        """Put the cars and people of `set_agents` where they are now."""
-        self._agents.move(cars, people)
 
     def frame(self, state: VehicleState, tick: int = 0) -> UInt8[np.ndarray, "h w 3"]:
         """The controller's input, rendered at twice its resolution; `tick` moves the rain."""

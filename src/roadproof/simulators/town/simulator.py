@@ -138,7 +138,7 @@ class TownSimulator(RouteSimulator[_Drive]):
             assert self._town is not None
             drive.step_traffic()
             drive.physics.move_cars(np.stack([drive.cars.x_m, drive.cars.y_m, drive.cars.yaw_rad], axis=1))
-            self._town.renderer.move_agents(drive.cars, drive.pedestrians)
+            self._town.renderer.set_agents(drive.cars, drive.pedestrians)
         drive.physics.step(control, self.dt_s)
         drive.state = drive.physics.state()
 
