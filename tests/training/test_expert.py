@@ -10,7 +10,7 @@ from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.traffic.agents import NOBODY, Agents
 from roadproof.traffic.traffic import Traffic
-from roadproof.training.expert import Expert, Manner, pedals, speed_limits
+from roadproof.training.expert import SLOW_MPS2, Expert, pedals, speed_limits
 
 SCENARIOS = builtin_scenarios()
 DT_S = 0.05
@@ -73,14 +73,14 @@ def test_the_expert_turns_the_wheel_towards_the_route() -> None:
     assert Expert(route).drive(right_of_it).steer < -0.05
 
 
-def test_speed_falls_in_time_for_bends() -> None:
-    manner = Manner(cruise_mps=9.0)
+def test_speed_falls_in_time_for_bends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadproof.training.expert.CRUISE_MPS", 9.0)
     for scenario in SCENARIOS:
         route = scenario_route(scenario, load_map("town"))
-        limit = speed_limits(route, manner)
+        limit = speed_limits(route)
         assert limit.max() <= 9.0 + 1e-9
         slowing = -np.diff(limit**2) / (2 * np.diff(route.arclengths_m))
-        assert slowing.max() <= manner.slow_mps2 + 1e-9
+        assert slowing.max() <= SLOW_MPS2 + 1e-9
         if scenario.kind != "straight":
             assert limit.min() < 8.8
 

@@ -10,7 +10,7 @@ from roadproof.datatypes import Command, Control
 from roadproof.errors import ScenarioError
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.roads.roadmap import RoadMap
-from roadproof.training.random_scenarios import LENGTHS_M, Displacement, Disturbance, random_scenario
+from roadproof.training.random_scenarios import LENGTHS_M, Disturbance, random_scenario
 
 
 @pytest.mark.parametrize("map_name", ["town", "second"])
@@ -33,12 +33,14 @@ def test_the_same_seed_gives_the_same_scenario():
     assert one != third
 
 
-def test_displaced_starts_spread_to_their_limits():
-    roads, displacement = load_map("town"), Displacement(aside_m=1.0, aside_limit_m=1.2)
+def test_displaced_starts_spread_to_their_limits(monkeypatch):
+    monkeypatch.setattr("roadproof.training.random_scenarios.ASIDE_M", 1.0)
+    monkeypatch.setattr("roadproof.training.random_scenarios.ASIDE_LIMIT_M", 1.2)
+    roads = load_map("town")
     generator = np.random.default_rng(0)
     asides, speeds = [], []
     for _ in range(60):
-        scenario = random_scenario(roads, "town", generator, name="x", displacement=displacement)
+        scenario = random_scenario(roads, "town", generator, name="x", displaced=True)
         place = scenario_route(scenario, roads).locate(scenario.start.x_m, scenario.start.y_m)
         asides.append(place.lateral_m)
         speeds.append(scenario.start.speed_mps)

@@ -30,7 +30,7 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
-from roadproof.training.random_scenarios import Displacement, Disturbance, random_scenario
+from roadproof.training.random_scenarios import Disturbance, random_scenario
 from roadproof.training.shards import Shard
 from roadproof.training.workers import Worker
 
@@ -192,7 +192,7 @@ def _conditions(plan: CollectionPlan, number: int, dt_s: float) -> _Conditions:
         generator,
         name=f"drive-{number:05d}",
         command=COMMANDS[number % len(COMMANDS)],
-        displacement=Displacement() if disturbed else None,
+        displaced=bool(disturbed),
     )
     steps = int(scenario.time_limit_s / dt_s) + 2
     return _Conditions(

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -37,25 +36,12 @@ DRAG_PER_S = 0.025
 STOP_LINE_M = 5.5
 NEVER = -2
 AHEAD_M = np.arange(1.0, 36.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Manner:
-    """How the expert drives.
-
-    Args:
-        cruise_mps: speed on a free, straight road, m/s.
-        side_mps2: lateral acceleration that bends are taken with, m/s².
-        slow_mps2: deceleration before a bend, m/s².
-        sight_s: how far ahead of its rear axle it steers to, in seconds of travel.
-        sight_m: the least distance ahead of its rear axle that it steers to, metres.
-    """
-
-    cruise_mps: float = 7.5
-    side_mps2: float = 2.2
-    slow_mps2: float = 1.8
-    sight_s: float = 0.75
-    sight_m: float = 4.5
+CRUISE_MPS = 7.5
+"""Speed on a free, straight road."""
+SIDE_MPS2, SLOW_MPS2 = 2.2, 1.8
+"""Lateral acceleration that bends are taken with, and deceleration before them."""
+SIGHT_S, SIGHT_M = 0.75, 4.5
+"""How far ahead of its rear axle the expert steers to, in seconds of travel, and at least."""
 
 
 def expert(world: OpenWorld) -> Callable[[Observation], Control]:
@@ -67,10 +53,9 @@ def expert(world: OpenWorld) -> Callable[[Observation], Control]:
 class Expert:
     """Drives one route; make a new one for every drive."""
 
-    def __init__(self, route: Route, manner: Manner | None = None) -> None:
+    def __init__(self, route: Route) -> None:
         self._route = route
-        self._manner = Manner() if manner is None else manner
-        self._limit_mps = speed_limits(route, self._manner)
+        self._limit_mps = speed_limits(route)
         self._at_m: float | None = None
 
     def drive(self, state: VehicleState, cars: Agents = NOBODY, pedestrians: Agents = NOBODY) -> Control:
@@ -95,7 +80,7 @@ class Expert:
         assert self._at_m is not None
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
         rear_x, rear_y = state.x_m - 0.5 * WHEELBASE_M * c, state.y_m - 0.5 * WHEELBASE_M * s
-        sight = max(self._manner.sight_m, self._manner.sight_s * state.speed_mps)
+        sight = max(SIGHT_M, SIGHT_S * state.speed_mps)
         x, y = self._route.ahead(np.array([self._at_m - 0.5 * WHEELBASE_M + sight]))[0].tolist()
         dx, dy = x - rear_x, y - rear_y
         aside, apart = dy * c - dx * s, math.hypot(dx, dy)
@@ -133,14 +118,14 @@ class Expert:
         return math.inf
 
 
-def speed_limits(route: Route, manner: Manner) -> Float[np.ndarray, " n"]:
+def speed_limits(route: Route) -> Float[np.ndarray, " n"]:
     """Speed at each point of a route so that bends are entered slowly enough, m/s."""
     ds = np.diff(route.arclengths_m)
     smooth = np.convolve(np.pad(np.diff(route.headings_rad) / ds, 3, mode="edge"), np.full(7, 1 / 7), mode="valid")
     curvature = np.abs(np.concatenate([smooth, smooth[-1:]]))
-    limit = np.minimum(np.sqrt(manner.side_mps2 / np.maximum(curvature, 1e-6)), manner.cruise_mps)
+    limit = np.minimum(np.sqrt(SIDE_MPS2 / np.maximum(curvature, 1e-6)), CRUISE_MPS)
     # v² may fall by 2·a·ds a point at most: the lower envelope of rising lines, from the end.
-    budget = 2.0 * manner.slow_mps2 * route.arclengths_m
+    budget = 2.0 * SLOW_MPS2 * route.arclengths_m
     return np.sqrt(np.minimum.accumulate((limit**2 + budget)[::-1])[::-1] - budget)
 
 

@@ -7,7 +7,6 @@ Convention:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,26 +23,13 @@ TRIES = 400
 LENGTHS_M = (60.0, 150.0)
 WIDTHS_M = (7.6, 6.8, 6.0, 3.0)
 LONGEST_S = 60.0
+ASIDE_M, ASIDE_LIMIT_M = 0.7, 1.5
+"""Standard deviation and limit of how far off the middle of its lane a displaced car starts."""
+TURN_RAD, TURN_LIMIT_RAD = math.radians(6.0), math.radians(15.0)
+"""The same of its heading relative to the lane."""
+FASTEST_MPS = 8.5
+"""Largest speed of a displaced start; half of them are at rest."""
 _KINDS: dict[Command, Kind] = {Command.LEFT: "left", Command.RIGHT: "right"}
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Displacement:
-    """How far off the middle of its lane, and how turned, a car starts: standard deviations and limits.
-
-    Args:
-        aside_m: standard deviation of the offset from the lane's middle, metres.
-        aside_limit_m: largest offset from the lane's middle, metres.
-        turn_rad: standard deviation of the heading relative to the lane.
-        turn_limit_rad: largest heading relative to the lane.
-        speed_mps: largest speed at the start, m/s; half of all cars start at rest.
-    """
-
-    aside_m: float = 0.7
-    aside_limit_m: float = 1.5
-    turn_rad: float = math.radians(6.0)
-    turn_limit_rad: float = math.radians(15.0)
-    speed_mps: float = 8.5
 
 
 def random_scenario(
@@ -53,7 +39,7 @@ def random_scenario(
     *,
     name: str,
     command: Command = Command.FOLLOW,
-    displacement: Displacement | None = None,
+    displaced: bool = False,
 ) -> Scenario:
     """A random route through a map, 60 to 150 m long, with a canvas at a random place on it.
 
@@ -63,7 +49,7 @@ def random_scenario(
         generator: where the randomness comes from.
         name: the name of the scenario.
         command: the command that one of the route's junctions asks for; `Command.FOLLOW` asks for none.
-        displacement: how the car starts; None starts it at rest in the middle of its lane.
+        displaced: whether the car starts off the middle of its lane, turned and moving, rather than at rest in it.
 
     Raises:
         ScenarioError: the map has no such route.
@@ -74,7 +60,7 @@ def random_scenario(
         lane = driving[int(generator.choice(len(driving), p=lengths / lengths.sum()))]
         at_m, reach_m = generator.uniform(0.0, lane.length_m), generator.uniform(*LENGTHS_M)
         goal = _walk(roads, lane.index, at_m, reach_m, generator)
-        start = _start(lane, at_m, displacement, generator)
+        start = _start(lane, at_m, generator, displaced=displaced)
         if goal is None or math.dist(goal, (start.x_m, start.y_m)) < 20.0:
             continue
         try:
@@ -156,14 +142,13 @@ def _walk(
     return x, y
 
 
-def _start(lane: Lane, at_m: float, displacement: Displacement | None, generator: np.random.Generator) -> VehicleState:
+def _start(lane: Lane, at_m: float, generator: np.random.Generator, *, displaced: bool) -> VehicleState:
     x, y, _, yaw = lane.at(at_m)
     aside = turn = speed = 0.0
-    if displacement is not None:
-        d = displacement
-        aside = float(np.clip(generator.normal(0.0, d.aside_m), -d.aside_limit_m, d.aside_limit_m))
-        turn = float(np.clip(generator.normal(0.0, d.turn_rad), -d.turn_limit_rad, d.turn_limit_rad))
-        speed = float(max(generator.uniform(-d.speed_mps, d.speed_mps), 0.0))
+    if displaced:
+        aside = float(np.clip(generator.normal(0.0, ASIDE_M), -ASIDE_LIMIT_M, ASIDE_LIMIT_M))
+        turn = float(np.clip(generator.normal(0.0, TURN_RAD), -TURN_LIMIT_RAD, TURN_LIMIT_RAD))
+        speed = float(max(generator.uniform(-FASTEST_MPS, FASTEST_MPS), 0.0))
     return VehicleState(
         x - aside * math.sin(yaw), y + aside * math.cos(yaw), 0.0, math.remainder(yaw + turn, 2 * math.pi), speed
     )
