@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from references import approach
-from roadproof.calibration.outline import GREY, SQUARES, PoseDoubt, fit_outline, moved, outline_errors_px
+from roadproof.calibration.outline import GREY, SQUARES, fit_outline, moved, outline_errors_px
 from roadproof.calibration.report import Spread, stated_errors_px
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 
@@ -82,12 +82,12 @@ def test_what_some_frames_show_carries_over_to_frames_that_show_nothing(scene):
     assert np.isnan(outline_errors_px(truth, np.zeros_like(visible), CIL_CAMERA, view)).all()
 
 
-def test_a_pose_without_doubt_is_not_moved(scene):
+def test_a_pose_without_doubt_is_not_moved(scene, monkeypatch):
     truth, visible, view = scene
     prior = moved(truth, np.tile(OFF, (len(truth), 1)), CIL_CAMERA)
-    tiny = (1e-7,) * 3
-    sure = PoseDoubt(common_rad=tiny, common_m=tiny, own_rad=tiny, own_m=tiny)
-    fit = fit_outline(prior, visible, CIL_CAMERA, view, doubt=sure)
+    for doubt in ("COMMON_DOUBT", "OWN_DOUBT"):
+        monkeypatch.setattr(f"roadproof.calibration.outline.{doubt}", (1e-7,) * 6)
+    fit = fit_outline(prior, visible, CIL_CAMERA, view)
     np.testing.assert_allclose(fit.image_from_canvas, prior, rtol=1e-3, atol=1e-2)
 
 

@@ -44,29 +44,10 @@ _REACH_PX = 3
 _GAIN_PX = 5
 _SEEN = 6 / 255
 _DELTA = 1e-5
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PoseDoubt:
-    """How far a pose may be off: standard deviations along the camera's axes (right, down, forward).
-
-    Args:
-        common_rad: rotation about each axis that is common to a drive, radians.
-        common_m: translation along each axis that is common to a drive, metres.
-        own_rad: rotation about each axis of each frame by itself, radians.
-        own_m: translation along each axis of each frame by itself, metres.
-    """
-
-    common_rad: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    common_m: tuple[float, float, float] = (0.1, 0.03, 0.1)
-    own_rad: tuple[float, float, float] = (0.001, 0.0005, 0.0005)
-    own_m: tuple[float, float, float] = (0.002, 0.002, 0.002)
-
-    @property
-    def precisions(self) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6 6"]]:
-        """The inverse covariances of the common and of each frame's own correction."""
-        common, own = (*self.common_rad, *self.common_m), (*self.own_rad, *self.own_m)
-        return np.diag(1 / np.square(common)), np.diag(1 / np.square(own))
+COMMON_DOUBT = (0.01, 0.01, 0.01, 0.1, 0.03, 0.1)
+"""Standard deviations of (ω, τ) that is common to a drive, rad and m along the camera's axes (right, down, forward)."""
+OWN_DOUBT = (0.001, 0.0005, 0.0005, 0.002, 0.002, 0.002)
+"""The same of each frame by itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +68,6 @@ def fit_outline(
     contrast: Float[np.ndarray, "f h w"],
     camera: CameraModel,
     view: CropResize,
-    *,
-    doubt: PoseDoubt | None = None,
 ) -> OutlineFit:
     """Move homographies until canvas and squares lie where they are seen.
 
@@ -97,9 +76,8 @@ def fit_outline(
         contrast: D: light minus dark frames, mean over channels, 1 for white minus black, (F, H, W).
         camera: camera of the frames.
         view: crop and resize that make the controller's input from the camera picture.
-        doubt: standard deviations of the pose; `PoseDoubt()` by default.
     """
-    common, own = (PoseDoubt() if doubt is None else doubt).precisions
+    common, own = (np.diag(1 / np.square(doubt)) for doubt in (COMMON_DOUBT, OWN_DOUBT))
     moves = np.zeros((len(prior), 6))
     for blur, steps in zip(_BLURS_PX, _STEPS, strict=True):
         problem = _Outline(prior, contrast, camera, view, blur, moves)
