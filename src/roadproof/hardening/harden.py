@@ -140,8 +140,8 @@ def harden(
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
-        TrainingError: there are no rounds, streets for training and judging are not disjoint, or the training step gives
-            no finite loss.
+        TrainingError: there are no rounds, streets for training and judging are not disjoint, or the training step
+            gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: the folder holds another hardening, or a stage refuses; the message says why.
     """
