@@ -7,7 +7,6 @@ All figures are surrogate figures: mean steering shift a frame on all composited
 
 import argparse
 import json
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -15,14 +14,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-
-import roadproof
 from roadproof.attacks import GradOpt, SteeringShift, Surrogate
 from roadproof.attacks.gradopt import dropping, gradopt, random_search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.controllers import load_controller
-from roadproof.machine import keep_freed_memory
+from roadproof.io.files import write_json
+from roadproof.machine import keep_freed_memory, made_with
 from roadproof.recordings import load_recordings
 from roadproof.search_space import SearchSpace
 
@@ -87,10 +84,7 @@ def main() -> None:
     result = {
         "benchmark": "attack_strength",
         "kind": "surrogate: mean steering shift a frame on composited frames",
-        "roadproof": roadproof.__version__,
-        "torch": torch.__version__,
-        "threads": torch.get_num_threads(),
-        "processor": platform.processor() or platform.machine(),
+        "made_with": made_with(),
         "figures": args.figures,
         "dtype": args.dtype,
         "rungs": [asdict(rung) for rung in rungs],
@@ -99,7 +93,7 @@ def main() -> None:
         "runs": runs,
         "spread": {m: {name: spread([run[m][name] for run in runs]) for name in names} for m in methods},
     }
-    args.json.write_text(json.dumps(result, indent=1) + "\n")
+    write_json(args.json, result)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from roadproof.drives.own.chessboard import calibrated
 from roadproof.drives.own.plan import Chessboard
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel
-from roadproof.io.files import write_text
+from roadproof.io.files import write_json
 from roadproof.lens import Lens, LensModel
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
@@ -161,7 +161,7 @@ def main() -> None:
                     key = f"{name}, {kind}, {count} pictures"
                     found[key] = drawn(camera, count, how, arguments.seeds)
                     print(key, found[key], flush=True)
-    write_text(arguments.json, json.dumps(found, indent=2))
+    write_json(arguments.json, found)
     print(json.dumps(found, indent=2, ensure_ascii=False))
 
 

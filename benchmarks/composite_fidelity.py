@@ -14,8 +14,6 @@ paint comes from the fit renders; beneath the paint it is not known, and taken t
 
 import argparse
 import csv
-import json
-import platform
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,12 +22,12 @@ import numpy as np
 import torch
 from PIL import Image, ImageFilter
 
-import roadproof
 from roadproof.compositing import composite, view_canvas
 from roadproof.compositing.published import nearest_canvas_pixels
 from roadproof.coverage import Shape
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_INPUT, CropResize
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.patterns import Pattern
 from roadproof.photometry import (
     AffineResponse,
@@ -211,15 +209,9 @@ def main() -> None:
         "records": records,
         "seed": "none: nothing is drawn at random",
         "device": "cpu",
-        "versions": {
-            "roadproof": roadproof.__version__,
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-            "pillow": Image.__version__,
-            "python": platform.python_version(),
-        },
+        "made_with": made_with(),
     }
-    write_atomically(arguments.json, lambda path: path.write_text(json.dumps(result, indent=1), encoding="utf-8"))
+    write_json(arguments.json, result)
 
 
 if __name__ == "__main__":

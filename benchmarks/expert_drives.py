@@ -9,13 +9,13 @@ goal within the time limit without any event; alone on the road, it ends at the 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 import statistics
 import time
 from collections import Counter
 from pathlib import Path
 
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.scenarios import builtin_scenarios
 from roadproof.training.scores import DrivingScore, Trial, score_drives
 
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True, help="file to write the numbers to")
     out: Path = parser.parse_args().json
     scenarios = builtin_scenarios()
-    results: dict[str, object] = {"python": platform.python_version(), "machine": platform.machine()}
+    results: dict[str, object] = {"made_with": made_with()}
     begin = time.perf_counter()
     conditions = [("alone", 0, 0), *((f"traffic, seed {seed}", AGENTS, seed) for seed in TRAFFIC_SEEDS)]
     for name, agents, seed in conditions:
@@ -53,8 +53,7 @@ def main() -> None:
         results[name] = result
         print(f"{name}: {result['clean']} of {result['drives']} clean, events {result['events']}")
     results["wall_s"] = round(time.perf_counter() - begin, 1)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    write_json(out, results)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import random
 import resource
 import statistics
@@ -38,7 +37,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import roadproof
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from bad_inputs import attempt, command_lines, damaged_files
@@ -137,14 +137,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     content: dict[str, Any] = json.loads(given.json.read_text()) if given.json.exists() else {}
-    content |= {"roadproof": roadproof.__version__, "python": platform.python_version()}
+    content["made_with"] = made_with()
     for name in [given.part] if given.part else PARTS:
         part, usual = PARTS[name]
         began = time.perf_counter()
         with tempfile.TemporaryDirectory() as place:
             done = part(given.count or usual, given.seed, Path(place))
         content[name] = done | {"seconds": time.perf_counter() - began}
-        given.json.write_text(json.dumps(content, indent=1) + "\n")
+        write_json(given.json, content)
         print(json.dumps({name: content[name]}, indent=1))
 
 

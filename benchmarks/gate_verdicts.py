@@ -13,13 +13,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,6 +24,8 @@ import torch
 
 import roadproof
 from roadproof.controllers import ConditionalPilotNet, save_controller
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.world import RecordedWorld
 from roadproof.recordings import load_recordings
@@ -110,8 +109,7 @@ def checked(team: Path, name: str, controller: str, seed: int) -> dict[str, Any]
     began = time.perf_counter()
     code = roadproof_command("check", plan.name, "--out", f"out-{name}-{seed}", folder=team)
     found = {"controller": name, "seed": seed, "exit_code": code, "seconds": time.perf_counter() - began}
-    kept.parent.mkdir(exist_ok=True)
-    kept.write_text(json.dumps(found))
+    write_json(kept, found)
     return found
 
 
@@ -138,10 +136,7 @@ def main() -> None:
     wrong = [each for each in checks if each["exit_code"] != each["expected"]]
     median_s = statistics.median(each["seconds"] for each in checks)
     content = {
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-        "roadproof": version("roadproof"),
-        "torch": torch.__version__,
+        "made_with": made_with(),
         "noise": given.noise,
         "goal_s": GOAL_S,
         "wrong": wrong,
@@ -149,7 +144,7 @@ def main() -> None:
         "longest_s": max(each["seconds"] for each in checks),
         "checks": checks,
     }
-    given.json.write_text(json.dumps(content, indent=1) + "\n")
+    write_json(given.json, content)
     print(f"{len(wrong)} of {len(checks)} verdicts wrong; median {median_s:.0f} s a check")
 
 

@@ -20,7 +20,6 @@ pictures, those of an instant at a time as a closed loop must and all of them in
 
 import argparse
 import json
-import platform
 import resource
 import statistics
 import time
@@ -40,7 +39,8 @@ from roadproof.controllers import CIL, pilotnet_controller
 from roadproof.controllers.asking import controls_of
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
-from roadproof.machine import keep_freed_memory
+from roadproof.io.files import write_json
+from roadproof.machine import keep_freed_memory, made_with
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet, Side, load_recordings
 from roadproof.search_space import SearchSpace
@@ -239,15 +239,12 @@ def main() -> None:
         print(json.dumps(paths[-1]), flush=True)
     result = {
         "benchmark": "gradopt_step",
-        "roadproof": roadproof.__version__,
-        "torch": torch.__version__,
-        "threads": torch.get_num_threads(),
-        "processor": platform.processor() or platform.machine(),
+        "made_with": made_with(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "cases": cases,
         "paths": paths,
     }
-    args.json.write_text(json.dumps(result, indent=1) + "\n")
+    write_json(args.json, result)
 
 
 if __name__ == "__main__":

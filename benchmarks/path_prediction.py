@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -35,8 +34,8 @@ from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.calibration import calibrate
 from roadproof.drives import record
-from roadproof.io.files import write_atomically
-from roadproof.machine import keep_freed_memory
+from roadproof.io.files import write_json
+from roadproof.machine import keep_freed_memory, made_with
 from roadproof.patterns import Pattern
 from roadproof.pipeline.budget import QUICK
 from roadproof.recordings import RecordingSet
@@ -139,15 +138,11 @@ def main() -> None:
             print({key: value for key, value in cells[found["cell"]].items() if key != "each"}, flush=True)
             every = [one for each in cells.values() for one in each["each"]]
             content = {
-                "machine": platform.processor() or platform.machine(),
-                "threads": torch.get_num_threads(),
-                "torch": torch.__version__,
-                "roadproof": roadproof.__version__,
+                "made_with": made_with(),
                 "simulator": args.simulator.split(":")[0],
                 "records": [*cells.values(), summary("pooled", every)],
             }
-            text = json.dumps(content, indent=1) + "\n"
-            write_atomically(args.json, lambda part, text=text: part.write_text(text))
+            write_json(args.json, content)
     print(summary("pooled", [one for each in cells.values() for one in each["each"]]))
 
 

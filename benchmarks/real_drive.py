@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from roadproof.drives.own import import_drives
-from roadproof.io.files import write_text
+from roadproof.io.files import write_json
 
 FOCAL_PX, HORIZON_PX, UP_M = 2152.0, 231.0, 1.19
 WHEEL_RAD = math.radians(25.0) * 14.8  # steer 1 turns the front wheels by 25°, the steering wheel 14.8 times that
@@ -111,7 +111,7 @@ def main() -> None:
         "yaw_rate_with_steering": float(np.corrcoef(rate, by_wheel)[0, 1]),
         "yaw_rate_by_steering": [float(each) for each in np.polyfit(by_wheel, rate, 1)],
     }
-    write_text(arguments.json, json.dumps(found, indent=2))
+    write_json(arguments.json, found)
     print(json.dumps(found, indent=2))
 
 

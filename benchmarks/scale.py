@@ -13,12 +13,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,8 @@ from roadproof.attacks import GradOpt, SteeringShift, Surrogate, attack, parse_g
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluate import evaluate
-from roadproof.machine import keep_freed_memory
+from roadproof.io.files import write_json
+from roadproof.machine import keep_freed_memory, made_with
 from roadproof.pipeline.estimate import of_search
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
@@ -145,16 +144,7 @@ def main() -> None:
     def keep(record: Record) -> None:
         records.append(record)
         print(json.dumps(record), flush=True)
-        content = {
-            "benchmark": "scale",
-            "roadproof": version("roadproof"),
-            "torch": torch.__version__,
-            "threads": torch.get_num_threads(),
-            "cores": os.cpu_count(),
-            "machine": platform.machine(),
-            "records": records,
-        }
-        given.json.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_json(given.json, {"benchmark": "scale", "made_with": made_with(), "records": records})
 
     for name in given.controllers:
         controller = roadproof.load_controller(name)

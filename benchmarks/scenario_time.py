@@ -13,18 +13,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 
 GOALS_S = {"pilotnet": 75.0, "cil": 120.0}
 
@@ -73,17 +72,13 @@ def main() -> None:
         if any(each["controller"] == controller and not each["cold"] for each in records)
     }
     content = {
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-        "roadproof": version("roadproof"),
+        "made_with": made_with(),
         "scenario": given.scenario,
         "goals_s": GOALS_S,
         "warm_median_s": warm,
         "records": records,
     }
-    given.json.write_text(json.dumps(content, indent=1) + "\n")
+    write_json(given.json, content)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ at the same time. Start-up is measured in a fresh process, from the import to th
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import platform
@@ -21,6 +20,9 @@ import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
+
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 
 GOALS = {"alone_fps": 300.0, "traffic_fps": 150.0, "start_s": 3.0, "memory_mb": 400.0}
 AGENTS = 20
@@ -77,18 +79,6 @@ def start_seconds(repeats: int) -> float:
     return statistics.median(runs)
 
 
-def processor() -> str:
-    """The processor's name."""
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        if names:
-            return names[0]
-    return platform.processor() or platform.machine()
-
-
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -104,18 +94,13 @@ def main() -> None:
         "start_s": start_seconds(arguments.repeats),
         "goals": GOALS,
         "agents": {"cars": AGENTS, "pedestrians": AGENTS},
-        "processor": processor(),
-        "cores": os.cpu_count(),
         "load_before": load_before,
         "platform": platform.platform(),
-        "versions": {name: version(name) for name in ("panda3d", "numpy", "pillow")}
-        | {"python": platform.python_version()},
+        "made_with": made_with() | {"panda3d": version("panda3d")},
     }
     for name, value in result.items():
         print(f"{name}: {value}")
-    partial = arguments.json.with_suffix(".partial")
-    partial.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    partial.replace(arguments.json)
+    write_json(arguments.json, result)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,6 @@ has it.
 """
 
 import argparse
-import json
-import platform
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,14 +22,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import roadproof
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Observation, Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, replay, rollout
 from roadproof.geometry import CANVAS_SIZE_PX, CropResize
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import (
     AffineResponse,
@@ -181,14 +179,9 @@ def main() -> None:
         "figures": arguments.figures,
         "seed": arguments.seed,
         "records": records,
-        "versions": {
-            "roadproof": roadproof.__version__,
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "made_with": made_with(),
     }
-    write_atomically(arguments.json, lambda path: path.write_text(json.dumps(result, indent=1), encoding="utf-8"))
+    write_json(arguments.json, result)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,6 @@ Replays are kept in FOLDER; an interrupted study goes on there, and writes what 
 """
 
 import argparse
-import json
-import platform
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +24,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import roadproof
 from roadproof.calibration import METHODS, Calibrated, Method, calibrate
 from roadproof.calibration.outline import moved
 from roadproof.calibration.replays import Replays
@@ -37,7 +34,8 @@ from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives, Trajectories, Window, record
 from roadproof.geometry import homography_from_pose
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.patterns import Pattern, raster
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recordings import Recording, RecordingSet
@@ -226,16 +224,15 @@ def main() -> None:
 
 def write(arguments: argparse.Namespace, records: list[dict[str, object]]) -> None:
     """All that is known so far."""
-    versions = {"roadproof": roadproof.__version__, "torch": torch.__version__, "numpy": np.__version__}
     result = {
         "study": "calibration",
         "version": 1,
         "settings": {k: str(v) for k, v in vars(arguments).items() if k not in ("json", "keep", "controller")},
         "controller": arguments.controller and Path(str(arguments.controller)).name,
         "records": records,
-        "versions": versions | {"python": platform.python_version()},
+        "made_with": made_with(),
     }
-    write_atomically(arguments.json, lambda path: path.write_text(json.dumps(result, indent=1), encoding="utf-8"))
+    write_json(arguments.json, result)
 
 
 if __name__ == "__main__":

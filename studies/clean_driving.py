@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import time
 from collections import Counter
@@ -26,7 +25,8 @@ from rich.progress import Progress
 from roadproof.controllers import shipped_names
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.datatypes import Command, Weather
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario, builtin_scenarios
 from roadproof.training.random_scenarios import random_scenario
@@ -121,13 +121,12 @@ def study(controllers: Sequence[str], names: Sequence[str], processes: int, out:
 
 def keep(content: dict[str, Any], out: Path) -> None:
     """Summarise and write."""
-    content |= {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
+    content["made_with"] = made_with()
     content["summary"] = {
         controller: {name: summary(list(rows.values())) for name, rows in every.items() if rows}
         for controller, every in content["drives"].items()
     }
-    text = json.dumps(content, indent=1) + "\n"
-    write_atomically(out, lambda part: part.write_text(text, encoding="utf-8"))
+    write_json(out, content)
 
 
 def main() -> None:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
@@ -34,8 +33,8 @@ from roadproof.calibration import Calibrated, calibrate
 from roadproof.drives import record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.intervals import mean_95
-from roadproof.io.files import write_atomically
-from roadproof.machine import keep_freed_memory
+from roadproof.io.files import write_json
+from roadproof.machine import keep_freed_memory, made_with
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.selection import select_by_driving
 from roadproof.processes import processes_beside
@@ -165,21 +164,14 @@ def summary(rows: Sequence[Row]) -> list[Row]:
 
 def write(path: Path, rows: Sequence[Row]) -> None:
     """All that is known so far."""
-    versions = {"roadproof": roadproof.__version__, "torch": torch.__version__, "python": platform.python_version()}
     content = {
         "study": "first choice",
         "version": 1,
         "summary": summary(rows),
         "rows": list(rows),
-        "versions": versions,
+        "made_with": made_with(),
     }
     write_json(path, content)
-
-
-def write_json(path: Path, content: Row) -> None:
-    """Whole or not at all."""
-    text = json.dumps(content, indent=1) + "\n"
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def main() -> None:

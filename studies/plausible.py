@@ -13,17 +13,13 @@ Everything is kept in FOLDER; an interrupted study goes on there, and writes wha
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-import roadproof
 from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, site_of
 from roadproof.attacks.cheapest import in_words
 from roadproof.attacks.objective import varied
@@ -31,7 +27,8 @@ from roadproof.compositing import Variation
 from roadproof.controllers import Controller, load_controller
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluate import evaluate
-from roadproof.io.files import write_atomically
+from roadproof.io.files import write_json
+from roadproof.machine import made_with
 from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
 from roadproof.patterns import Pattern
 from roadproof.pipeline.budget import QUICK
@@ -210,9 +207,7 @@ def main() -> None:
                 )
                 for row in cell.rows(asked.limits):
                     rows.append(row)
-                    made = {"roadproof": roadproof.__version__, "torch": torch.__version__, "on": platform.machine()}
-                    text = json.dumps({"made_with": made, "rows": rows}, indent=1) + "\n"
-                    write_atomically(asked.json, lambda part, text=text: part.write_text(text, encoding="utf-8"))
+                    write_json(asked.json, {"made_with": made_with(), "rows": rows})
                     print(f"{spec}, {name}, {row['limit']}: {row['deviation_m']:.2f} m", flush=True)
     print(table(rows))
 

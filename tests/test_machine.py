@@ -4,8 +4,11 @@ import os
 import platform
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
+
+from roadproof.machine import made_with
 
 ASK_AGAIN = """
 import resource, torch
@@ -54,3 +57,10 @@ def test_threads_of_a_command_sleep_soon_while_they_wait_unless_the_user_says_ot
         [sys.executable, "-c", ASK_CONTROLLER], env=environment, capture_output=True, text=True, check=True
     )
     assert f"GOMP_SPINCOUNT = '{spins}'" in told.stderr
+
+
+def test_what_figures_are_made_with_is_what_is_installed() -> None:
+    told = made_with()
+    for name in ("numpy", "pillow", "torch"):
+        assert told[name] == version(name)
+    assert told["processor"]

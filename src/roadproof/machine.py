@@ -1,9 +1,13 @@
-"""How a whole process uses the machine: choices for programs, so the command line makes them, not the library."""
+"""How a whole process uses the machine, which programs choose, not the library; and what the machine is."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import platform
+import re
+from contextlib import suppress
+from pathlib import Path
 
 # From glibc's malloc.h.
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
@@ -39,3 +43,31 @@ def sleep_while_waiting() -> None:
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "5000")
+
+
+def made_with() -> dict[str, object]:
+    """What figures are made with, to stand beside them: the processor, its cores, torch's threads, versions."""
+    import numpy as np
+    import PIL
+    import torch
+
+    import roadproof
+
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "roadproof": roadproof.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "pillow": PIL.__version__,
+        "torch": torch.__version__,
+    }
+
+
+def _processor() -> str:
+    """The processor's name; its kind where the system does not say."""
+    with suppress(OSError):
+        if named := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return named[1]
+    return platform.processor() or platform.machine()
