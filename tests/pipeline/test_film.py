@@ -13,7 +13,7 @@ av = pytest.importorskip("av", reason="films need the extra roadproof[video]")
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
-from roadproof.pipeline.film import EVENT_SHOWN_S, film_trial, last_event
+from roadproof.pipeline.film import EVENT_SHOWN_S, film_drives, last_event
 
 PATTERN = magenta(380.0)
 
@@ -29,8 +29,9 @@ def test_a_car_that_stands_until_its_time_is_up_is_filmed_for_a_moment_only(town
     done = evaluate(
         town, stops_for_good, scenario, PATTERN, folder=tmp_path, weathers=(Weather.CLEAR_NOON,), starts=0, runs=0
     )
-    (drive,) = load_episodes(tmp_path, [done.shown().painted])
-    assert film_trial(town, done, np.zeros((400, 400, 4), np.uint8), tmp_path)
+    files = done.shown().clean, done.shown().painted
+    _, drive = load_episodes(tmp_path, files)
+    assert film_drives(town, scenario, files, np.zeros((400, 400, 4), np.uint8), tmp_path)
     with av.open(str(tmp_path / "film.mp4")) as film:
         pictures = sum(1 for _ in film.decode(video=0))
         assert film.streams.video[0].average_rate == 10

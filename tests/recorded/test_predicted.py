@@ -18,7 +18,7 @@ from roadproof.driving.rollout import rollout
 from roadproof.driving.speed import speed_difference
 from roadproof.errors import RoadproofError
 from roadproof.patterns import Pattern, raster
-from roadproof.pipeline.film import film_trial
+from roadproof.pipeline.film import film_drives
 from roadproof.pipeline.selection import Selection, select_by_driving
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.recorded.world import RecordedWorld
@@ -50,7 +50,8 @@ def predicted(recordings, tmp_path_factory):
             starts=0,
             runs=0,
         )
-        film_trial(world, done, raster(BAR), run / "evaluation")
+        shown = done.shown()
+        film_drives(world, world.scenario, (shown.clean, shown.painted), raster(BAR), run / "evaluation")
     write_report(run)
     return run, done
 

@@ -80,7 +80,7 @@ def evaluate(
     from roadproof.patterns import read_paint
     from roadproof.pipeline.estimate import of_evaluation
     from roadproof.pipeline.fidelity import measure_fidelity
-    from roadproof.pipeline.film import film_trial
+    from roadproof.pipeline.film import film_drives
     from roadproof.recorded.simulator import check_canvas
     from roadproof.recordings import load_recordings
 
@@ -123,7 +123,8 @@ def evaluate(
                 on_drive=lambda done, total: show(f"Driving {driven.name}", done, total, "drives"),
             )
         if film:
-            film_trial(world, evaluation, paint, out)
+            shown = evaluation.shown()
+            film_drives(world, shown.start.of(driven), (shown.clean, shown.painted), paint, out)
         fidelity = None
         if recorded is not None and figures is not None and isinstance(who, Controller):
             fidelity = measure_fidelity(world, who, driven, figures, recorded, out, weather=skies[0], device=device)

@@ -27,10 +27,8 @@ from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
-from roadproof.driving.drive_store import Episodes, load_episodes
-from roadproof.driving.evaluation import ATTACK, Evaluation
+from roadproof.driving.drive_store import Episodes
 from roadproof.driving.starts import NOMINAL
-from roadproof.driving.trial import judge as judge_pair
 from roadproof.errors import CheckError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
@@ -42,7 +40,7 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.film import FILM, STRIP, film_trial
+from roadproof.pipeline.film import FILM, STRIP, film_drives
 from roadproof.pipeline.stress_test import OnProgress, stress_test
 from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
@@ -228,30 +226,9 @@ class _Run:
         place = next(p for p in places if p.scenario.name == case.scenario and case.weather in p.weathers)
         drives = self.folder / "drives" / case.scenario
         (drives / FILM).unlink(missing_ok=True)
-        clean, driven = load_episodes(drives, (worst.clean, worst.painted))
+        paint = read_paint(Path(worst.paint))
         with place.factory() as world:
-            scenario = place.begun_in(world)
-            trial = judge_pair(
-                clean,
-                driven,
-                scenario.canvas,
-                pattern=ATTACK,
-                clean_file=worst.clean,
-                painted_file=worst.painted,
-                start=worst.start,
-            )
-            shown = Evaluation(
-                scenario=scenario,
-                controller=self.plan.controller,
-                weathers=(case.weather,),
-                runs=0,
-                cars=0,
-                pedestrians=0,
-                seed=worst.seed,
-                trials=(trial,),
-                simulator_calls=0,
-                seconds=0.0,
-            )
-            film_trial(world, shown, read_paint(Path(worst.paint)), drives)
+            start = worst.start.of(place.begun_in(world))
+            film_drives(world, start, (worst.clean, worst.painted), paint, drives)
         write_worst(drives / STRIP, self.folder / WORST)
         return case

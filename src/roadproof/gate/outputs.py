@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from roadproof.errors import EpisodeError
 from roadproof.gate.result import Case, CheckResult
 from roadproof.gate.verdict import Status
-from roadproof.io.arrays import read_archive
 from roadproof.io.files import write_atomically, write_text
+from roadproof.pipeline.film import Strip
 from roadproof.recordings import evenly
 from roadproof.report.formatting import MISSING, in_words
 
@@ -126,16 +125,16 @@ def write_worst(strip: Path, path: Path) -> None:
     """Write the picture of a passage: above without paint, below with it.
 
     Args:
-        strip: the file of pictures that `pipeline.film.film_trial` left.
+        strip: the file of pictures that `pipeline.film.film_drives` left.
         path: the JPEG file to write.
 
     Raises:
         EpisodeError: the file of pictures is missing or damaged.
         OutputError: the picture cannot be written.
     """
-    found = read_archive(strip, ("clean", "painted"), EpisodeError, "check again")
-    shown = evenly(len(found["painted"]), WORST_COLUMNS)
-    rows = [np.concatenate(list(found[name][shown]), 1) for name in ("clean", "painted")]
+    found = Strip.load(strip)
+    shown = evenly(len(found.painted), WORST_COLUMNS)
+    rows = [np.concatenate(list(pictures[shown]), 1) for pictures in (found.clean, found.painted)]
     whole = np.concatenate(rows)
     # Around what was recorded, pictures of the recorded world are black.
     picture = Image.fromarray(whole[whole.max((1, 2)) > BLACK])

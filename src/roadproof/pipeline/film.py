@@ -18,10 +18,10 @@ from roadproof.datatypes import Control, Observation
 from roadproof.driving.deviation import lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.rollout import drive_again
-from roadproof.io.arrays import write_archive
+from roadproof.errors import EpisodeError
 from roadproof.io.files import write_atomically
+from roadproof.io.records import RecordFile, Saved
 from roadproof.io.video import can_film, film_file
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -47,7 +47,7 @@ INK, PAPER, FAINT, CLEAN, PAINTED = (30, 33, 38), (250, 249, 246), (110, 114, 12
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Strip:
+class Strip(Saved):
     """Pictures of one passage over the canvas, at the same instants of both drives.
 
     Args:
@@ -55,6 +55,9 @@ class Strip:
         lateral_m: distance of the painted drive beside the clean path at each picture, metres, left positive, (n,).
         clean: camera pictures of the drive over the bare road, (n, h, w, 3).
         painted: camera pictures of the drive over the paint, (n, h, w, 3).
+
+    Raises:
+        EpisodeError: there are not as many of all.
     """
 
     time_s: Float[np.ndarray, " n"]
@@ -62,13 +65,12 @@ class Strip:
     clean: UInt8[np.ndarray, "n h w 3"]
     painted: UInt8[np.ndarray, "n h w 3"]
 
-    def save(self, path: Path) -> None:
-        """Write the strip as one NumPy archive.
+    def __post_init__(self) -> None:
+        if len({len(self.time_s), len(self.lateral_m), len(self.clean), len(self.painted)}) > 1:
+            raise EpisodeError("the strip has not one picture of each drive at each time")
 
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        write_archive(path, {name: getattr(self, name) for name in self.__slots__})
+
+Strip.FILE = RecordFile(kind=Strip, header=None, error=EpisodeError, remedy="evaluate again")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,16 +97,19 @@ class _Side:
         return step if step + self.each < self.shown else self.shown - 1
 
 
-def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage, folder: Path) -> bool:
-    """Drive the shown trial's two drives again, with the camera's full pictures, and keep film, poster and strip.
+def film_drives(
+    simulator: Simulator, start: Scenario, files: tuple[str, str], paint: PatternImage, folder: Path
+) -> bool:
+    """Drive two judged drives again, with the camera's full pictures, and keep film, poster and strip.
 
     The drives are replayed from their controls, so they are the judged ones.
 
     Args:
-        simulator: an open simulator of the kind that the evaluation used.
-        evaluation: evaluation whose shown trial is filmed.
+        simulator: an open simulator of the kind that drove them.
+        start: their scenario, with the start that they had.
+        files: the names of the files of the drive without paint and of the one with it.
         paint: picture of the canvas as it was painted.
-        folder: the folder of the evaluation, which gets film.mp4, film.jpg and strip.npz.
+        folder: the folder of those files, which gets film.mp4, film.jpg and strip.npz.
 
     Returns:
         Whether there is a film; without PyAV (extra `video`) there are poster and strip alone.
@@ -112,12 +117,10 @@ def film_trial(simulator: Simulator, evaluation: Evaluation, paint: PatternImage
     Raises:
         OutputError: the folder cannot be written.
     """
-    trial = evaluation.shown()
-    start = trial.start.of(evaluation.scenario)
-    clean, painted = load_episodes(folder, (trial.clean, trial.painted))
+    clean, painted = load_episodes(folder, files)
     predicted = ", predicted" if painted.paint.predicted else ""
     last = min(len(clean), len(painted)) - 1
-    seen = passage(path_of(clean), evaluation.scenario.canvas, horizon_m=STRIP_HORIZON_M)
+    seen = passage(path_of(clean), start.canvas, horizon_m=STRIP_HORIZON_M)
     first, end = min(seen.start, last), min(seen.stop - 1, last)
     steps: list[int] = sorted({round(first + (end - first) * k / (MOMENTS - 1)) for k in range(MOMENTS)})
     sides = (

@@ -24,7 +24,7 @@ from roadproof.io.identity import ANSWERS, digest, require_same
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
-from roadproof.pipeline.film import film_trial
+from roadproof.pipeline.film import film_drives
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
@@ -259,8 +259,9 @@ class Stages:
         self, evaluation: Evaluation, pattern: Pattern, drives: Drives, recordings: RecordingSet
     ) -> Fidelity | None:
         """Film two drives and compare composites with renders, for the report."""
-        folder = self.folder / "evaluation"
-        film_trial(self.simulator, evaluation, raster(pattern), folder)
+        folder, shown = self.folder / "evaluation", evaluation.shown()
+        start = shown.start.of(evaluation.scenario)
+        film_drives(self.simulator, start, (shown.clean, shown.painted), raster(pattern), folder)
         try:
             return measure_fidelity(
                 self.simulator,

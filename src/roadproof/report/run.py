@@ -32,8 +32,7 @@ from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.trial import Trial
-from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.io.arrays import read_archive
+from roadproof.errors import RoadproofError
 from roadproof.io.commands import read_commands
 from roadproof.io.files import check_closed
 from roadproof.patterns import Pattern, load_pattern
@@ -227,7 +226,7 @@ def _judged(folder: Path) -> Judged:
         fidelity=Fidelity.load(fidelity) if fidelity.exists() else None,
         film=_bytes(folder / FILM),
         poster=_bytes(folder / POSTER),
-        strip=_strip(folder / STRIP),
+        strip=Strip.load(path) if (path := folder / STRIP).exists() else None,
     )
 
 
@@ -238,9 +237,3 @@ def _driven(folder: Path, trial: Trial) -> tuple[Weather, Episode, Episode]:
 
 def _bytes(path: Path) -> bytes | None:
     return path.read_bytes() if path.exists() else None
-
-
-def _strip(path: Path) -> Strip | None:
-    if not path.exists():
-        return None
-    return Strip(**read_archive(path, Strip.__slots__, EpisodeError, "evaluate again"))
