@@ -82,7 +82,10 @@ MISTAKES = {
     "seed twice": (("seeds = [0, 1]", "seeds = [1, 1]"), "seeds has 1 twice"),
     "no seed": (("seeds = [0, 1]", "seeds = []"), "seeds is empty"),
     "budget": (("version = 1", 'version = 1\nbudget = "huge"'), "budget is 'huge', expected one of smoke, full"),
-    "simulator": ((LIMITS, LIMITS + '\n[full]\nsimulator = "moon"'), "simulator is 'moon', expected town or carla://"),
+    "simulator": (
+        (LIMITS, LIMITS + '\n[full]\nsimulator = "moon"'),
+        "simulator 'moon' is unknown, expected town or carla://",
+    ),
     "scenario": (('scenarios = ["test-road"]', 'scenarios = ["test-raod"]'), "did you mean 'test-road'"),
     "outside": (('scenario_file = "', 'scenario_file = "../'), "leaves the plan's folder"),
     "patterns": (('patterns = "patterns"', 'patterns = "nowhere"'), "patterns 'nowhere' is no folder"),

@@ -148,7 +148,7 @@ def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, mon
         ("version = 2", "version = 1", "version is 1, expected 2; version 1 had other keys"),
         ("version = 2", "version = 2.0", "version is 2.0, expected 2"),
         ("roadproof-study", "other", "expected format"),
-        ('controller = "cil"', 'controller = "cil"\nsimulator = "twon"', "simulator is 'twon'"),
+        ('controller = "cil"', 'controller = "cil"\nsimulator = "twon"', "simulator 'twon' is unknown"),
         ("seeds =", "seed =", "did you mean 'seeds'"),
         ("figures = [", "figures = [0, ", "figures has 0"),
         ('"straight-03"', '"straigt-03"', "did you mean 'straight-03'"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, cast
 import typer
 
 from roadproof.errors import RoadproofError
-from roadproof.io.tables import first_twice
+from roadproof.io.tables import each_once
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_PROCESSES, MAX_SEED
 
 if TYPE_CHECKING:
@@ -257,8 +257,7 @@ def weathers_of(names: str, option: str) -> tuple[Weather, ...]:
         RoadproofError: a name is no weather's, where the message names the nearest, or is there twice.
     """
     found = tuple(weather_of(name.strip(), option) for name in names.split(","))
-    if (twice := first_twice(found)) is not None:
-        raise RoadproofError(f"--{option} has {twice} twice, expected each once")
+    each_once(found, f"--{option}", RoadproofError)
     return found
 
 

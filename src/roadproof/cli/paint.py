@@ -103,12 +103,9 @@ def _paint(
         # Torch takes seconds to import; commands without limits read their other options first.
         return Paint(None, None)
     from roadproof.compositing import Variation
-    from roadproof.errors import PatternError
-    from roadproof.io.files import read_toml
     from roadproof.paint import PaintLimits
-    from roadproof.study.reading import paint_of
 
-    limits, variation = (None, None) if paint is None else paint_of(read_toml(paint, PatternError), str(paint))
+    limits, variation = (None, None) if paint is None else _read(paint)
     said: dict[str, Any] = {
         "max_area_m2": max_area,
         "colours": None if colours is None else tuple(each.strip() for each in colours.split(",")),
@@ -120,3 +117,22 @@ def _paint(
     if said:
         limits = replace(limits or PaintLimits(), **said)
     return Paint(limits, variation or (Variation() if robust else None))
+
+
+def _read(path: Path) -> tuple[PaintLimits | None, Variation | None]:
+    """Limits on paint and a variation from the tables [paint] and [variation], each None where it is not there."""
+    from roadproof.compositing import Variation
+    from roadproof.errors import PatternError, StudyError
+    from roadproof.io.files import read_toml
+    from roadproof.io.tables import build
+    from roadproof.paint import PaintLimits
+
+    content = read_toml(path, PatternError)
+    for key, table in content.items():
+        if key not in ("paint", "variation") or not isinstance(table, dict):
+            raise StudyError(f"{path}: {key!r:.60} is no table of it, expected [paint] and [variation]")
+    limits, variation = content.get("paint"), content.get("variation")
+    return (
+        None if limits is None else build(PaintLimits, limits, "paint", StudyError),
+        None if variation is None else build(Variation, variation, "variation", StudyError),
+    )

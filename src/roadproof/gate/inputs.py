@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from roadproof.datatypes import Weather
 from roadproof.drives import load_drives
 from roadproof.errors import CheckError
 from roadproof.io.files import check_name
-from roadproof.io.tables import first_twice
+from roadproof.io.tables import each_once
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.scenarios import Scenario, find_scenario
 
@@ -31,18 +30,6 @@ class Stored:
     name: str
     path: Path
     pattern: Pattern
-
-
-def each_once(values: tuple[Any, ...], what: str) -> None:
-    """See that a list is not empty, and that nothing stands in it twice.
-
-    Raises:
-        CheckError: the list is empty, or something stands in it twice.
-    """
-    if not values:
-        raise CheckError(f"{what} is empty, expected at least one")
-    if (twice := first_twice(values)) is not None:
-        raise CheckError(f"{what} has {twice} twice, expected each once")
 
 
 def stored_patterns(
@@ -74,7 +61,7 @@ def stored_patterns(
     if not any(found.values()):
         raise CheckError(f"patterns {listed!r} holds none for these scenarios; put pattern files (*.json) there")
     for name, patterns in found.items():
-        each_once(tuple(each.name for each in patterns), f"patterns of {name}")
+        each_once([each.name for each in patterns], f"patterns of {name}", CheckError)
     return found
 
 

@@ -77,5 +77,5 @@ def command_of(plan: CheckPlan, place: Place, weather: Weather, pattern: str, se
     if plan.budget == "full":
         words += ["--scenario", place.scenario.name, "--weathers", weather, "--runs", "0"]
         words += [] if plan.scenario_file is None else ["--scenarios", str(plan.scenario_file)]
-    words += ["--starts", str(plan.starts.count), "--start-range", *map(str, astuple(plan.start_range))]
+    words += ["--starts", str(plan.starts.count), "--start-range", *map(str, astuple(plan.starts.range))]
     return shlex.join([*words, "--seed", str(seed), "--out", str(out)])

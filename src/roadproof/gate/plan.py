@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,18 +9,17 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
-from roadproof.driving.starts import StartRange
 from roadproof.errors import CheckError, RoadproofError
-from roadproof.gate.inputs import Stored, each_once, recordings_of, stored_patterns
+from roadproof.gate.inputs import Stored, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
 from roadproof.io.files import AnyPath, as_path, read_toml
-from roadproof.io.tables import build
+from roadproof.io.tables import build, check_range, each_once
 from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
-from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, load_scenarios
-from roadproof.simulators.loading import SPECS, is_server
+from roadproof.scenarios import BUILTIN_FILE, Scenario, load_scenarios
+from roadproof.simulators.loading import check_spec
 from roadproof.study.plan import StartPlan
-from roadproof.study.reading import paint_of, refuse_untrusted
+from roadproof.study.reading import beside, chosen_scenarios, refuse_untrusted, take_head
 
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
@@ -78,13 +76,6 @@ class CheckPlan:
     reference: Path | None
 
     @property
-    def start_range(self) -> StartRange:
-        """The range that starts are drawn from."""
-        return StartRange(
-            right_m=self.starts.right_m, turned_rad=self.starts.turned_rad, faster_mps=self.starts.faster_mps
-        )
-
-    @property
     def keys(self) -> tuple[Key, ...]:
         """The key of every case, scenario by scenario."""
         found: list[Key] = []
@@ -118,7 +109,7 @@ class _Stated:
     scenarios: tuple[str, ...]
     limits: dict[str, dict[str, float]]
     scenario_file: str | None = None
-    budget: str = "smoke"
+    budget: BudgetName = "smoke"
     patterns: str | None = None
     random: int = 5
     figures: int = 5
@@ -146,11 +137,7 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
     path = as_path(path)
     content = read_toml(path, CheckError)
     try:
-        if content.pop("format", None) != FORMAT:
-            raise CheckError(f'expected format = "{FORMAT}"')
-        version = content.pop("version", None)
-        if type(version) is not int or version != FORMAT_VERSION:
-            raise CheckError(f"version is {version!r:.40}, expected {FORMAT_VERSION}")
+        take_head(content, FORMAT, FORMAT_VERSION, CheckError)
         plan = _plan(build(_Stated, content, "the check", CheckError), path.parent, budget)
         if not trust:
             refuse_untrusted(plan.controller, plan.simulator if plan.budget == "full" else None)
@@ -160,31 +147,27 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
 
 
 def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
-    _one_of(stated.budget, "budget", BUDGETS)
-    _within(stated.random, "random", 0, 1000)
-    _within(stated.figures, "figures", 1, MAX_FIGURES)
-    each_once(stated.scenarios, "scenarios")
-    each_once(stated.seeds, "seeds")
+    check_range(stated.random, "random", 0, 1000, CheckError)
+    check_range(stated.figures, "figures", 1, MAX_FIGURES, CheckError)
+    each_once(stated.scenarios, "scenarios", CheckError)
+    each_once(stated.seeds, "seeds", CheckError)
     for seed in stated.seeds:
-        _within(seed, "seeds", 0, MAX_SEED)
+        check_range(seed, "seeds", 0, MAX_SEED, CheckError)
     if budget is not None:
         _one_of(budget, "budget", BUDGETS)
     chosen: BudgetName = "full" if (budget or stated.budget) == "full" else "smoke"
     listed = stated.scenario_file
-    own = None if listed is None else _beside(folder, listed, "scenario_file")
+    own = None if listed is None else beside(folder, listed, "scenario_file", "plan", CheckError)
     known = load_scenarios(own or BUILTIN_FILE)
-    scenarios = _chosen(stated.scenarios, known)
+    scenarios = chosen_scenarios(stated.scenarios, known)
     smoke = None if stated.smoke is None else build(_Smoke, stated.smoke, "smoke", CheckError)
     full = build(_Full, stated.full, "full", CheckError)
-    if full.simulator != "town" and not is_server(full.simulator):
-        raise CheckError(f"simulator is {full.simulator!r}, expected {SPECS}")
+    check_spec(full.simulator)
     if chosen == "smoke" and smoke is None:
         raise CheckError('a smoke check drives in recordings; add [smoke] with recordings = ["FOLDER"]')
     weathers = full.weathers if chosen == "full" or smoke is None else smoke.weathers
-    each_once(weathers, "weathers")
+    each_once(weathers, "weathers", CheckError)
     change, reference = _change(stated.change, folder)
-    tables = {"paint": stated.paint, "variation": stated.variation}
-    paint, variation = paint_of({name: table for name, table in tables.items() if table is not None}, "the check")
     plan = CheckPlan(
         controller=stated.controller,
         scenarios=scenarios,
@@ -195,8 +178,8 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         starts=build(StartPlan, stated.starts, "starts", CheckError),
         random=stated.random,
         figures=stated.figures,
-        paint=paint,
-        variation=variation,
+        paint=None if stated.paint is None else build(PaintLimits, stated.paint, "paint", CheckError),
+        variation=None if stated.variation is None else build(Variation, stated.variation, "variation", CheckError),
         stored=stored_patterns(stated.patterns, folder, scenarios, known),
         recordings=recordings_of(folder, smoke.recordings, scenarios, weathers, stated.controller)
         if smoke is not None and chosen == "smoke"
@@ -217,7 +200,7 @@ def _limits(stated: dict[str, dict[str, float]]) -> dict[Kind, dict[str, float]]
         _one_of(kind, "a key of limits", tuple(Kind))
         for name, limit in limits.items():
             _one_of(name, f"a key of limits.{kind}", MEASURES[Kind(kind)])
-            _within(limit, f"limits.{kind}.{name}", *RANGES[name])
+            check_range(limit, f"limits.{kind}.{name}", *RANGES[name], CheckError)
             found[Kind(kind)][name] = limit
     return found
 
@@ -235,9 +218,9 @@ def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict
         if isinstance(table, str):
             raise CheckError(f"change.{name} is {table!r}, expected {{ absolute = ..., relative = ... }}")
         found[name] = build(Change, table, f"change.{name}", CheckError)
-        _within(found[name].absolute, f"change.{name}.absolute", 0.0, 100.0)
-        _within(found[name].relative, f"change.{name}.relative", 0.0, 100.0)
-    return found, _beside(folder, reference, "reference")
+        for each in ("absolute", "relative"):
+            check_range(getattr(found[name], each), f"change.{name}.{each}", 0.0, 100.0, CheckError)
+    return found, beside(folder, reference, "reference", "plan", CheckError)
 
 
 def _check_drives(plan: CheckPlan) -> None:
@@ -271,27 +254,6 @@ def _check_drives(plan: CheckPlan) -> None:
                 )
 
 
-def _beside(folder: Path, listed: str, what: str) -> Path:
-    path = folder / listed
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise CheckError(f"{what} {listed!r} leaves the plan's folder; put it beside the plan")
-    return path
-
-
-def _chosen(names: tuple[str, ...], known: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
-    """Scenarios by name or pattern of names, each once, in the order first named."""
-    chosen: dict[str, Scenario] = {}
-    for name in names:
-        found = [each for each in known if fnmatch.fnmatchcase(each.name, name)] or [find_scenario(name, known)]
-        chosen |= {each.name: each for each in found}
-    return tuple(chosen.values())
-
-
 def _one_of(value: str, name: str, choices: Iterable[str]) -> None:
     if value not in choices:
         raise CheckError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
-
-
-def _within(value: int | float, name: str, least: int | float, most: int | float) -> None:
-    if not least <= value <= most:
-        raise CheckError(f"{name} is {value}, expected {least} to {most}")

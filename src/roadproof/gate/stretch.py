@@ -193,7 +193,7 @@ class Stretch:
         return {
             (seed, k): Conditions(paint=CLEAN, weather=weather, seed=seed, start=start)
             for seed in plan.seeds
-            for k, start in enumerate(plan.start_range.draw(plan.starts.count, seed))
+            for k, start in enumerate(plan.starts.range.draw(plan.starts.count, seed))
         }
 
     def _aside_m(self, episode: Episode) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
@@ -118,3 +118,27 @@ def first_twice(values: Iterable[T]) -> T | None:
             return value
         seen.add(value)
     return None
+
+
+def each_once(values: Sequence[object], what: str, error: type[RoadproofError]) -> None:
+    """See that a list is not empty, and that nothing stands in it twice.
+
+    Raises:
+        error: the list is empty, or something stands in it twice.
+    """
+    if not values:
+        raise error(f"{what} is empty, expected at least one")
+    if (twice := first_twice(values)) is not None:
+        raise error(f"{what} has {twice} twice, expected each once")
+
+
+def check_range(
+    value: int | float, what: str, least: int | float, most: int | float, error: type[RoadproofError]
+) -> None:
+    """See that a number is in its range.
+
+    Raises:
+        error: it is not.
+    """
+    if not least <= value <= most:
+        raise error(f"{what} is {value}, expected {least} to {most}")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import fnmatch
 import hashlib
-import json
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 from pathlib import Path
@@ -17,13 +14,14 @@ from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.io.files import AnyPath, as_path, read_toml
-from roadproof.io.tables import build, first_twice
+from roadproof.io.identity import digest, stated
+from roadproof.io.tables import build, check_range, each_once
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
-from roadproof.scenarios import BUILTIN_FILE, Scenario, find_scenario, identity, load_scenarios
-from roadproof.simulators.loading import SPECS, is_server
+from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
+from roadproof.simulators.loading import check_spec
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
-from roadproof.study.reading import paint_of, refuse_untrusted
+from roadproof.study.reading import beside, chosen_scenarios, refuse_untrusted, take_head
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -31,11 +29,6 @@ JOB_VERSION = 3
 """Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
 
 BLACK = "1-b"
-
-
-def _check_range(name: str, value: int, least: int, most: int) -> None:
-    if not least <= value <= most:
-        raise StudyError(f"{name} is {value}, expected {least} to {most}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,9 +51,9 @@ class TrafficPlan:
     weathers: Literal["all", "first"] = "all"
 
     def __post_init__(self) -> None:
-        _check_range("cars", self.cars, 0, MAX_CROWD)
-        _check_range("pedestrians", self.pedestrians, 0, MAX_CROWD)
-        _check_range("runs", self.runs, 1, 10_000)
+        check_range(self.cars, "cars", 0, MAX_CROWD, StudyError)
+        check_range(self.pedestrians, "pedestrians", 0, MAX_CROWD, StudyError)
+        check_range(self.runs, "runs", 1, 10_000, StudyError)
         if not self.cars + self.pedestrians:
             raise StudyError("cars and pedestrians are 0; leave [traffic] out to drive alone")
 
@@ -81,7 +74,7 @@ class StartPlan(StartRange):
 
     def __post_init__(self) -> None:
         StartRange.__post_init__(self)
-        _check_range("count", self.count, 1, 1000)
+        check_range(self.count, "count", 1, 1000, StudyError)
 
     @property
     def range(self) -> StartRange:
@@ -150,8 +143,7 @@ class Job(Conditions):
             for name in names:
                 if not table.get(name):
                     table.pop(name, None)
-        content = json.dumps(told, sort_keys=True, default=str)
-        return hashlib.sha256(content.encode()).hexdigest()[:16]
+        return digest(stated(told))[:16]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -167,6 +159,7 @@ class Study(Conditions):
 
     Raises:
         StudyError: a list is empty, something stands in it twice, or a value makes no sense.
+        SimulatorError: no simulator has this name.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -176,29 +169,24 @@ class Study(Conditions):
     reference: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("scenarios", "figures", "methods", "seeds", "weathers"):
-            if not getattr(self, name):
-                raise StudyError(f"{name} is empty, expected at least one")
+        methods = [method.name for method in self.methods]
+        # What is asked for twice would be two jobs that write the same folder.
+        named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": methods}
+        named |= {what: list(map(str, getattr(self, what))) for what in ("figures", "seeds", "weathers")}
+        for what, names in named.items():
+            each_once(names, what, StudyError)
+        if self.reference is not None and self.reference not in methods:
+            raise StudyError(f"reference is {self.reference!r}, expected one of {', '.join(methods)}")
         for figures in self.figures:
             known = isinstance(figures, int) and not isinstance(figures, bool) and 1 <= figures <= MAX_FIGURES
             if figures != BLACK and not known:
                 raise StudyError(
                     f"figures has {figures!r}, expected 1 to {MAX_FIGURES}, or {BLACK!r} for one black figure"
                 )
-        if self.simulator != "town" and not is_server(self.simulator):
-            raise StudyError(f"simulator is {self.simulator!r}, expected {SPECS}")
         for seed in self.seeds:
-            _check_range("seeds", seed, 0, MAX_SEED)
+            check_range(seed, "seeds", 0, MAX_SEED, StudyError)
+        check_spec(self.simulator)
         self._check_paint()
-        # What is asked for twice would be two jobs that write the same folder.
-        named = {"scenarios": [scenario.name for scenario in self.scenarios], "method": [m.name for m in self.methods]}
-        for what in ("figures", "seeds", "weathers"):
-            named[what] = list(map(str, getattr(self, what)))
-        for what, names in named.items():
-            if (twice := first_twice(names)) is not None:
-                raise StudyError(f"{what} has {twice} twice, expected each once")
-        if self.reference is not None and self.reference not in named["method"]:
-            raise StudyError(f"reference is {self.reference!r}, expected one of {', '.join(named['method'])}")
 
     def _check_paint(self) -> None:
         """See that every method can keep to the limits on paint and the variation."""
@@ -255,43 +243,25 @@ class _Stated(Conditions):
 
 
 def _study(content: dict[str, Any], folder: Path) -> Study:
-    if content.pop("format", None) != FORMAT:
-        raise StudyError(f'expected format = "{FORMAT}"')
-    version = content.pop("version", None)
-    if type(version) is not int or version != FORMAT_VERSION:
-        raise StudyError(
-            f"version is {version!r}, expected {FORMAT_VERSION}; version 1 had other keys, see docs/studies.md"
-        )
-    tables = {"traffic": TrafficPlan, "starts": StartPlan}
+    advice = "; version 1 had other keys, see docs/studies.md"
+    take_head(content, FORMAT, FORMAT_VERSION, StudyError, advice=advice)
+    tables = {"traffic": TrafficPlan, "starts": StartPlan, "paint": PaintLimits, "variation": Variation}
     built = {
         name: build(tables[name], content[name], name, StudyError)
         for name in tables
         if isinstance(content.get(name), dict)
     }
-    named = {name: content[name] for name in ("paint", "variation") if name in content}
-    built |= dict(zip(("paint", "variation"), paint_of(named, "the study"), strict=True))
-    stated = build(_Stated, content | built, "the study", StudyError)
-    listed = stated.scenario_file
-    own = BUILTIN_FILE if listed is None else folder / listed
-    if listed is not None and not own.resolve().is_relative_to(folder.resolve()):
-        raise StudyError(f"scenario_file {listed!r} leaves the study's folder; put it beside the study")
+    plan = build(_Stated, content | built, "the study", StudyError)
+    listed = plan.scenario_file
+    own = BUILTIN_FILE if listed is None else beside(folder, listed, "scenario_file", "study", StudyError)
     return Study(
-        scenarios=_chosen(stated.scenarios, load_scenarios(own)),
-        figures=stated.figures,
-        methods=tuple(map(method_plan, stated.method)),
-        seeds=stated.seeds,
-        reference=stated.reference,
-        **stated.shared,
+        scenarios=chosen_scenarios(plan.scenarios, load_scenarios(own)),
+        figures=plan.figures,
+        methods=tuple(map(method_plan, plan.method)),
+        seeds=plan.seeds,
+        reference=plan.reference,
+        **plan.shared,
     )
-
-
-def _chosen(patterns: Iterable[str], scenarios: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
-    """Scenarios by name or pattern of names, each once, in the order first named."""
-    chosen: dict[str, Scenario] = {}
-    for pattern in patterns:
-        found = [scenario for scenario in scenarios if fnmatch.fnmatchcase(scenario.name, pattern)]
-        chosen |= {scenario.name: scenario for scenario in found or [find_scenario(pattern, scenarios)]}
-    return tuple(chosen.values())
 
 
 def _digest(controller: str) -> str:

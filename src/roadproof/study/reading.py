@@ -1,32 +1,70 @@
-"""What the plans of studies and checks have in common: their tables on paint, and whom they may trust."""
+"""What the plans of studies and checks have in common: their head, the scenarios they name, and whom they may trust."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import fnmatch
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
-from roadproof.compositing import Variation
 from roadproof.controllers.loading import runs_code
-from roadproof.errors import StudyError
-from roadproof.io.tables import build
-from roadproof.paint import PaintLimits
+from roadproof.errors import RoadproofError, StudyError
+from roadproof.scenarios import Scenario, find_scenario
 from roadproof.simulators.loading import is_elsewhere
 
 
-def paint_of(content: Mapping[str, Any], what: str) -> tuple[PaintLimits | None, Variation | None]:
-    """Limits on paint and a variation from the tables [paint] and [variation], each None where it is not there.
+def take_head(
+    content: dict[str, Any], file_format: str, version: int, error: type[RoadproofError], *, advice: str = ""
+) -> None:
+    """Take format and version out of a plan.
+
+    Args:
+        content: the plan as TOML has it.
+        file_format: the "format" that the plan must name.
+        version: the "version" that it must be of.
+        error: the type of error to raise.
+        advice: what follows in the message where the version is another.
 
     Raises:
-        StudyError: there is another key, or a value makes no sense.
+        error: the plan is of another format or version.
     """
-    for key, table in content.items():
-        if key not in ("paint", "variation") or not isinstance(table, dict):
-            raise StudyError(f"{what}: {key!r:.60} is no table of it, expected [paint] and [variation]")
-    limits, variation = content.get("paint"), content.get("variation")
-    return (
-        None if limits is None else build(PaintLimits, limits, "paint", StudyError),
-        None if variation is None else build(Variation, variation, "variation", StudyError),
-    )
+    if content.pop("format", None) != file_format:
+        raise error(f'expected format = "{file_format}"')
+    known = content.pop("version", None)
+    if type(known) is not int or known != version:
+        raise error(f"version is {known!r:.40}, expected {version}{advice}")
+
+
+def beside(folder: Path, listed: str, what: str, plan: str, error: type[RoadproofError]) -> Path:
+    """The path of a file or folder that a plan names.
+
+    Args:
+        folder: the plan's folder.
+        listed: the file or folder, as the plan names it.
+        what: the key that names it, for the message.
+        plan: what the plan is called in the message, such as "study".
+        error: the type of error to raise.
+
+    Raises:
+        error: it lies elsewhere.
+    """
+    path = folder / listed
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise error(f"{what} {listed!r} leaves the {plan}'s folder; put it beside the {plan}")
+    return path
+
+
+def chosen_scenarios(patterns: Iterable[str], known: tuple[Scenario, ...]) -> tuple[Scenario, ...]:
+    """Scenarios by name or pattern of names, each once, in the order first named.
+
+    Raises:
+        ScenarioError: no scenario has such a name; the message names the nearest.
+    """
+    chosen: dict[str, Scenario] = {}
+    for pattern in patterns:
+        found = [each for each in known if fnmatch.fnmatchcase(each.name, pattern)]
+        chosen |= {each.name: each for each in found or [find_scenario(pattern, known)]}
+    return tuple(chosen.values())
 
 
 def refuse_untrusted(controller: str, simulator: str | None) -> None:
