@@ -105,16 +105,10 @@ def evaluate(
         episodes = Episodes.of(world, driver, scenario, paints, folder)
         planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
         drives = list(dict.fromkeys(drive for pair in planned for drive in pair))
-        missing = [drive for drive in drives if not episodes.has(drive)]
-        made = len(drives) - len(missing)
-        on_drive(made, len(drives))
-        if processes > 1 and len(missing) > 1:
-            assert callable(simulator)
-            make_together(simulator, episodes, missing, processes, lambda done: on_drive(made + done, len(drives)))
-        else:
-            for k, drive in enumerate(missing):
-                episodes.make(world, drive)
-                on_drive(made + k + 1, len(drives))
+        factory = simulator if callable(simulator) else None
+        make_missing(
+            world, episodes, drives, lambda done: on_drive(done, len(drives)), factory=factory, processes=processes
+        )
     evaluation = Evaluation(
         scenario=scenario,
         controller=driver_name or driver_in_words(driver),
@@ -171,26 +165,49 @@ def _planned(
     return pairs
 
 
-def make_together(
+def make_missing(
+    world: Simulator,
+    episodes: Episodes,
+    drives: Sequence[Conditions],
+    on_done: Callable[[int], object],
+    *,
+    factory: SimulatorFactory | None = None,
+    processes: int = 1,
+) -> None:
+    """Make the drives that a store lacks, one by one or shared out among processes.
+
+    Args:
+        world: open simulator that drives where one process does.
+        episodes: store of the drives.
+        drives: drives that are wanted.
+        on_done: called with the number of these drives that are done.
+        factory: function that makes a simulator, called in each of several processes.
+        processes: largest number of processes; without a factory only one is used.
+
+    Raises:
+        SimulatorError: a process died, or the simulator refuses the conditions.
+        ControllerError: the driver raises, or answers wrongly.
+        OutputError: the drives cannot be written.
+    """
+    missing = [drive for drive in drives if not episodes.has(drive)]
+    made = len(drives) - len(missing)
+    on_done(made)
+    if factory is not None and processes > 1 and len(missing) > 1:
+        _make_together(factory, episodes, missing, processes, lambda done: on_done(made + done))
+        return
+    for done, drive in enumerate(missing, made + 1):
+        episodes.make(world, drive)
+        on_done(done)
+
+
+def _make_together(
     factory: SimulatorFactory,
     episodes: Episodes,
     drives: Sequence[Conditions],
     processes: int,
     on_done: Callable[[int], object],
 ) -> None:
-    """Share drives out among processes; progress is read from the folder.
-
-    Args:
-        factory: function that makes a simulator, called in each process.
-        episodes: store of the drives.
-        drives: drives that are missing from the store.
-        processes: largest number of processes.
-        on_done: called with the number of these drives that are done.
-
-    Raises:
-        SimulatorError: a process died, or the simulator refuses the conditions.
-        ControllerError: the driver raises, or answers wrongly.
-    """
+    """Share drives out among processes; progress is read from the folder."""
     shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
     stop = get_context("spawn").Event()
     with processes_beside(len(shares), _until, stop) as pool:

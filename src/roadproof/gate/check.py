@@ -81,19 +81,20 @@ def run_check(
     """
     before: Mapping[Key, Case] = {}
     begun, folder = time.perf_counter(), as_path(folder)
+    architecture = architecture_of(controller)
     if processes > 1:
         require_picklable(controller)
     with working_in(folder):
         clear(folder)
         if compare and plan.reference is not None:
-            before = load_reference(plan.reference, architecture_of(controller), plan)
+            before = load_reference(plan.reference, architecture, plan)
         run = _Run(plan, controller, folder, before, device, processes, on_progress)
         places = places_of(plan, device)
         cases = tuple(case for place in places for case in run.cases(place))
         result = CheckResult(
             roadproof=roadproof.__version__,
             controller=plan.controller,
-            architecture=architecture_of(controller),
+            architecture=architecture,
             budget=plan.budget,
             compared=bool(before),
             cases=cases,

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from roadproof.datatypes import Ending, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import make_together
+from roadproof.driving.evaluate import make_missing
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
@@ -107,31 +108,18 @@ class Stretch:
         """
         alone = [each for weather in self.weathers for each in self._alone(weather).values()]
         total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
-        self._make(alone, factory, processes, lambda done: on_drive(done, total))
-        pairs = [pair for weather in self.weathers for paint in self.paints for pair in self._pairs(weather, paint)]
-        total = len(alone) + len(pairs)
-        painted = [painted for _, painted in pairs]
-        self._make(painted, factory, processes, lambda done: on_drive(len(alone) + done, total))
+        make = partial(make_missing, self.world, self.episodes, factory=factory, processes=processes)
+        make(alone, lambda done: on_drive(done, total))
+        painted = [each for weather in self.weathers for _, _, each in self._pairs(weather, self.paints)]
+        total = len(alone) + len(painted)
+        make(painted, lambda done: on_drive(len(alone) + done, total))
 
-    def _make(
-        self, drives: Sequence[Conditions], factory: SimulatorFactory, processes: int, on_done: Callable[[int], object]
-    ) -> None:
-        missing = [each for each in drives if not self.episodes.has(each)]
-        made = len(drives) - len(missing)
-        on_done(made)
-        if processes > 1 and len(missing) > 1:
-            make_together(factory, self.episodes, missing, processes, lambda done: on_done(made + done))
-            return
-        for k, each in enumerate(missing):
-            self.episodes.make(self.world, each)
-            on_done(made + k + 1)
-
-    def _pairs(self, weather: Weather, paint: Paint) -> list[tuple[Conditions, Conditions]]:
-        """The drives over a pattern, each after the one that it is compared with, where that went well."""
+    def _pairs(self, weather: Weather, paints: Iterable[Paint]) -> list[tuple[Paint, Conditions, Conditions]]:
+        """Patterns, with each drive over them after the one that it is compared with, where that went well."""
         alone = self._alone(weather)
         good = {each.clean for each in self.bare(weather) if not each.wrong}
-        pairs = [(alone[k], replace(alone[k], paint=paint.name)) for k in paint.drives]
-        return [(clean, painted) for clean, painted in pairs if self.episodes.file(clean) in good]
+        pairs = [(paint, alone[k], replace(alone[k], paint=paint.name)) for paint in paints for k in paint.drives]
+        return [each for each in pairs if self.episodes.file(each[1]) in good]
 
     def bare(self, weather: Weather) -> tuple[JudgedDrive, ...]:
         """The drives on the bare road, and what went wrong in them."""
@@ -146,24 +134,21 @@ class Stretch:
     def painted(self, weather: Weather, paints: Iterable[Paint]) -> tuple[JudgedDrive, ...]:
         """The drives over paint, each compared with the same drive on the bare road."""
         found: list[JudgedDrive] = []
-        for paint in paints:
-            for clean, painted in self._pairs(weather, paint):
-                trial = self.episodes.trial(clean, painted)
-                side = "left" if trial.lateral_m > 0 else "right"
-                found.append(
-                    JudgedDrive(
-                        seed=clean.seed,
-                        start=clean.start,
-                        wrong=f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}"
-                        if trial.leaves_lane
-                        else "",
-                        clean=trial.clean,
-                        painted=trial.painted,
-                        paint=str(paint.path),
-                        deviation_m=trial.deviation_m,
-                        lateral_m=trial.lateral_m,
-                    )
+        for paint, clean, painted in self._pairs(weather, paints):
+            trial = self.episodes.trial(clean, painted)
+            side = "left" if trial.lateral_m > 0 else "right"
+            found.append(
+                JudgedDrive(
+                    seed=clean.seed,
+                    start=clean.start,
+                    wrong=f"{abs(trial.lateral_m):.2f} m to the {side}, {trial.ending}" if trial.leaves_lane else "",
+                    clean=trial.clean,
+                    painted=trial.painted,
+                    paint=str(paint.path),
+                    deviation_m=trial.deviation_m,
+                    lateral_m=trial.lateral_m,
                 )
+            )
         return tuple(found)
 
     def conditions(self, key: Key, paints: Sequence[Paint]) -> str:
