@@ -73,7 +73,9 @@ def test_wilcoxon_is_that_of_scipy_on_scenario_means():
         Series({(f"s{k}", seed): float(each[k, seed]) for k in range(15) for seed in range(2)})
         for each in (first, second)
     )
-    assert paired(ours, theirs).p == pytest.approx(stats.wilcoxon(first.mean(1), second.mean(1)).pvalue)
+    assert wilcoxon_p(paired(ours, theirs).by_scenario) == pytest.approx(
+        stats.wilcoxon(first.mean(1), second.mean(1)).pvalue
+    )
 
 
 def test_wilcoxon_of_known_pairs():

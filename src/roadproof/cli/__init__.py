@@ -15,7 +15,6 @@ import traceback
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
 
 from roadproof import __version__
 from roadproof.cli.attack import attack
@@ -33,6 +32,7 @@ from roadproof.cli.group import Verbs
 from roadproof.cli.harden import harden
 from roadproof.cli.import_ import import_
 from roadproof.cli.open_ import open_
+from roadproof.cli.progress import tell
 from roadproof.cli.record import record
 from roadproof.cli.report import report
 from roadproof.cli.scenarios import scenarios
@@ -147,4 +147,4 @@ def _fail(message: str) -> NoReturn:
 def _complain(message: str) -> None:
     """One line on standard error; what a message quotes may be long, or hold line ends and a terminal's commands."""
     plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in message)
-    Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(f"roadproof: {plain:.1000}")
+    tell(f"roadproof: {plain:.1000}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadproof.cli.options import Device, Out, Processes, Trust, argument, check_simulator, choice, unset
+from roadproof.cli.options import Device, Out, Processes, Trust, argument, check_processes, choice, unset
 from roadproof.cli.output import answer, say, stored, table
 from roadproof.cli.verbs import begin, is_dry_run
 
@@ -45,7 +45,6 @@ def check(
     from roadproof.gate.plan import BUDGETS, load_check
     from roadproof.gate.result import FILE
     from roadproof.gate.verdict import Status
-    from roadproof.io.files import write_atomically
     from roadproof.io.locks import hold
 
     asked = None if budget is None else choice(budget, "budget", BUDGETS)
@@ -56,7 +55,7 @@ def check(
     if accept and chosen.reference is None:
         raise CheckError(f"--accept makes a reference, but {plan} names none; add [change] with reference")
     if chosen.budget == "full":
-        check_simulator(chosen.simulator, processes)
+        check_processes(chosen.simulator, processes)
     who = load_controller(chosen.controller, device=device)
     begin(_estimate(chosen, who, processes))
     with stages() as show:
@@ -66,8 +65,7 @@ def check(
     if accept and not passed:
         say("This does not become the reference, since not all of it passed")
     elif accept and chosen.reference is not None:
-        content = (out / FILE).read_bytes()
-        write_atomically(chosen.reference, lambda part: part.write_bytes(content))
+        result.save(chosen.reference)
         say(f"From now on the reference is {chosen.reference}; keep it beside the plan")
     answer(stored(out / FILE))
     if not passed:

@@ -56,7 +56,7 @@ def demo(
     from roadproof.simulators.loading import open_simulator
 
     tested = options.scenario_of(scenario, scenarios)
-    options.check_simulator(simulator, processes)
+    options.check_processes(simulator, processes)
     spent = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
     spent = replace(spent, rounds=rounds, attack_weathers=options.weathers_of(attack_weathers, "attack-weathers"))
     spent = replace(spent, objective=varied(spent.objective, paint.variation))
@@ -91,11 +91,9 @@ def demo(
 def _report(result: StressTest, out: Path) -> None:
     from roadproof.pipeline.stage_costs import StageCost
     from roadproof.report.page import write_report
-    from roadproof.report.run import read_run
-    from roadproof.report.verdict import verdict
 
     page = write_report(out)
-    say(verdict(read_run(out)).sentence)
+    say(stored(out / "result.json")["verdict"]["sentence"])
     if (foretold := result.prediction) is not None:
         say(
             f"Predicted in the recordings {foretold.predicted_m:.2f} m of deviation ({foretold.least_m:.2f} to "

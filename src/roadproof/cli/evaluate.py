@@ -92,7 +92,7 @@ def evaluate(
         _check_recorded(where.recorded, skies, runs, recordings)
         runs = cars = pedestrians = 0
     else:
-        options.check_simulator(simulator, processes)
+        options.check_processes(simulator, processes)
     begun = StartRange(**dict(zip(StartRange.__slots__, start_range, strict=True)))
     figures, paint = _figures(pattern, needed=bool(random or recordings)), read_paint(pattern)
     recorded = None if recordings is None else load_recordings(recordings)

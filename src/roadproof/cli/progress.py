@@ -148,7 +148,12 @@ class _Lines:
             said += f", {in_words(seconds)}"
             if self._first < done < total:
                 said += f", about {in_words(seconds * (total - done) / (done - self._first))} left"
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(said)
+        tell(said)
+
+
+def tell(line: str) -> None:
+    """Print a line on standard error; nothing in it is read as markup."""
+    Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(line)
 
 
 def in_words(seconds: float) -> str:

@@ -15,10 +15,10 @@ def report(
     """Show a run as one self-contained page, report.html, and its numbers as result.json."""
     # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.report.page import write_report
-    from roadproof.report.run import read_run
-    from roadproof.report.verdict import verdict
 
     page = write_report(folder)
-    say(verdict(read_run(folder)).sentence)
-    say(f"The report is {page}, its numbers are in {page.with_name('result.json')}")
-    answer(stored(page.with_name("result.json")))
+    numbers = page.with_name("result.json")
+    result = stored(numbers)
+    say(result["verdict"]["sentence"])
+    say(f"The report is {page}, its numbers are in {numbers}")
+    answer(result)

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
-from rich.console import Console
 
 from roadproof.cli.group import words_given
 from roadproof.cli.output import answer, in_json, say
-from roadproof.cli.progress import Loudness, in_words, is_quiet, speak
+from roadproof.cli.progress import Loudness, in_words, is_quiet, speak, tell
 from roadproof.errors import RoadproofError
 from roadproof.io.commands import write_command
 from roadproof.io.locks import hold
@@ -113,9 +112,7 @@ def begin(estimate: Estimate, *folders: Path) -> None:
         hold(folder)
     if estimate.seconds > SHORT_S and not is_quiet():
         less = ", less what is done already" if any(any(folder.iterdir()) for folder in folders) else ""
-        Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(
-            f"This takes {told}{less}; when it is interrupted, the same command goes on"
-        )
+        tell(f"This takes {told}{less}; when it is interrupted, the same command goes on")
 
 
 def keep_command(folder: Path) -> None:

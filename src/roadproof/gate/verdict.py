@@ -129,22 +129,22 @@ def judge(
     for name, limit in limits.items():
         found = measures[name]
         if found.value > limit:
-            failed.append(f"{in_words(name, found)} is above the limit of {_one(name, limit)}")
+            failed.append(f"{estimate_in_words(name, found)} is above the limit of {_one(name, limit)}")
         elif limit and (found.high is None or found.high > limit):
             undecided.append(
-                f"too few drives: {in_words(name, found)} does not exceed the limit of {_one(name, limit)}, but its "
-                "interval does; drive more starts or seeds"
+                f"too few drives: {estimate_in_words(name, found)} does not exceed the limit of {_one(name, limit)}, "
+                "but its interval does; drive more starts or seeds"
             )
     for name, change in changes.items():
         if before is None or name not in measures or name not in before:
             continue
         now, then = measures[name].value, before[name].value
         if measures[name].high is None:
-            undecided.append(f"too few drives: {in_words(name, measures[name])} has no interval; drive more")
+            undecided.append(f"too few drives: {estimate_in_words(name, measures[name])} has no interval; drive more")
         if change.is_exceeded(then, now):
             failed.append(
-                f"{in_words(name, measures[name])} was {_one(name, then)} in the reference: worse by more than "
-                f"{_one(name, change.absolute)} and by more than {change.relative:.0%}"
+                f"{estimate_in_words(name, measures[name])} was {_one(name, then)} in the reference: worse by more "
+                f"than {_one(name, change.absolute)} and by more than {change.relative:.0%}"
             )
     status = Status.FAILED if failed else Status.TOO_FEW if undecided else Status.PASSED
     return status, (*failed, *undecided)
@@ -157,17 +157,11 @@ _NAMES = {
 }
 
 
-def in_words(name: str, found: Estimate) -> str:
+def estimate_in_words(name: str, found: Estimate) -> str:
     """A measure's name, value and interval: "median deviation 0.31 m (0.12 to 0.44)"."""
-    return f"{_NAMES[name]} {shown(name, found)}"
-
-
-def shown(name: str, found: Estimate) -> str:
-    """A measure's value and interval: "0.31 m (0.12 to 0.44)"."""
     low, high = found.low, found.high
-    return _one(name, found.value) + (
-        "" if low is None or high is None else f" ({_one(name, low)} to {_one(name, high)})"
-    )
+    interval = "" if low is None or high is None else f" ({_one(name, low)} to {_one(name, high)})"
+    return f"{_NAMES[name]} {_one(name, found.value)}{interval}"
 
 
 def _one(name: str, value: float) -> str:

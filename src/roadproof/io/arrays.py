@@ -31,7 +31,7 @@ _PIECE_BYTES = 2**24
 HEADER = "header"
 _KINDS = "biuf"
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_DAMAGE = (
+DAMAGE = (
     EOFError,
     KeyError,
     MemoryError,
@@ -153,13 +153,8 @@ def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarr
     Raises:
         error: the file is missing, holds anything but numbers, or holds more or less than it claims.
     """
-    try:
-        with open_file(path) as file:
-            return _array(cast("io.BufferedIOBase", file), os.fstat(file.fileno()).st_size, _KINDS)
-    except FileNotFoundError:
-        raise error(f"{path} is missing; {remedy}") from None
-    except _DAMAGE as reason:
-        raise error(f"{path} is damaged ({one_line(reason)}); {remedy}") from None
+    with _told(path, error, remedy), open_file(path) as file:
+        return _array(cast("io.BufferedIOBase", file), os.fstat(file.fileno()).st_size, _KINDS)
 
 
 @contextmanager
@@ -167,13 +162,19 @@ def _opened(
     path: Path, error: type[RoadproofError], remedy: str, most_bytes: int
 ) -> Generator[zipfile.ZipFile, None, None]:
     """An archive to read from; whatever is wrong with it, there or while it is read, is an `error`."""
+    with _told(path, error, remedy), open_file(path) as file, zipfile.ZipFile(file) as archive:
+        _check(archive, most_bytes)
+        yield archive
+
+
+@contextmanager
+def _told(path: Path, error: type[RoadproofError], remedy: str) -> Generator[None]:
+    """Whatever is wrong with a file while it is read is an `error`."""
     try:
-        with open_file(path) as file, zipfile.ZipFile(file) as archive:
-            _check(archive, most_bytes)
-            yield archive
+        yield
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None
-    except _DAMAGE as reason:
+    except DAMAGE as reason:
         raise error(f"{path} is damaged ({one_line(reason)}); {remedy}") from None
 
 
@@ -195,7 +196,7 @@ def _member(archive: zipfile.ZipFile, name: str, kinds: str) -> np.ndarray:
     try:
         with archive.open(entry) as file:
             return _array(cast("io.BufferedIOBase", file), entry.file_size, kinds)
-    except _DAMAGE as reason:
+    except DAMAGE as reason:
         raise ValueError(f"{name}: {one_line(reason)}") from None
 
 

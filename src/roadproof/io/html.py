@@ -45,14 +45,14 @@ def content_of(image: Image.Image, kind: str) -> bytes:
     return out.getvalue()
 
 
-def data_url(kind: str, content: bytes | None) -> str | None:
-    """A file's content as a data URL of its media type; None where there is no content."""
-    return None if content is None else f"data:{kind};base64,{base64.b64encode(content).decode()}"
+def data_url(content: bytes, kind: str) -> str:
+    """A file's content as a data URL of its media type."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def encoded(image: Image.Image, kind: str) -> str:
     """A picture as a data URL; `kind` is "PNG" or "JPEG"."""
-    return data_url(f"image/{kind.lower()}", content_of(image, kind)) or ""
+    return data_url(content_of(image, kind), f"image/{kind.lower()}")
 
 
 def picture(pixels: UInt8[np.ndarray, "h w c"], words: str, width_px: int) -> Markup:

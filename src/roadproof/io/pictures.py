@@ -9,6 +9,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from roadproof.errors import RoadproofError
+from roadproof.io.arrays import DAMAGE
 from roadproof.io.files import open_file
 
 MOST_PIXELS = 40_000_000
@@ -49,14 +50,5 @@ def read_picture(
             return np.array(picture.convert(mode))
     except FileNotFoundError:
         raise error(f"{path} is missing; {remedy}") from None
-    except (
-        EOFError,
-        MemoryError,
-        OSError,
-        OverflowError,
-        RuntimeError,
-        SyntaxError,
-        ValueError,
-        Image.DecompressionBombError,
-    ) as reason:
+    except (*DAMAGE, Image.DecompressionBombError) as reason:
         raise error(f"{path} cannot be read ({reason}); {remedy}") from None

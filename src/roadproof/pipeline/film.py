@@ -20,6 +20,7 @@ from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import drive_again
 from roadproof.errors import EpisodeError
+from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import write_atomically
 from roadproof.io.records import RecordFile, Saved
 from roadproof.io.video import can_film, film_file
@@ -40,7 +41,9 @@ MOMENTS = 25
 """Pictures of a passage: enough to move through it, a picture every third step or so."""
 
 STRIP_SIZE = (400, 300)
-STRIP_HORIZON_M = 14.0
+HORIZON_M = 14.0
+"""Distance before the canvas at which the first picture is taken; the last is taken at the canvas' end."""
+
 EVENT_SHOWN_S = 3.0
 STANDS_MPS = 0.1
 INK, PAPER, FAINT, CLEAN, PAINTED = (30, 33, 38), (250, 249, 246), (110, 114, 120), (36, 92, 168), (184, 58, 26)
@@ -120,9 +123,7 @@ def film_drives(
     clean, painted = load_episodes(folder, files)
     predicted = ", predicted" if painted.paint.predicted else ""
     last = min(len(clean), len(painted)) - 1
-    seen = passage(path_of(clean), start.canvas, horizon_m=STRIP_HORIZON_M)
-    first, end = min(seen.start, last), min(seen.stop - 1, last)
-    steps: list[int] = sorted({round(first + (end - first) * k / (MOMENTS - 1)) for k in range(MOMENTS)})
+    steps = sorted(set(passage_steps(clean, painted, start.canvas, MOMENTS)))
     sides = (
         _filmed(f"without paint{predicted}", CLEAN, simulator, start, clean, None, steps),
         _filmed(f"with paint{predicted}", PAINTED, simulator, start, painted, paint, steps),
@@ -145,6 +146,13 @@ def film_drives(
         if (folder / FILM).stat().st_size <= MOST_BYTES:
             break
     return True
+
+
+def passage_steps(clean: Episode, painted: Episode, canvas: CanvasPlacement, count: int) -> list[int]:
+    """Steps evenly spread over the clean drive's passage, from `HORIZON_M` on, as far as the painted drive goes."""
+    seen, last = passage(path_of(clean), canvas, horizon_m=HORIZON_M), len(painted) - 1
+    first, end = min(seen.start, last), min(seen.stop - 1, last)
+    return [round(first + (end - first) * k / (count - 1)) for k in range(count)]
 
 
 def _filmed(

@@ -103,10 +103,11 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
         OutputError: the page cannot be written.
     """
     runs = compared(folders)
-    weathers = list(dict.fromkeys(weather for each in runs for weather in each.judged.evaluation.weathers))
-    first = runs[0].judged.evaluation.scenario
+    judged = [each.judged for each in runs]
+    weathers = list(dict.fromkeys(weather for each in judged for weather in each.evaluation.weathers))
+    first = judged[0].evaluation.scenario
     kinds = sorted({each.predicted for each in runs})
-    same_place = all(each.judged.evaluation.scenario.canvas == first.canvas for each in runs)
+    same_place = all(each.evaluation.scenario.canvas == first.canvas for each in judged)
     text = environment().get_template("compare.html.jinja").render(
         version=roadproof.__version__,
         runs=runs,
@@ -116,7 +117,7 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
         offsets=charts.offsets([(each.name, each.judged.clean, each.judged.painted) for each in runs], first.canvas)
         if same_place and len(kinds) == 1
         else None,
-        patterns=[encoded(on_asphalt(each.judged.paint, 360, _size(each)), "PNG") for each in runs],
+        patterns=[encoded(on_asphalt(each.paint, 360, each.evaluation.scenario.canvas), "PNG") for each in judged],
         above=[_above(each, number) for number, each in enumerate(runs)],
     )  # fmt: skip
     write_text(as_path(page), text)
@@ -126,11 +127,6 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
 def _above(each: Compared, number: int) -> charts.Chart:
     judged = each.judged
     return top_view(judged.evaluation.scenario, judged.paint, judged.clean, judged.painted, f"above-{number}")
-
-
-def _size(each: Compared) -> tuple[float, float]:
-    canvas = each.judged.evaluation.scenario.canvas
-    return canvas.width_m, canvas.length_m
 
 
 def _name(path: Path, paths: Sequence[Path]) -> str:

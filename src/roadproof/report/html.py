@@ -28,7 +28,7 @@ def environment() -> Environment:
     )
     filters: dict[str, Callable[..., object]] = {
         "aside": aside_in_words,
-        "data": _data,
+        "data": data_url,
         "degrees": math.degrees,
         "form": format,
         "jpeg": partial(_picture, kind="JPEG"),
@@ -39,10 +39,6 @@ def environment() -> Environment:
     }
     cast("dict[str, Any]", templates.filters).update(filters)
     return templates
-
-
-def _data(content: bytes, kind: str) -> str | None:
-    return data_url(kind, content)
 
 
 def _picture(pixels: UInt8[np.ndarray, "h w 3"], *, kind: str) -> str:

@@ -175,10 +175,10 @@ def _passage(run: Run) -> list[Fields]:
 def _pattern(run: Run) -> Fields | None:
     """What is painted, as it lies on the road."""
     pattern, judged = run.pattern, run.judged
-    size = None
+    canvas = None if judged is None else judged.evaluation.scenario.canvas
+    size = canvas and (canvas.width_m, canvas.length_m)
     if judged is not None:
-        paint, canvas = judged.paint, judged.evaluation.scenario.canvas
-        size = (canvas.width_m, canvas.length_m)
+        paint = judged.paint
         # Its figures are listed only if they are what was painted.
         pattern = pattern if pattern is not None and np.array_equal(raster(pattern), paint) else None
     elif pattern is not None:
@@ -186,7 +186,7 @@ def _pattern(run: Run) -> Fields | None:
     else:
         return None
     return {
-        "picture": encoded(on_asphalt(paint, 480, size or (1.0, 1.0)), "PNG"),
+        "picture": encoded(on_asphalt(paint, 480, canvas), "PNG"),
         "painted": "" if judged is None else PAINTED[judged.evaluation.paint],
         "size": f"{size[0]:.1f} × {size[1]:.1f} m" if size else "400 × 400 canvas pixels",
         "share": f"{(paint[..., 3] / 255).mean():.0%}",
@@ -194,7 +194,7 @@ def _pattern(run: Run) -> Fields | None:
         "conspicuous": _conspicuous(run),
         "cheapest": None
         if run.cheapest is None
-        else encoded(on_asphalt(raster(run.cheapest.pattern), 480, size or (1.0, 1.0)), "PNG"),
+        else encoded(on_asphalt(raster(run.cheapest.pattern), 480, canvas), "PNG"),
     }
 
 

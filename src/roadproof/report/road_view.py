@@ -16,7 +16,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 from PIL import Image
 
+from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
+from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.protocol import PatternImage
 
@@ -82,6 +84,14 @@ def around_canvas(canvas: CanvasPlacement) -> Callable[[Plan], Plan]:
 def in_world(points: Plan) -> Plan:
     """World x, y as they are: a map with north up."""
     return points
+
+
+def road_of(map_name: str) -> RoadMap | None:
+    """A scenario's map; None for another simulator's, without which paths and canvas are shown."""
+    try:
+        return load_map(map_name)
+    except ScenarioError:
+        return None
 
 
 def draw_road(axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: Box, ground: Ground) -> None:
@@ -151,15 +161,15 @@ def pixels_of(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(drawn.buffer_rgba())[..., :3]
 
 
-def on_asphalt(paint: UInt8[np.ndarray, "s s 4"], width_px: int, size: tuple[float, float]) -> Image.Image:
+def on_asphalt(paint: UInt8[np.ndarray, "s s 4"], width_px: int, canvas: CanvasPlacement | None) -> Image.Image:
     """A pattern on asphalt in its true proportions, direction of travel upwards.
 
     Args:
         paint: the pattern on the canvas, RGBA.
         width_px: the width of the picture, in pixels.
-        size: width and length of the canvas, in any unit.
+        canvas: the canvas whose proportions it has; None for a square.
     """
     road = Image.new("RGB", (paint.shape[1], paint.shape[0]), ASPHALT)
     road.paste(Image.fromarray(paint[..., :3]), (0, 0), Image.fromarray(paint[..., 3]))
-    width, length = size
+    width, length = (1.0, 1.0) if canvas is None else (canvas.width_m, canvas.length_m)
     return road.resize((width_px, max(round(width_px * length / width), 1)), Image.Resampling.LANCZOS)

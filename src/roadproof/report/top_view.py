@@ -13,11 +13,8 @@ from matplotlib.patches import Rectangle
 from roadproof.driving.deviation import passage, path_of
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted
-from roadproof.errors import ScenarioError
 from roadproof.report.charts import CLEAN, INK, NO_MOMENTS, PAINTED, VARIABLES, WIDTH_IN, Chart, Mark, svg_of
-from roadproof.report.road_view import Ground, Plan, around_canvas, draw_canvas, draw_road, plan_of
-from roadproof.roads.maps import load_map
-from roadproof.roads.roadmap import RoadMap
+from roadproof.report.road_view import Ground, Plan, around_canvas, draw_canvas, draw_road, plan_of, road_of
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage
 
@@ -56,7 +53,7 @@ def top_view(
     low, high = _widened(low, high, 0.5 * (right - left))
     box = (left, low, right, high)
     figure, axes = plan_of(box, (WIDTH_IN, WIDTH_IN * (high - low) / (right - left)), "none")
-    road = _road(scenario)
+    road = road_of(scenario.map_name)
     beside = VARIABLES["asphalt" if road is None else "grass"]
     axes.add_patch(Rectangle((left, low), right - left, high - low, color=beside))
     if road is not None:
@@ -78,14 +75,6 @@ def top_view(
         Mark(kind, path[np.minimum(steps, len(path) - 1)]) for kind, path in (("clean", bare), ("painted", driven))
     )
     return Chart(svg_of(figure, name, words, marks), words + ". Up is the direction of travel at the canvas.")
-
-
-def _road(scenario: Scenario) -> RoadMap | None:
-    try:
-        return load_map(scenario.map_name)
-    except ScenarioError:
-        # Another simulator's map: paths and canvas are shown without it.
-        return None
 
 
 def _draw_events(axes: Axes, painted: Episode, driven: Plan) -> int:

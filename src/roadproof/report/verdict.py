@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from roadproof.attacks import AttackResult
 from roadproof.datatypes import Ending
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.intervals import mean_95
@@ -47,29 +48,26 @@ def verdict(run: Run) -> Verdict:
         evaluation = run.judged.evaluation
         return _foreseen(evaluation) if evaluation.predicted else _driven(evaluation)
     if run.attack is not None:
-        attack = run.attack
-        if attack.predicted_mps is not None:
-            return Verdict(
-                "predicted",
-                "Predicted, not driven",
-                f"Driven in the recorded frames, the pattern makes the car {speed_in_words(attack.predicted_mps)} on "
-                "average while the canvas is in view; nobody has driven over it for real yet.",
-            )
-        if attack.predicted_m is not None:
-            return Verdict(
-                "predicted",
-                "Predicted, not driven",
-                f"Driven in the recorded frames, the pattern makes the car deviate by {attack.predicted_m:.2f} m "
-                f"({attack.group}); nobody has driven over it for real yet.",
-            )
-        return Verdict(
-            "predicted",
-            "Predicted, not driven",
-            f"On composited frames the pattern shifts steering by {attack.surrogate_shift:+.3f} a frame "
-            f"({attack.group}); nobody has driven over it yet.",
-        )
+        return Verdict("predicted", "Predicted, not driven", _predicted(run.attack))
     drives = len(run.drives.drives if run.drives else run.recordings.recordings if run.recordings else ())
     return Verdict("recorded", "Not attacked yet", f"{drives} drives are recorded; no pattern was searched yet.")
+
+
+def _predicted(attack: AttackResult) -> str:
+    if attack.predicted_mps is not None:
+        return (
+            f"Driven in the recorded frames, the pattern makes the car {speed_in_words(attack.predicted_mps)} on "
+            "average while the canvas is in view; nobody has driven over it for real yet."
+        )
+    if attack.predicted_m is not None:
+        return (
+            f"Driven in the recorded frames, the pattern makes the car deviate by {attack.predicted_m:.2f} m "
+            f"({attack.group}); nobody has driven over it for real yet."
+        )
+    return (
+        f"On composited frames the pattern shifts steering by {attack.surrogate_shift:+.3f} a frame "
+        f"({attack.group}); nobody has driven over it yet."
+    )
 
 
 def _foreseen(evaluation: Evaluation) -> Verdict:

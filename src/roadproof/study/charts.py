@@ -24,7 +24,7 @@ from roadproof.study.statistics import mean_over_scenarios
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000", "#882255", "#7a7f85")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*")
 LINES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.4)), (0, (6, 2, 1, 2)))
-_ENTRY_IN, _LETTER_IN = 0.7, 0.085
+_ENTRY_IN, LETTER_IN = 0.7, 0.085
 """Room that an entry of a legend takes, and each of its letters, inches."""
 INK, MUTED, RULE = "#1c2126", "#575e66", "#dcd9d1"
 
@@ -189,7 +189,7 @@ def legend(figure: Figure) -> None:
         list(entries.values()),
         list(entries),
         loc="outside upper left",
-        ncols=max(1, min(len(entries), int(figure.get_figwidth() / (_ENTRY_IN + _LETTER_IN * max(map(len, entries)))))),
+        ncols=max(1, min(len(entries), int(figure.get_figwidth() / (_ENTRY_IN + LETTER_IN * max(map(len, entries)))))),
         frameon=False,
         fontsize=9.5,
         labelcolor=INK,

@@ -88,7 +88,7 @@ def _page(
             {
                 "name": picture.name,
                 "caption": picture.caption,
-                "source": data_url("image/png", (out / "figures" / f"{picture.name}.png").read_bytes()),
+                "source": data_url((out / "figures" / f"{picture.name}.png").read_bytes(), "image/png"),
             }
             for picture in pictures
         ],

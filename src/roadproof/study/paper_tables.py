@@ -14,7 +14,7 @@ from roadproof.report.formatting import MISSING, in_words
 from roadproof.scenarios import KINDS
 from roadproof.study.kept_jobs import StatedMethod
 from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, PENALTY, Block, Metric, Results
-from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios, paired
+from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios, paired, wilcoxon_p
 from roadproof.study.table import Cell, Estimate, Heading, Table, headings, slug
 from roadproof.study.table_notes import table_note
 
@@ -112,10 +112,11 @@ def _paired_table(results: Results, ours: str, theirs: str, blocks: Sequence[Blo
             if found is None:
                 rows.append((*where, *[MISSING] * 6))
                 continue
-            p = MISSING if found.p is None else "< 0.001" if found.p < 0.001 else f"{found.p:.3f}"
+            p = wilcoxon_p(found.by_scenario)
+            told = MISSING if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
             share = Estimate(found.at_least, 0, unit="%")
             counts = (str(found.difference.count), str(len(found.by_scenario)))
-            rows.append((*where, Estimate(found.difference), share, str(found.ties), p, *counts))
+            rows.append((*where, Estimate(found.difference), share, str(found.ties), told, *counts))
     said = (
         f"Difference: {ours} less {theirs}, above 0 where {ours} is stronger. p: two-sided Wilcoxon signed-rank "
         "test of the scenarios’ mean differences, not corrected for the number of rows."

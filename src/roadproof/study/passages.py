@@ -11,19 +11,16 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from roadproof.datatypes import Control, Observation
-from roadproof.driving.deviation import passage, path_of
 from roadproof.driving.drive_store import load_episodes
-from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.rollout import drive_again
 from roadproof.driving.trial import Trial
+from roadproof.pipeline.film import passage_steps
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
 PICTURES = 6
 SIZE_PX = (240, 180)
-HORIZON_M = 14.0
-"""Distance before the canvas at which the first picture is taken; the last is taken at the canvas' end."""
 
 
 def passages(simulator: Simulator, evaluation: Evaluation, folder: Path, paint: PatternImage) -> dict[str, bytes]:
@@ -59,7 +56,8 @@ def _strip(
     simulator: Simulator, scenario: Scenario, trial: Trial, folder: Path, paint: PatternImage
 ) -> UInt8[np.ndarray, "h w 3"]:
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
-    steps, taken, numbers = _steps(clean, painted, scenario), list[UInt8[np.ndarray, "h w 3"]](), count()
+    steps = passage_steps(clean, painted, scenario.canvas, PICTURES)
+    taken, numbers = list[UInt8[np.ndarray, "h w 3"]](), count()
 
     def keep(seen: Observation, _: Control | None) -> None:
         times = steps.count(next(numbers))
@@ -77,10 +75,3 @@ def _strip(
         on_step=keep,
     )
     return np.concatenate(taken, 1)
-
-
-def _steps(clean: Episode, painted: Episode, scenario: Scenario) -> list[int]:
-    """Evenly spread over the clean drive's passage, as far as the painted drive goes."""
-    seen, last = passage(path_of(clean), scenario.canvas, horizon_m=HORIZON_M), len(painted) - 1
-    first, end = min(seen.start, last), min(seen.stop - 1, last)
-    return [round(first + (end - first) * k / (PICTURES - 1)) for k in range(PICTURES)]

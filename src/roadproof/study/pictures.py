@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from textwrap import fill
@@ -12,31 +12,23 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
-from roadproof.errors import ScenarioError
 from roadproof.patterns import raster
+from roadproof.pipeline.film import HORIZON_M
 from roadproof.recordings import evenly
 from roadproof.report.formatting import in_words
-from roadproof.report.road_view import Ground, around_canvas, draw_road, on_asphalt
-from roadproof.roads.maps import load_map
+from roadproof.report.road_view import Ground, around_canvas, draw_canvas, draw_road, on_asphalt, road_of
 from roadproof.scenarios import KINDS
-from roadproof.study.charts import INK, MUTED, Picture, legend, plain, style
+from roadproof.study.charts import INK, LETTER_IN, MUTED, Picture, legend, plain, style
 from roadproof.study.kept_jobs import KeptJob
-from roadproof.study.passages import HORIZON_M
 from roadproof.study.results import Results
 from roadproof.study.rows import JobId
 
 PANELS = 6
 ROWS, COLUMNS = 8, 12
 BEFORE_M, AFTER_M, BESIDE_M = 12.0, 26.0, 10.5
-GROUND = Ground(sidewalk="#d8d4c9", asphalt="#b9bcc0", marking="#f6f4ee")
-GRASS = "#e4e9d9"
-CLEAN = "#1c2126"
+GROUND = Ground(sidewalk="#d8d4c9", asphalt="#b9bcc0", marking="#f6f4ee", grass="#e4e9d9")
 PICTURE_PX = 160
-
-_LETTER_IN = 0.085
-"""Width of a letter of a title, inches."""
 
 Jobs = Mapping[JobId, KeptJob]
 
@@ -94,7 +86,7 @@ def _draw_paths(axes: Axes, results: Results, driven: Sequence[KeptJob]) -> None
         assert paths is not None
         clean, painted = paths
         if number == 0:
-            axes.plot(*around(clean).T, color=CLEAN, linewidth=1.4, label="bare road")
+            axes.plot(*around(clean).T, color=INK, linewidth=1.4, label="bare road")
         # The first lies on top: it is what the others are compared with.
         look: dict[str, Any] = style(results, job.id.method) | {"marker": "", "zorder": 4.0 - 0.1 * number}
         axes.plot(*around(painted).T, linewidth=2.0, label=plain(job.id.method), **look)
@@ -103,18 +95,12 @@ def _draw_paths(axes: Axes, results: Results, driven: Sequence[KeptJob]) -> None
 def _draw_place(axes: Axes, job: KeptJob) -> None:
     """The road, where its map can be read, and the canvas."""
     canvas = job.scenario.canvas
-    width, length = canvas.width_m, canvas.length_m
-    low, high = -length / 2 - BEFORE_M, length / 2 + AFTER_M
-    axes.set(xticks=[], yticks=[], facecolor=GRASS)
+    low, high = -canvas.length_m / 2 - BEFORE_M, canvas.length_m / 2 + AFTER_M
+    axes.set(xticks=[], yticks=[], facecolor=GROUND.grass, xlim=(-BESIDE_M, BESIDE_M), ylim=(low, high))
     axes.spines[:].set_visible(False)
-    try:
-        box = (-BESIDE_M, low, BESIDE_M, high)
-        draw_road(axes, load_map(job.scenario.map_name), around_canvas(canvas), box, GROUND)
-    except ScenarioError:
-        pass  # Another simulator's map: paths and canvas are shown without it.
-    look: dict[str, Any] = {"fill": False, "edgecolor": INK, "linewidth": 0.9, "linestyle": (0, (3, 2))}
-    axes.add_patch(Rectangle((-width / 2, -length / 2), width, length, **look))
-    axes.set(xlim=(-BESIDE_M, BESIDE_M), ylim=(low, high), aspect="equal")
+    if (road := road_of(job.scenario.map_name)) is not None:
+        draw_road(axes, road, around_canvas(canvas), (-BESIDE_M, low, BESIDE_M, high), GROUND)
+    draw_canvas(axes, canvas, None, INK, upright=True)
 
 
 def gallery(results: Results, jobs: Jobs) -> Picture | None:
@@ -144,14 +130,14 @@ def passages(results: Results, jobs: Jobs) -> list[Picture]:
     One scenario of each kind is shown, the one where the reference method's patterns deviate most, at the largest K; a
     straight one at K = 4 where the study has that, as the paper's supplement shows it.
     """
-    return [picture for kind in KINDS for picture in _passages(results, jobs, kind)]
-
-
-def _passages(results: Results, jobs: Jobs, kind: str) -> Iterator[Picture]:
-    of_kind = [name for name in examples(results, PANELS) if results.kinds[name] == kind][:1]
-    figures = "4" if kind == "straight" and "4" in results.figures else results.figures[-1]
     conditions = [(weather, traffic) for traffic in (False, True) for weather in results.weathers]
-    for scenario in of_kind:
+    shown = examples(results, PANELS)
+    pictures: list[Picture] = []
+    for kind in KINDS:
+        scenario = next((name for name in shown if results.kinds[name] == kind), None)
+        if scenario is None:
+            continue
+        figures = "4" if kind == "straight" and "4" in results.figures else results.figures[-1]
         ids = [JobId(scenario, figures, method, results.seeds[0]) for method in results.compared]
         rows = {where: [_strip(results, jobs, job, *where) for job in ids] for where in conditions}
         kept = {where: row for where, row in rows.items() if any(cell.picture is not None for cell in row)}
@@ -159,13 +145,13 @@ def _passages(results: Results, jobs: Jobs, kind: str) -> Iterator[Picture]:
         titles = list(map(plain, results.compared))
         figure = _grid(labels, titles, list(kept.values()), (6.4 * len(ids) + 0.5, 1.15 * len(kept) + 0.4))
         if figure is not None:
-            yield Picture(
-                f"passage-{kind}",
+            words = (
                 f"What the car’s camera sees on {plain(scenario)} as it passes each method’s pattern, K = {figures}, "
                 f"seed {results.seeds[0]}: one drive in each condition, from {HORIZON_M:.0f} m before the canvas to "
-                "its end. Under each the mean deviation of all drives in that condition.",
-                figure,
+                "its end. Under each the mean deviation of all drives in that condition."
             )
+            pictures.append(Picture(f"passage-{kind}", words, figure))
+    return pictures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,8 +167,7 @@ def _pattern(results: Results, jobs: Jobs, job: JobId) -> _Cell:
     pattern = None if kept is None else kept.pattern()
     if kept is None or pattern is None:
         return _Cell(None, "")
-    canvas = kept.scenario.canvas
-    picture = np.asarray(on_asphalt(raster(pattern, PICTURE_PX), PICTURE_PX, (canvas.width_m, canvas.length_m)))
+    picture = np.asarray(on_asphalt(raster(pattern, PICTURE_PX), PICTURE_PX, kept.scenario.canvas))
     return _Cell(picture, _driven(results, job, results.home, traffic=results.overall[0].traffic))
 
 
@@ -206,7 +191,7 @@ def _grid(
         return None
     figure = Figure(figsize=size_in, layout="constrained")
     grid: Any = figure.subplots(len(rows), len(titles), squeeze=False)
-    letters = max(8, int(size_in[0] / len(titles) / _LETTER_IN))
+    letters = max(8, int(size_in[0] / len(titles) / LETTER_IN))
     over = ["\n".join(fill(line, letters, break_on_hyphens=False) for line in title.splitlines()) for title in titles]
     for row, column in product(range(len(rows)), range(len(titles))):
         axes, cell = grid[row, column], rows[row][column]

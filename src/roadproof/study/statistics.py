@@ -75,14 +75,6 @@ class Paired:
     ties: int
     by_scenario: tuple[float, ...]
 
-    @property
-    def p(self) -> float | None:
-        """Two-sided Wilcoxon signed-rank test of the scenarios' mean differences.
-
-        None where all are zero, or there are fewer than two scenarios.
-        """
-        return wilcoxon_p(self.by_scenario)
-
 
 def paired(ours: Values, theirs: Values) -> Paired | None:
     """Compare two methods case by case; None where they have no case in common."""
@@ -104,6 +96,9 @@ def paired(ours: Values, theirs: Values) -> Paired | None:
 
 
 def wilcoxon_p(differences: Sequence[float]) -> float | None:
-    """Two-sided p of the Wilcoxon signed-rank test that differences lie around 0, zeros left out as Wilcoxon did."""
+    """Two-sided p of the Wilcoxon signed-rank test that differences lie around 0, zeros left out as Wilcoxon did.
+
+    None where all are zero, or there are fewer than two.
+    """
     apart = [gap for gap in differences if abs(gap) > EQUAL]
     return float(stats.wilcoxon(apart).pvalue) if apart and len(differences) > 1 else None
