@@ -78,16 +78,26 @@ def _place(folder: Path) -> Path:
     """The file that says who works in a folder: outside of the folder, which holds results alone."""
     # Where every process looks, whatever its TMPDIR says.
     shared = Path("/tmp")  # noqa: S108  # the folder in it is the user's own
-    user: int = getattr(os, "getuid", int)()  # a user may have no name, or no number
-    locks = (shared if shared.is_dir() else Path(tempfile.gettempdir())) / f"roadproof-locks-{user}"
-    try:
-        locks.mkdir(mode=0o700, exist_ok=True)
-        whose = locks.stat().st_uid
-    except OSError as error:
-        raise OutputError(f"cannot keep locks in {locks}: {error.strerror}; remove what is there") from None
-    if whose != user:
-        raise OutputError(f"{locks} belongs to another user, expected yours; have it removed")
+    locks = own_folder(shared if shared.is_dir() else Path(tempfile.gettempdir()), "locks")
     return locks / hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
+
+
+def own_folder(shared: Path, purpose: str) -> Path:
+    """The user's own folder in one that all users write to, made where it is not there.
+
+    Raises:
+        OutputError: the folder cannot be made, or belongs to another user.
+    """
+    user: int = getattr(os, "getuid", int)()  # a user may have no name, or no number
+    own = shared / f"roadproof-{purpose}-{user}"
+    try:
+        own.mkdir(mode=0o700, exist_ok=True)
+        whose = own.stat().st_uid
+    except OSError as error:
+        raise OutputError(f"cannot keep {purpose} in {own}: {error.strerror}; remove what is there") from None
+    if whose != user:
+        raise OutputError(f"{own} belongs to another user, expected yours; have it removed")
+    return own
 
 
 def _worker(place: Path) -> str:

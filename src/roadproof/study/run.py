@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import getpass
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from roadproof.errors import RoadproofError, StudyError
-from roadproof.io.locks import working_in
+from roadproof.io.locks import own_folder, working_in
 from roadproof.machine import keep_freed_memory
 from roadproof.processes import processes_beside
 from roadproof.simulators.loading import is_server
@@ -64,10 +65,11 @@ def run_study(
         left = [job for job in jobs if not is_done(job, folder)]
         done = len(jobs) - len(left)
         results = _on_this_machine(left, folder, work, workers) if cluster is None else _on_ray(left, work, cluster)
-        for job, result in results:
-            write_result(job, result, folder)
-            done += 1
-            on_job(done, job, result)
+        with closing(results):
+            for job, result in results:
+                write_result(job, result, folder)
+                done += 1
+                on_job(done, job, result)
         return write_table(jobs, folder)
 
 
@@ -90,15 +92,18 @@ def _compute_with_one_thread() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
-def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int) -> Iterator[tuple[Job, JobResult]]:
+def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int) -> Generator[tuple[Job, JobResult]]:
     try:
-        joblib: Any = import_module("joblib")
         import_module("threadpoolctl")
     except ImportError as error:
         raise StudyError(f"studies need {error.name}; install roadproof[study]") from None
     # Threads that each wait for a process of their own: one that dies takes its job with it and no other.
-    pool = joblib.Parallel(n_jobs=workers, backend="threading", return_as="generator_unordered", pre_dispatch=workers)
-    yield from pool(joblib.delayed(_in_own_process)(job, folder / "work" / job.key, work) for job in jobs)
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for done in as_completed(pool.submit(_in_own_process, job, folder / "work" / job.key, work) for job in jobs):
+            yield done.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _in_own_process(job: Job, scratch: Path, work: Work) -> tuple[Job, JobResult]:
@@ -109,7 +114,7 @@ def _in_own_process(job: Job, scratch: Path, work: Work) -> tuple[Job, JobResult
             return job, failed(job, "its process died, most likely for want of memory; use fewer workers")
 
 
-def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job, JobResult]]:
+def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Generator[tuple[Job, JobResult]]:
     try:
         ray: Any = import_module("ray")
     except ImportError:
@@ -142,6 +147,4 @@ def _on_ray(jobs: Sequence[Job], work: Work, cluster: str) -> Iterator[tuple[Job
 
 def _on_node(job: Job, work: Work) -> JobResult:
     # What a job keeps to go on from stays on its node, where others may compute too; its result travels.
-    own = Path(tempfile.gettempdir()) / f"roadproof-study-{getpass.getuser()}"
-    own.mkdir(mode=0o700, exist_ok=True)
-    return _attempt(job, own / job.key, work)
+    return _attempt(job, own_folder(Path(tempfile.gettempdir()), "study") / job.key, work)
