@@ -31,13 +31,13 @@ def select(
     from roadproof.attacks import AttackResult
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
-    from roadproof.drives import load_drives
+    from roadproof.drives.folder import read_settings
     from roadproof.errors import RoadproofError
     from roadproof.io.locks import hold
     from roadproof.patterns import save_pattern
     from roadproof.pipeline.selection import UNITS, chosen_by, select_by_driving
 
-    recorded = load_drives(run / "record").settings
+    recorded = read_settings(run / "record")
     place = run / "attack"
     if not (place / "result.json").exists():
         raise RoadproofError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -101,7 +101,7 @@ def recorded_in(spec: str) -> Recorded | None:
     if not spec.startswith(RECORDED):
         return None
     from roadproof.datatypes import Weather
-    from roadproof.drives import load_drives
+    from roadproof.drives.folder import read_settings
 
     if spec == RECORDED:
         raise RoadproofError(
@@ -114,12 +114,11 @@ def recorded_in(spec: str) -> Recorded | None:
         raise RecordingError(f"{there} has no recordings.json; expected recordings, or a run that has some")
     if run is None or not (run / "record" / "record.json").is_file():
         return Recorded(there, None, Weather.CLEAR_NOON)
-    settings = load_drives(run / "record").settings
+    settings = read_settings(run / "record")
     return Recorded(there, settings.scenario, settings.weather)
 
 
-@contextmanager
-def open_world(spec: str, device: str = "cpu") -> Generator[MappedSimulator | RecordedSimulator]:
+def open_world(spec: str, device: str = "cpu") -> AbstractContextManager[MappedSimulator | RecordedSimulator]:
     """Open what a spec names for a with-block; leaving frees everything it holds.
 
     Args:
@@ -134,10 +133,6 @@ def open_world(spec: str, device: str = "cpu") -> Generator[MappedSimulator | Re
     from roadproof.simulators.loading import open_simulator
 
     inside = recorded_in(spec)
-    opened = (
-        open_simulator(spec)
-        if inside is None
-        else RecordedSimulator(load_recordings(inside.folder), weather=inside.weather, device=device)
-    )
-    with opened as world:
-        yield world
+    if inside is None:
+        return open_simulator(spec)
+    return RecordedSimulator(load_recordings(inside.folder), weather=inside.weather, device=device)

@@ -197,6 +197,18 @@ def read_drive(name: str, folder: Path) -> Drive | None:
     return _DRIVE.read(path, name=name, episode=Episode.load(path.with_name("episode.npz")))
 
 
+def read_settings(folder: Path) -> Settings:
+    """Read the settings of a recording alone, whether it is finished or not.
+
+    Raises:
+        RecordingError: the folder is missing or damaged.
+    """
+    if not (folder / "record.json").is_file():
+        raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
+    check_closed(folder, RecordingError)
+    return _SETTINGS.read(folder / "record.json")
+
+
 def load_drives(folder: AnyPath) -> Drives:
     """Read a finished recording.
 
@@ -205,10 +217,7 @@ def load_drives(folder: AnyPath) -> Drives:
         EpisodeError: an episode in it is damaged.
     """
     folder = as_path(folder)
-    if not (folder / "record.json").is_file():
-        raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
-    check_closed(folder, RecordingError)
-    settings = _SETTINGS.read(folder / "record.json")
+    settings = read_settings(folder)
     plans = settings.trajectories.plans()
     drives = [read_drive(plan.name, folder) for plan in plans]
     missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]

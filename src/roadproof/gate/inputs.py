@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.datatypes import Weather
-from roadproof.drives import load_drives
+from roadproof.drives.folder import read_settings
 from roadproof.errors import CheckError
 from roadproof.io.files import check_name
 from roadproof.io.tables import each_once
@@ -99,7 +99,7 @@ def recordings_of(
         for scenario in scenarios:
             if not (run := place / scenario.name).is_dir():
                 continue
-            made = load_drives(run / "record").settings
+            made = read_settings(run / "record")
             if (made.scenario.start, made.scenario.canvas) != (scenario.start, scenario.canvas):
                 raise CheckError(f"{run} is a recording of another {scenario.name}; record it again")
             found.setdefault((scenario.name, made.weather), run)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Generator
-from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -57,7 +55,7 @@ def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
         Place(
             scenario=each,
             weathers=(weather,),
-            factory=partial(_open_recordings, plan.recordings[each.name, weather], weather, device),
+            factory=partial(_in_recordings, plan.recordings[each.name, weather], weather, device),
             where=f"recorded:{plan.recordings[each.name, weather]}",
         )
         for each in plan.scenarios
@@ -65,10 +63,8 @@ def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
     )
 
 
-@contextmanager
-def _open_recordings(run: Path, weather: Weather, device: str) -> Generator[RecordedSimulator]:
-    with RecordedSimulator(load_recordings(run / "recordings"), weather=weather, device=device) as world:
-        yield world
+def _in_recordings(run: Path, weather: Weather, device: str) -> RecordedSimulator:
+    return RecordedSimulator(load_recordings(run / "recordings"), weather=weather, device=device)
 
 
 def command_of(plan: CheckPlan, place: Place, weather: Weather, pattern: str, seed: int, out: Path) -> str:

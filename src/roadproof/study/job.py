@@ -162,7 +162,7 @@ def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path
     first, calls_before, seconds_before = None, 0, 0.0
     if plan.start:
         # Record, calibrate and search the steering shift; the candidates are for the black box to drive.
-        budget = replace(STEERING, select=0, weathers=job.weathers[:1])
+        budget = replace(STEERING, select=0, starts=0, weathers=job.weathers[:1])
         found, calls_before, seconds_before = _searched(job, world, controller, folder / "start", budget)
         chosen = first_of_each_group(found.attack.candidates, plan.start)
         first = torch.stack([space.point(candidate.pattern) for _, candidate in chosen])
