@@ -57,7 +57,7 @@ def harden(
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
-    options.check_simulator(simulator, processes)
+    options.check_processes(simulator, processes)
     known = options.scenarios_of(scenarios)
 
     def named(names: str) -> list[Scenario]:
@@ -105,8 +105,7 @@ def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: i
     """The estimate of attacks, tuning and judging, where clean drives are those on all streets, before and after."""
     from roadproof.pipeline.estimate import Estimate, frame_seconds, of_drives, of_run, of_search
 
-    tuning = budget.tuning
-    learnt = Estimate(seconds=tuning.steps * tuning.batch * frame_seconds(who))
+    learnt = Estimate(seconds=budget.tuning.pictures * frame_seconds(who))
     whole = of_run(budget.attack, who, film=False).times((rounds + 1) * training) + learnt.times(rounds)
     whole += of_drives(budget.town_drives)
     if judging:

@@ -43,7 +43,7 @@ class HardeningBudget:
         TrainingError: the judging attack does not drive in the recorded world, or drives nothing.
     """
 
-    attack: Budget = field(default_factory=lambda: ALONE)
+    attack: Budget = field(default_factory=lambda: replace(ALONE, method=GradOpt(restarts=1)))
     tuning: Tuning = field(default_factory=Tuning)
     town_drives: int = 40
     judge: Budget = field(default_factory=lambda: replace(ALONE, starts=4))
@@ -95,7 +95,7 @@ HARDENING_BUDGETS = {
     "quick": HardeningBudget(),
     "full": HardeningBudget(
         attack=replace(ALONE, method=GradOpt(restarts=6), select=3),
-        tuning=Tuning(steps=4000),
+        tuning=Tuning(steps=20_000),
         town_drives=80,
         judge=replace(QUICK, select=4, starts=2),
         unseen=TPE(calls=400),

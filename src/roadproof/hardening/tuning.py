@@ -79,12 +79,12 @@ class Tuning:
         TrainingError: a number is out of range.
     """
 
-    steps: int = 600
+    steps: int = 2000
     batch: int = 48
     learning_rate: float = 1e-3
     bare: float = 0.25
     found: float = 0.5
-    climbs: int = 2
+    climbs: int = 8
     climb: float = 0.1
 
     def __post_init__(self) -> None:
@@ -96,6 +96,11 @@ class Tuning:
         for name in ("bare", "found"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
+
+    @property
+    def pictures(self) -> int:
+        """How many pictures the controller sees in all, those of climbing patterns included."""
+        return self.steps * self.batch * (2 + self.climbs) // 2
 
     def rate(self, step: int) -> float:
         """The learning rate of a step."""
