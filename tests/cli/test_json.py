@@ -116,7 +116,7 @@ def test_a_hardening_is_answered_as_its_file_has_it(invoke, tmp_path, monkeypatc
     def hardened(world, controller, training, out, **how):
         (out / "hardening.json").write_text(json.dumps({"format": "roadproof-hardening", "best": how["rounds"]}))
         done = (Round(0, {"left-07": 1.0}, 1.0),)
-        return Hardened(controller=controller, hardened=f"{out}/hardened", rounds=done, best=1, judgement=None)
+        return Hardened(controller=controller, hardened=f"{out}/hardened", rounds=done, best=1, judgement=None, cost={})
 
     for room, name, made_up in (("harden", "harden", hardened), ("page", "write_hardening", lambda _, out: out)):
         monkeypatch.setattr(import_module(f"roadproof.hardening.{room}"), name, made_up)

@@ -56,8 +56,8 @@ class Strip(Saved):
     Args:
         time_s: time of each picture since the start, seconds, (n,).
         lateral_m: distance of the painted drive beside the clean path at each picture, metres, left positive, (n,).
-        clean: camera pictures of the drive over the bare road, (n, h, w, 3).
-        painted: camera pictures of the drive over the paint, (n, h, w, 3).
+        clean: camera pictures of the drive over the bare road, (n, height, width, 3).
+        painted: camera pictures of the drive over the paint, (n, height, width, 3).
 
     Raises:
         EpisodeError: there are not as many of all.
@@ -65,8 +65,8 @@ class Strip(Saved):
 
     time_s: Float[np.ndarray, " n"]
     lateral_m: Float[np.ndarray, " n"]
-    clean: UInt8[np.ndarray, "n h w 3"]
-    painted: UInt8[np.ndarray, "n h w 3"]
+    clean: UInt8[np.ndarray, "n height width 3"]
+    painted: UInt8[np.ndarray, "n height width 3"]
 
     def __post_init__(self) -> None:
         if len({len(self.time_s), len(self.lateral_m), len(self.clean), len(self.painted)}) > 1:
