@@ -50,6 +50,7 @@ def test_the_strongest_attack_on_each_street_is_compared():
 def test_hardening_that_spoils_clean_driving_did_not_help():
     told = verdict(*HELPED, clean=(4, 3))
     assert (told.outcome, told.clean_worse) == ("did not help", True)
+    assert told.sentence.startswith("It helped against paint but not on the whole: over the strongest attack")
     assert told.sentence.endswith("fewer drives over the bare road are clean.")
 
 

@@ -108,8 +108,10 @@ class Verdict:
         between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
         outcome = {"helped": "It helped", "did not help": "It did not help", "not shown": "That it helped is not shown"}
         worse = "; fewer drives over the bare road are clean" if self.clean_worse else ""
+        paint_alone = self.clean_worse and c.high is not None and c.high < 0
+        begin = "It helped against paint but not on the whole" if paint_alone else outcome[self.outcome]
         return (
-            f"{outcome[self.outcome]}: over the strongest attack on streets not trained on it deviates by "
+            f"{begin}: over the strongest attack on streets not trained on it deviates by "
             f"{self.after_m:.2f} m instead of {self.before_m:.2f} m, {c.value:+.2f} m on average{between}; it leaves "
             f"its lane in {self.left_lane_after:.0%} of the drives instead of {self.left_lane_before:.0%}{worse}."
         )
