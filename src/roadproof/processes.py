@@ -10,9 +10,11 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, ExitStack
+from functools import cached_property
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -36,6 +38,26 @@ class Worker(Protocol):
 AnyWorker = TypeVar("AnyWorker", bound=Worker)
 Work = TypeVar("Work")
 Result = TypeVar("Result")
+
+
+class Opened(Generic[Result]):
+    """A worker that enters a context, such as a simulator, when it is first wanted.
+
+    Args:
+        factory: makes the context; it travels between processes.
+    """
+
+    def __init__(self, factory: Callable[[], AbstractContextManager[Result]]) -> None:
+        self._factory, self._stack = factory, ExitStack()
+
+    @cached_property
+    def inside(self) -> Result:
+        """What the context gives; it is left in `close`."""
+        return self._stack.enter_context(self._factory())
+
+    def close(self) -> None:
+        """Leave the context, if it was entered."""
+        self._stack.close()
 
 
 def spread(
@@ -66,8 +88,9 @@ def spread(
         return
     stop = multiprocessing.get_context("spawn").Event()
     with processes_beside(count, _begin_work, worker, stop, max(1, (os.cpu_count() or 1) // count)) as pool:
-        waiting = {pool.submit(_call, function, work): work for work in works}
         try:
+            # A process that dies at once breaks the pool before all is handed to it.
+            waiting = {pool.submit(_call, function, work): work for work in works}
             for future in as_completed(waiting):
                 yield waiting[future], future.result()
         except BrokenProcessPool:

@@ -7,13 +7,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import cycle
-from multiprocessing import get_context
-from multiprocessing.synchronize import Event
 
 import torch
 
@@ -21,19 +17,15 @@ from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
-from roadproof.errors import EpisodeError, PatternError, SimulatorError
+from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import DIED, processes_beside, require_picklable
+from roadproof.processes import Opened, require_picklable, spread
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
 
 PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
-_LOOK_S = 0.5
-
-_stop: Event | None = None
-"""In a process that shares drives with others: set once one of them has failed."""
 
 
 def evaluate(
@@ -193,51 +185,22 @@ def make_missing(
     made = len(drives) - len(missing)
     on_done(made)
     if factory is not None and processes > 1 and len(missing) > 1:
-        _make_together(factory, episodes, missing, processes, lambda done: on_done(made + done))
+        drives_made = spread(_make, missing, _Driving(factory, episodes), processes=processes)
+        for done, _ in enumerate(drives_made, made + 1):
+            on_done(done)
         return
     for done, drive in enumerate(missing, made + 1):
         episodes.make(world, drive)
         on_done(done)
 
 
-def _make_together(
-    factory: SimulatorFactory,
-    episodes: Episodes,
-    drives: Sequence[Conditions],
-    processes: int,
-    on_done: Callable[[int], object],
-) -> None:
-    """Share drives out among processes; progress is read from the folder."""
-    shares = [list(drives[k::processes]) for k in range(min(processes, len(drives)))]
-    stop = get_context("spawn").Event()
-    with processes_beside(len(shares), _until, stop) as pool:
-        running = [pool.submit(_make_share, factory, episodes, share) for share in shares]
-        try:
-            while (waiting := wait(running, timeout=_LOOK_S, return_when="FIRST_EXCEPTION")).not_done:
-                on_done(sum(episodes.has(drive) for drive in drives))
-                for future in waiting.done:
-                    future.result()
-            for future in running:
-                future.result()
-        except BrokenProcessPool:
-            raise SimulatorError(DIED) from None
-        except BaseException:
-            # The pool waits for its processes, which would drive on for as long as there is something to drive.
-            stop.set()
-            raise
-    on_done(len(drives))
+class _Driving(Opened[Simulator]):
+    """What a process makes drives with: a simulator, and the store with the driver, which travel there once."""
+
+    def __init__(self, factory: SimulatorFactory, episodes: Episodes) -> None:
+        super().__init__(factory)
+        self.episodes = episodes
 
 
-def _until(stop: Event) -> None:
-    """Have this process make drives until an event is set."""
-    global _stop
-    _stop = stop
-
-
-def _make_share(factory: SimulatorFactory, episodes: Episodes, drives: Sequence[Conditions]) -> None:
-    """Make one process' share of the drives."""
-    torch.set_num_threads(1)
-    with factory() as world:
-        for drive in drives:
-            if _stop is None or not _stop.is_set():
-                episodes.make(world, drive)
+def _make(driving: _Driving, drive: Conditions) -> None:
+    driving.episodes.make(driving.inside, drive)

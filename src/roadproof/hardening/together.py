@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
-from functools import cached_property, partial
+from functools import partial
 from typing import TypeAlias
 
 from roadproof.errors import TrainingError
 from roadproof.hardening.judgement import Judge
 from roadproof.hardening.run import Run
-from roadproof.processes import spread, stopping
+from roadproof.processes import Opened, spread, stopping
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
@@ -42,7 +41,7 @@ def together(
     Raises:
         RoadproofError: a stage of a street refuses, or a process died; the message says why.
     """
-    done = spread(partial(_on_street, work, run, number), scenarios, _Beside(factory), processes=processes)
+    done = spread(partial(_on_street, work, run, number), scenarios, Opened(factory), processes=processes)
     return (scenario for scenario, _ in done)
 
 
@@ -56,23 +55,8 @@ def judge_street(run: Run, simulator: Simulator, number: int, scenario: Scenario
     Judge(run, simulator, number, scenario, _go_on).judge()
 
 
-class _Beside:
-    """What a process drives in: a simulator, opened when it is first wanted."""
-
-    def __init__(self, factory: SimulatorFactory) -> None:
-        self._factory, self._open = factory, ExitStack()
-
-    @cached_property
-    def simulator(self) -> Simulator:
-        return self._open.enter_context(self._factory())
-
-    def close(self) -> None:
-        """Close the simulator, if there is one."""
-        self._open.close()
-
-
-def _on_street(work: StreetWork, run: Run, number: int, beside: _Beside, scenario: Scenario) -> None:
-    work(run, beside.simulator, number, scenario)
+def _on_street(work: StreetWork, run: Run, number: int, opened: Opened[Simulator], scenario: Scenario) -> None:
+    work(run, opened.inside, number, scenario)
 
 
 def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
