@@ -18,7 +18,7 @@ TARGET = torch.tensor([0.3, 0.8, 0.6, 0.2])
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer starts for the acquisition of the published search: its settings have a test of their own."""
-    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"n_random": 1000, "n_smart": 4})
+    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"drawn": 1000, "climbs": 4})
 
 
 def bowl(unit):
@@ -78,27 +78,26 @@ def test_published_bo_draws_first_and_is_guided_then(quick):
 
 def test_published_bo_has_its_settings(monkeypatch):
     """FACTS of the released code: EI with ξ = 0, isotropic Matérn-5/2 from 1.0, 25 restarts, 1e5 and 250 starts."""
-    from bayes_opt import acquisition
-
     seen = {}
 
-    def suggest(self, gp, target_space, n_random, n_smart, random_state):
-        seen.update(gp=gp, space=target_space, n_random=n_random, n_smart=n_smart, xi=self.xi)
-        return target_space.bounds.mean(1)
+    def most_promising(process, ranges, random, drawn, climbs):
+        seen.update(process=process, ranges=ranges, drawn=drawn, climbs=climbs)
+        return ranges / 2
 
-    monkeypatch.setattr(acquisition.ExpectedImprovement, "suggest", suggest)
+    monkeypatch.setattr(proposals, "most_promising", most_promising)
     space = SearchSpace(figures=2, family="published-bo")
     propose = proposals.published_bo(proposals.natural_ranges(space), 2, 42)
     tried = np.linspace(0.1, 0.9, 42).reshape(3, 14)
     point = propose(tried, np.array([1.0, 3.0, 2.0]), 1)
     assert np.allclose(point, 0.5)
-    assert seen["xi"] == 0.0
-    assert (seen["n_random"], seen["n_smart"]) == (100_000, 250)
-    assert seen["gp"].get_params()["kernel"].get_params()["nu"] == 2.5
-    assert seen["gp"].kernel.length_scale == 1.0
-    assert (seen["gp"].alpha, seen["gp"].normalize_y, seen["gp"].n_restarts_optimizer) == (1e-6, True, 25)
-    assert seen["space"].bounds[:, 1].tolist() == [180.0, 400.0, 100.0, 70.0, 250.0, 250.0, 250.0] * 2
-    assert np.allclose(seen["space"].params, tried * seen["space"].bounds[:, 1])
+    assert (seen["drawn"], seen["climbs"]) == (100_000, 250)
+    process = seen["process"]
+    assert process.kernel.nu == 2.5
+    assert process.kernel.length_scale == 1.0
+    assert (process.alpha, process.n_restarts_optimizer) == (1e-6, 25)
+    assert seen["ranges"].tolist() == [180.0, 400.0, 100.0, 70.0, 250.0, 250.0, 250.0] * 2
+    assert np.allclose(process.X_train_, tried * seen["ranges"])
+    assert np.allclose(process.y_train_, [-np.sqrt(1.5), np.sqrt(1.5), 0.0])
     assert proposals.natural_ranges(BO).tolist() == [180.0, 400.0, 80.0, 60.0]
 
 

@@ -37,7 +37,7 @@ class PullsToBrightPaint(torch.nn.Module):
 
 @pytest.mark.parametrize("word", [word for word in METHODS if word != Published.word])
 def test_whatever_the_search_its_patterns_obey(word, monkeypatch, tmp_path):
-    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"n_random": 500, "n_smart": 2})
+    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"drawn": 500, "climbs": 2})
     kind = METHODS[word]
     asked = {"iterations": 4, "restarts": 2, "halving": False} if kind is GradOpt else {"calls": 8}
     if word == "published-bo":

@@ -116,8 +116,8 @@ def check_files(result, figures, conditions=("clear-noon",)):
 
 @pytest.mark.slow
 def test_the_published_baseline_is_driven_and_judged(street, tmp_path, monkeypatch):
-    pytest.importorskip("bayes_opt", reason="bayesian-optimization is not installed")
-    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"n_random": 100, "n_smart": 1})
+    pytest.importorskip("sklearn", reason="scikit-learn is not installed")
+    monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"drawn": 100, "climbs": 1})
     result = run_job(job_of(BO, street), tmp_path)
     (row,) = result.rows
     assert (row["search_calls"], row["evaluation_calls"]) == (4, 2)

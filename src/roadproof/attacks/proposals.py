@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from roadproof.attacks.expected_improvement import most_promising
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
@@ -22,7 +23,7 @@ Propose: TypeAlias = Callable[
 ]
 """Points tried, their values, how many new ones are wanted; the new points."""
 
-PUBLISHED_ACQUISITION: dict[str, Any] = {"n_random": 100_000, "n_smart": 250}
+PUBLISHED_ACQUISITION = {"drawn": 100_000, "climbs": 250}
 """How the authors maximise the expected improvement: random points, and runs of L-BFGS-B."""
 
 _COLOUR_RANGE = 250.0
@@ -57,8 +58,7 @@ def published_bo(ranges: Float[np.ndarray, " d"], random_calls: int, seed: int) 
 
     Expected improvement (ξ = 0) of a Gaussian process with one Matérn-5/2 length for all inputs, which are not scaled;
     noise 1e-6, values normalised, 25 restarts of the fit; the improvement is maximised over 100,000 random points and
-    250 runs of L-BFGS-B. Theirs was version 1.0.1 of the same library; today's begins those runs at the best random
-    points, theirs began at others.
+    250 runs of L-BFGS-B.
 
     Args:
         ranges: range of each parameter in natural units, all beginning at 0, (D,).
@@ -66,12 +66,10 @@ def published_bo(ranges: Float[np.ndarray, " d"], random_calls: int, seed: int) 
         seed: seed of everything random; the authors' was 42.
     """
     try:
-        from bayes_opt import TargetSpace, acquisition
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import Matern
     except ImportError as error:
         raise _missing(error) from None
-    bounds = {f"p{index:03d}": (0.0, float(high)) for index, high in enumerate(ranges)}
 
     def propose(
         tried: Float[np.ndarray, "t d"], value: Float[np.ndarray, " t"], count: int
@@ -80,18 +78,14 @@ def published_bo(ranges: Float[np.ndarray, " d"], random_calls: int, seed: int) 
             drawn = np.random.RandomState(seed).uniform(size=(random_calls, len(ranges)))
             return drawn[len(tried) : len(tried) + count]
         state = np.random.RandomState(derived_seed(seed, len(tried)))  # the library takes no other
-        space = TargetSpace(None, bounds, random_state=state, allow_duplicate_points=True)
-        for point, found in zip(tried * ranges, value, strict=True):
-            space.register(point, float(found))
-        model = GaussianProcessRegressor(
-            kernel=Matern(nu=2.5), alpha=1e-6, normalize_y=True, n_restarts_optimizer=25, random_state=state
+        process = GaussianProcessRegressor(
+            kernel=Matern(nu=2.5), alpha=1e-6, n_restarts_optimizer=25, random_state=state
         )
-        improvement = acquisition.ExpectedImprovement(xi=0.0)
         with warnings.catch_warnings():
             # The length scale often ends at its bound on inputs that are not scaled; as published.
             warnings.simplefilter("ignore")
-            point = improvement.suggest(model, space, random_state=state, **PUBLISHED_ACQUISITION)
-        return np.asarray(point)[None] / ranges
+            process.fit(tried * ranges, (value - value.mean()) / (value.std() or 1.0))
+        return most_promising(process, ranges, state, **PUBLISHED_ACQUISITION)[None] / ranges
 
     return propose
 

@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from roadproof.attacks import BayesianOptimisation
 from roadproof.compositing import Variation
 from roadproof.controllers.loading import files_of
 from roadproof.datatypes import Weather
@@ -26,6 +27,7 @@ from roadproof.study.reading import beside, chosen_scenarios, refuse_untrusted, 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
 JOB_VERSION = 3
+JOB_VERSIONS = {BayesianOptimisation.word: 4}
 """Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
 
 BLACK = "1-b"
@@ -132,7 +134,8 @@ class Job(Conditions):
     @property
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
-        told: dict[str, Any] = {"job_version": JOB_VERSION, **asdict(self), "scenario": identity(self.scenario)}
+        version = JOB_VERSIONS.get(self.method.search, JOB_VERSION)
+        told: dict[str, Any] = {"job_version": version, **asdict(self), "scenario": identity(self.scenario)}
         # Jobs are older than these words; a map of the user's is known by what is in it, not by where it lies.
         tables = (
             (told, ("weights", "paint", "variation")),
