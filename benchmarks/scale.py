@@ -4,8 +4,9 @@
 
 One step of the steering search is timed on a drive of 22 to 352 frames, with 1 to 16 figures, and from 1 to 16 starts,
 beside the bare controller's passes to as many frames; drives over a painted road are timed by their number and by how
-many processes make them, and must be the same for any number. A whole search of each size is held against what
-`roadproof attack --dry-run` would say of it. Nothing else may run meanwhile. The plot has one panel for each question.
+many processes make them, and must be the same for any number; a guided proposal of Bayesian optimisation as published
+by the trials before it. A whole search of each size is held against what `roadproof attack --dry-run` would say of it.
+Nothing else may run meanwhile. The plot has one panel for each question.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import torch
 
 import roadproof
 from gradopt_step import milliseconds, synthetic_drive
-from roadproof.attacks import GradOpt, SteeringShift, Surrogate, attack, parse_groups
+from roadproof.attacks import GradOpt, SteeringShift, Surrogate, attack, parse_groups, proposals
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluate import evaluate
@@ -39,6 +40,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 FRAMES, FIGURES, STARTS = 88, 5, 1
 SIZES = {"frames": (22, 44, 88, 176, 352), "figures": (1, 2, 4, 8, 16), "starts": (1, 2, 4, 8, 16)}
 DRIVES = (2, 4, 8)
+TRIALS = (60, 140, 400, 1000)
 
 Record = dict[str, Any]
 
@@ -96,6 +98,17 @@ def drives(controller: str, count: int, processes: int) -> tuple[Record, np.ndar
     return {"drives": count, "processes": processes, "took_s": took_s}, np.array([t.deviation_m for t in found.trials])
 
 
+def proposal(trials: int) -> Record:
+    """The next point of Bayesian optimisation as published, after so many trials of a smooth value."""
+    space = SearchSpace(figures=FIGURES, family="published-bo")
+    ranges = proposals.natural_ranges(space)
+    tried = np.random.default_rng(0).uniform(size=(trials, len(ranges)))
+    propose = proposals.published_bo(ranges, 1, 0)
+    began = time.perf_counter()
+    propose(tried, np.sin(3 * tried).sum(1), 1)
+    return {"trials": trials, "took_s": time.perf_counter() - began}
+
+
 def sizes() -> Iterable[tuple[str, dict[str, int]]]:
     """Every size of a search, with what it is that grows."""
     for against, values in SIZES.items():
@@ -107,9 +120,11 @@ def draw(records: list[Record], path: Path) -> None:
     """One panel for each question, logarithmic both ways."""
     from matplotlib.figure import Figure
 
-    panels = [*SIZES, "drives", "processes", "estimate"]
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    for axes, against in zip(figure.subplots(2, 3).flat, panels, strict=True):
+    panels = [*SIZES, "drives", "processes", "trials", "estimate"]
+    figure = Figure(figsize=(14, 6.5), layout="constrained")
+    every = figure.subplots(2, 4)
+    every[-1, -1].axis("off")
+    for axes, against in zip(every.flat, panels, strict=False):
         mine = [each for each in records if each["against"] == against]
         for name in sorted({each["controller"] for each in mine}):
             of = [each for each in mine if each["controller"] == name]
@@ -146,6 +161,8 @@ def main() -> None:
         print(json.dumps(record), flush=True)
         write_json(given.json, {"benchmark": "scale", "made_with": made_with(), "records": records})
 
+    for trials in TRIALS:
+        keep({"against": "trials", "controller": "BO as published"} | proposal(trials))
     for name in given.controllers:
         controller = roadproof.load_controller(name)
         for against, size in sizes():
