@@ -11,11 +11,11 @@ from typing import cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from roadproof.controllers.frames import one_frame_batch
-from roadproof.controllers.protocol import Controller, PedalController, TemporalController
+from roadproof.controllers.protocol import Commands, Controller, Frames, PedalController, Speeds, TemporalController
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
@@ -24,9 +24,7 @@ from roadproof.io.pictures import MOST_PIXELS
 NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy, argmax or rounding on the way"
 
 
-def steer_of(
-    controller: Controller, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-) -> Float[Tensor, " b"]:
+def steer_of(controller: Controller, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
     """What `Controller.steer` answers, checked: steering of each frame, in steer units, (B,).
 
     Raises:
@@ -40,10 +38,7 @@ def steer_of(
 
 
 def controls_of(
-    controller: PedalController,
-    frames: Float[Tensor, "b 3 h w"],
-    speed_mps: Float[Tensor, " b"],
-    command: Int[Tensor, " b"],
+    controller: PedalController, frames: Frames, speed_mps: Speeds, command: Commands
 ) -> Float[Tensor, "b 3"]:
     """What `PedalController.controls` answers, checked: steer, throttle and brake of each frame, (B, 3).
 
@@ -59,9 +54,9 @@ def controls_of(
 def controls_after_of(
     controller: TemporalController,
     memory: object,
-    frames: Float[Tensor, "b 3 h w"],
-    speed_mps: Float[Tensor, " b"],
-    command: Int[Tensor, " b"],
+    frames: Frames,
+    speed_mps: Speeds,
+    command: Commands,
     elapsed_s: float,
 ) -> tuple[Float[Tensor, "b 3"], object]:
     """What `TemporalController.controls_after` answers, checked: controls of each car, (B, 3), and what it remembers.
@@ -84,12 +79,7 @@ def controls_after_of(
 
 
 def next_controls_of(
-    controller: Controller,
-    memory: object,
-    frames: Float[Tensor, "b 3 h w"],
-    speed_mps: Float[Tensor, " b"],
-    command: Int[Tensor, " b"],
-    elapsed_s: float,
+    controller: Controller, memory: object, frames: Frames, speed_mps: Speeds, command: Commands, elapsed_s: float
 ) -> tuple[Float[Tensor, "b c"], object]:
     """All that a controller of any kind says: steer, throttle and brake, (B, 3), or steer alone, (B, 1).
 
@@ -172,11 +162,7 @@ def frame_size_of(controller: Controller) -> tuple[int, int] | None:
 
 
 def answer_of(
-    controller: Controller,
-    member: str,
-    frames: Float[Tensor, "b 3 h w"],
-    speed_mps: Float[Tensor, " b"],
-    command: Int[Tensor, " b"],
+    controller: Controller, member: str, frames: Frames, speed_mps: Speeds, command: Commands
 ) -> Float[Tensor, "b ..."]:
     """What `steer` or `controls` answers, checked for shape, dtype and device, but not for its values.
 
@@ -187,7 +173,7 @@ def answer_of(
     return _checked(answer, member, frames)
 
 
-def _checked(answer: object, member: str, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b ..."]:
+def _checked(answer: object, member: str, frames: Frames) -> Float[Tensor, "b ..."]:
     """An answer with the promised shape, dtype and device."""
     what = f"the controller's {member}"
     shape = (len(frames),) if member == "steer" else (len(frames), 3)
@@ -217,7 +203,7 @@ def require_finite(answer: Float[Tensor, "b ..."], member: str) -> None:
         )
 
 
-def require_gradient(answer: Float[Tensor, "b ..."], frames: Float[Tensor, "b 3 h w"], member: str) -> None:
+def require_gradient(answer: Float[Tensor, "b ..."], frames: Frames, member: str) -> None:
     """Refuse an answer without gradients if the frames carry them.
 
     Raises:

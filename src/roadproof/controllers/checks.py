@@ -9,7 +9,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -22,7 +22,15 @@ from roadproof.controllers.asking import (
     frame_size_of,
     steer_of,
 )
-from roadproof.controllers.protocol import Controller, PedalController, TemporalController, missing_members
+from roadproof.controllers.protocol import (
+    Commands,
+    Controller,
+    Frames,
+    PedalController,
+    Speeds,
+    TemporalController,
+    missing_members,
+)
 from roadproof.datatypes import Command
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
@@ -88,9 +96,9 @@ _ON_A_COPY = "work on a copy: steer must not write into the frames it is given"
 class _Drive(NamedTuple):
     """Made-up frames with speeds and commands."""
 
-    frames: Float[Tensor, "b 3 h w"]
-    speed_mps: Float[Tensor, " b"]
-    command: Int[Tensor, " b"]
+    frames: Frames
+    speed_mps: Speeds
+    command: Commands
 
 
 def check_controller(

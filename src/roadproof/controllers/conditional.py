@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from roadproof.controllers.frames import one_frame_batch
+from roadproof.controllers.protocol import Commands, Frames, Speeds
 from roadproof.datatypes import Command, Control
 
 SPEED_SCALE_MPS = 25.0
@@ -49,7 +50,7 @@ class ConditionalNetwork(nn.Module):
     branches: nn.ModuleList
     speed_branch: nn.Module
 
-    def image_feature(self, frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b image"]:
+    def image_feature(self, frames: Frames) -> Float[Tensor, "b image"]:
         """The feature of what the frames show, in the network's own dtype."""
         raise NotImplementedError
 
@@ -57,9 +58,7 @@ class ConditionalNetwork(nn.Module):
         """The input of the heads, from the image feature and the scaled speed."""
         raise NotImplementedError
 
-    def forward(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> ConditionalOutput:
+    def forward(self, frames: Frames, speed_mps: Speeds, command: Commands) -> ConditionalOutput:
         """Controls and predicted speed, in the network's own dtype; what training needs.
 
         Args:
@@ -70,9 +69,7 @@ class ConditionalNetwork(nn.Module):
         image = self.image_feature(frames)
         return ConditionalOutput(self._controls(image, speed_mps, command), self.speed_branch(image)[:, 0])
 
-    def steer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
+    def steer(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
         """Steering, positive to the right, linear and not clipped; see `Controller.steer`.
 
         Raises:
@@ -80,9 +77,7 @@ class ConditionalNetwork(nn.Module):
         """
         return self._controls(self.image_feature(frames), speed_mps, command)[:, 0].to(frames.dtype)
 
-    def controls(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
+    def controls(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         """The published agent's steer, throttle and brake; see `controllers.PedalController`.
 
         It does not brake below 0.1, gives gas or brakes but not both, and gives no gas above 10 m/s.
@@ -101,23 +96,19 @@ class ConditionalNetwork(nn.Module):
             steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
         return Control(steer=steer, throttle=gas, brake=brake)
 
-    def _controls(
-        self, image: Float[Tensor, "b image"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
+    def _controls(self, image: Float[Tensor, "b image"], speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         joined = self.joined(image, (speed_mps / SPEED_SCALE_MPS).to(image.dtype)[:, None])
         return commanded(self.branches, joined, command)
 
 
-def commanded(
-    heads: nn.ModuleList, joined: Float[Tensor, "b joined"], command: Int[Tensor, " b"]
-) -> Float[Tensor, "b out"]:
+def commanded(heads: nn.ModuleList, joined: Float[Tensor, "b joined"], command: Commands) -> Float[Tensor, "b out"]:
     """What the head of each command answers."""
     # All heads, then the commanded one: they are half a percent of the work, and nothing waits for the device.
     every = torch.stack([head(joined) for head in heads], dim=1)
     return every.gather(1, branch_of(command)[:, None, None].expand(-1, 1, every.shape[2]))[:, 0]
 
 
-def branch_of(command: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
+def branch_of(command: Commands) -> Int[Tensor, " b"]:
     """Index of the head for CARLA's codes: follow (and 0, goal reached) 0, left 2, right 3, everything else 1."""
     branch = torch.ones_like(command, dtype=torch.int64)
     branch = branch.masked_fill((command == _FOLLOW) | (command == 0), 0)

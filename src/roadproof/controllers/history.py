@@ -10,10 +10,11 @@ from typing import TypeVar, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from roadproof.controllers.asking import act_after_of
+from roadproof.controllers.protocol import Commands, Frames, Speeds
 from roadproof.controllers.steering import SteeringController
 from roadproof.controllers.trajectory import TrajectoryController
 from roadproof.datatypes import Control
@@ -84,15 +85,11 @@ class HistoryController(nn.Module):
         """(height, width) of the frames it takes, or None when it takes any size."""
         return self.single.input_size
 
-    def steer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
+    def steer(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
         """Steering at frames that stand for all before them; see `Controller.steer`."""
         return self.single.steer(torch.stack([frames] * self.frames, 1), speed_mps, command)
 
-    def controls(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
+    def controls(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         """Controls at frames that stand for all before them; see `PedalController.controls`."""
         return self.single.controls(torch.stack([frames] * self.frames, 1), speed_mps, command)
 
@@ -101,12 +98,7 @@ class HistoryController(nn.Module):
         return act_after_of(self, None, frame, speed_mps, command, 0.0)[0]
 
     def controls_after(
-        self,
-        memory: object,
-        frames: Float[Tensor, "b 3 h w"],
-        speed_mps: Float[Tensor, " b"],
-        command: Int[Tensor, " b"],
-        elapsed_s: float,
+        self, memory: object, frames: Frames, speed_mps: Speeds, command: Commands, elapsed_s: float
     ) -> tuple[Float[Tensor, "b 3"], object]:
         """Controls after the frames so far; see `TemporalController.controls_after`."""
         before = cast("tuple[Tensor, ...] | None", memory)

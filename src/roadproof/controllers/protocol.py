@@ -10,6 +10,18 @@ from torch import Tensor
 
 from roadproof.datatypes import Control
 
+Frames = Float[Tensor, "b 3 h w"]
+"""RGB in [0, 1], one picture a car."""
+
+Stacks = Float[Tensor, "b *n 3 h w"]
+"""Frames, or for each car N of them, oldest first."""
+
+Speeds = Float[Tensor, " b"]
+"""Speed of the car at each frame, m/s."""
+
+Commands = Int[Tensor, " b"]
+"""What the route asks at each frame, in CARLA's codes (`datatypes.Command`)."""
+
 
 @runtime_checkable
 class Controller(Protocol):
@@ -27,9 +39,7 @@ class Controller(Protocol):
         """(height, width) of the frames it takes, or None when it takes any size."""
         ...
 
-    def steer(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
+    def steer(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
         """Steering of each frame by itself, differentiable in the frames.
 
         Args:
@@ -55,9 +65,7 @@ class PedalController(Controller, Protocol):
     one of these its own, also where paint changes it.
     """
 
-    def controls(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
+    def controls(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         """Steer, throttle and brake of each frame by itself, inside their ranges, differentiable in the frames.
 
         Args:
@@ -78,12 +86,7 @@ class TemporalController(Controller, Protocol):
     """
 
     def controls_after(
-        self,
-        memory: object,
-        frames: Float[Tensor, "b 3 h w"],
-        speed_mps: Float[Tensor, " b"],
-        command: Int[Tensor, " b"],
-        elapsed_s: float,
+        self, memory: object, frames: Frames, speed_mps: Speeds, command: Commands, elapsed_s: float
     ) -> tuple[Float[Tensor, "b 3"], object]:
         """Steer, throttle and brake of B cars at the next frame of their drives, and what is remembered from then on.
 

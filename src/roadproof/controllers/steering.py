@@ -8,10 +8,11 @@ from itertools import chain
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from roadproof.controllers.frames import FramePreparation, one_frame_batch
+from roadproof.controllers.protocol import Commands, Speeds, Stacks
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 
@@ -43,7 +44,7 @@ class CruiseControl:
         return Control(steer=steer, throttle=max(effort, 0.0), brake=max(-effort, 0.0)).clipped()
 
     def controls(
-        self, steer: Float[Tensor, " b"], speed_mps: Float[Tensor, " b"], target_mps: Float[Tensor, " b"] | None = None
+        self, steer: Float[Tensor, " b"], speed_mps: Speeds, target_mps: Float[Tensor, " b"] | None = None
     ) -> Float[Tensor, "b 3"]:
         """Controls of many cars: steer, throttle and brake inside their ranges, differentiable.
 
@@ -86,9 +87,7 @@ class NetworkController(nn.Module):
         """(height, width) of the frames it takes, or None when it takes any size."""
         return self.preparation.frame_size
 
-    def answer(
-        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> object:
+    def answer(self, frames: Stacks, speed_mps: Speeds, command: Commands) -> object:
         """What the network answers, in its own dtype.
 
         Raises:
@@ -103,7 +102,7 @@ class NetworkController(nn.Module):
         }
         return self.network(*(values[name] for name in self.inputs))
 
-    def _prepared(self, frames: Float[Tensor, "b *n 3 h w"]) -> Float[Tensor, "b *n 3 hn wn"]:
+    def _prepared(self, frames: Stacks) -> Float[Tensor, "b *n 3 hn wn"]:
         if frames.ndim == 4:
             return self.preparation(frames)
         prepared = self.preparation(frames.flatten(0, 1))
@@ -113,9 +112,7 @@ class NetworkController(nn.Module):
 class SteeringController(NetworkController):
     """A `Controller` around a network that answers with one steering value a frame, of shape (B,) or (B, 1)."""
 
-    def steer(
-        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
+    def steer(self, frames: Stacks, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
         """Steering, positive to the right and not clipped; see `Controller.steer`.
 
         Raises:
@@ -133,9 +130,7 @@ class SteeringController(NetworkController):
             )
         return answer.reshape(-1).to(frames.dtype)
 
-    def controls(
-        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
+    def controls(self, frames: Stacks, speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         """Steer by the network, throttle and brake by `cruise`; see `controllers.PedalController`.
 
         Raises:

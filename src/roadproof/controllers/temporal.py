@@ -18,11 +18,12 @@ from __future__ import annotations
 from typing import cast
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from roadproof.controllers.frames import FramePreparation
 from roadproof.controllers.history import TICK_S, kept_after
+from roadproof.controllers.protocol import Commands, Frames, Speeds
 from roadproof.controllers.tracking import LinearMPC, PurePursuit
 from roadproof.controllers.trajectory import Plan, TrajectoryController
 from roadproof.controllers.waypoint import FLAT, WAYPOINT_CRUISE, WAYPOINT_ON_CARLA, WaypointNet
@@ -57,22 +58,18 @@ class TemporalNet(WaypointNet):
         self,
         maps: Float[Tensor, "b c 6 13"],
         past: Float[Tensor, "b n m"],
-        speed_mps: Float[Tensor, " b"],
-        command: Int[Tensor, " b"],
+        speed_mps: Speeds,
+        command: Commands,
     ) -> Plan:
         """The plan that follows from a frame's maps and the past."""
         return self.plan(torch.cat([self.image(maps), self.recall(past)], 1), speed_mps, command)
 
-    def forward(
-        self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Plan:
+    def forward(self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Speeds, command: Commands) -> Plan:
         """The plan at the first frames of drives."""
         maps = self.maps(frames)
         return self.after(maps, maps.new_zeros(len(maps), NOTES, _NOTE), speed_mps, command)
 
-    def along(
-        self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Plan:
+    def along(self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Speeds, command: Commands) -> Plan:
         """The plans at every frame of windows of `WINDOW` frames, one window after the other, each a drive's first."""
         maps = self.maps(frames)
         notes = self.note(maps).unflatten(0, (-1, WINDOW))
@@ -87,19 +84,12 @@ class TemporalPlanner(TrajectoryController):
 
     network: TemporalNet
 
-    def along(
-        self, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Plan:
+    def along(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Plan:
         """The plans at every frame of windows of `WINDOW` frames, for training."""
         return self.network.along(self.preparation(frames), speed_mps, command)
 
     def controls_after(
-        self,
-        memory: object,
-        frames: Float[Tensor, "b 3 h w"],
-        speed_mps: Float[Tensor, " b"],
-        command: Int[Tensor, " b"],
-        elapsed_s: float,
+        self, memory: object, frames: Frames, speed_mps: Speeds, command: Commands, elapsed_s: float
     ) -> tuple[Float[Tensor, "b 3"], object]:
         """Controls after what was seen so far; see `TemporalController.controls_after`."""
         network = self.network

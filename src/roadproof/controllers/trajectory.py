@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from roadproof.controllers.frames import FramePreparation, one_frame_batch
+from roadproof.controllers.protocol import Commands, Speeds, Stacks
 from roadproof.controllers.steering import CruiseControl, NetworkController
 from roadproof.controllers.tracking import LinearMPC, PurePursuit, lengths_of
 from roadproof.datatypes import Control
@@ -60,9 +61,7 @@ class TrajectoryController(NetworkController):
         self.law = law or PurePursuit()
         self.dt_s = dt_s
 
-    def forward(
-        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Plan:
+    def forward(self, frames: Stacks, speed_mps: Speeds, command: Commands) -> Plan:
         """The plan for each frame, differentiable in the frames.
 
         Raises:
@@ -86,9 +85,7 @@ class TrajectoryController(NetworkController):
         steps = torch.diff(torch.cat([torch.zeros_like(path[:, :1]), path], 1), dim=1)
         return Plan(path, lengths_of(steps).mean(1) / self.dt_s)
 
-    def steer(
-        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
+    def steer(self, frames: Stacks, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
         """Steering along the plan, positive to the right and not clipped; see `Controller.steer`.
 
         Raises:
@@ -96,9 +93,7 @@ class TrajectoryController(NetworkController):
         """
         return self.steer_along(self(frames, speed_mps, command), speed_mps).to(frames.dtype)
 
-    def controls(
-        self, frames: Float[Tensor, "b *n 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Float[Tensor, "b 3"]:
+    def controls(self, frames: Stacks, speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         """Steer along the plan, throttle and brake by its speed; see `controllers.PedalController`.
 
         Raises:
@@ -112,11 +107,11 @@ class TrajectoryController(NetworkController):
             steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
         return Control(steer=steer, throttle=gas, brake=brake)
 
-    def controls_along(self, plan: Plan, speed_mps: Float[Tensor, " b"]) -> Float[Tensor, "b 3"]:
+    def controls_along(self, plan: Plan, speed_mps: Speeds) -> Float[Tensor, "b 3"]:
         """Steer, throttle and brake along a plan that was made already, inside their ranges, (B, 3)."""
         return self.cruise.controls(self.steer_along(plan, speed_mps), speed_mps, plan.target_mps)
 
-    def steer_along(self, plan: Plan, speed_mps: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+    def steer_along(self, plan: Plan, speed_mps: Speeds) -> Float[Tensor, " b"]:
         """Steering along a plan that was made already, positive to the right, (B,)."""
         # A network may compute in half precision; distances squared need more.
         return self.law.steer(plan.path.float() if plan.path.dtype.itemsize < 4 else plan.path, speed_mps)

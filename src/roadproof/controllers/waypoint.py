@@ -16,13 +16,14 @@ References:
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from roadproof.controllers.cil import CentredBatchNorm2d
 from roadproof.controllers.conditional import BRANCHES, SPEED_SCALE_MPS, commanded
 from roadproof.controllers.frames import FramePreparation
+from roadproof.controllers.protocol import Commands, Speeds
 from roadproof.controllers.steering import CruiseControl
 from roadproof.controllers.tracking import LinearMPC, PurePursuit
 from roadproof.controllers.trajectory import Plan, TrajectoryController
@@ -68,9 +69,7 @@ class WaypointNet(nn.Module):
 
     straight: Float[Tensor, "n 2"]
 
-    def forward(
-        self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
-    ) -> Plan:
+    def forward(self, frames: Float[Tensor, "b 3 88 200"], speed_mps: Speeds, command: Commands) -> Plan:
         """The path and the speed of the commanded head."""
         return self.plan(self.image(self.maps(frames)), speed_mps, command)
 
@@ -78,7 +77,7 @@ class WaypointNet(nn.Module):
         """The feature maps of each frame, from which its image feature is made."""
         return self.squeeze(self.blocks(functional.silu(self.stem(frames))))
 
-    def plan(self, features: Float[Tensor, "b f"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]) -> Plan:
+    def plan(self, features: Float[Tensor, "b f"], speed_mps: Speeds, command: Commands) -> Plan:
         """The path and the speed that the commanded head makes of features."""
         joined = torch.cat([features, speed_mps[:, None] / SPEED_SCALE_MPS], 1)
         answer = commanded(self.heads, joined, command)
