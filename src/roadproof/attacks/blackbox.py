@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks import proposals
-from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
+from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.driven import DrivenMeasure
 from roadproof.attacks.gradopt import Running, Search
 from roadproof.attacks.groups import Group, parse_groups
@@ -236,7 +236,10 @@ def blackbox_search(
     # More calls are the same search, gone on with.
     fields = {name: each for name, each in asdict(method).items() if name != "calls"}
     identity = repr((space, method.word, fields, seed, at_once, given, world))
-    trials = _resumed(checkpoint, space, identity, aim)
+    keeping = Checkpoint(checkpoint, identity, aim)
+    nothing = torch.empty(0, dtype=torch.float64)
+    none = {"unit": nothing.new_empty(0, space.figures, len(space.names)), "value": nothing, "seconds": nothing}
+    trials = Trials(**keeping.load(torch.device("cpu")) or none)
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
     while len(trials) < method.calls:
@@ -254,19 +257,9 @@ def blackbox_search(
         trials = Trials(
             torch.cat([trials.unit, unit]), torch.cat([trials.value, found]), torch.cat([trials.seconds, now])
         )
-        if checkpoint:
-            state = {"unit": trials.unit, "value": trials.value, "seconds": trials.seconds}
-            save_checkpoint(checkpoint, identity, state, aim=aim)
+        keeping.save({"unit": trials.unit, "value": trials.value, "seconds": trials.seconds})
         on_step(len(trials), float(trials.value.max()))
     return trials
-
-
-def _resumed(checkpoint: Path | None, space: SearchSpace, identity: str, aim: str) -> Trials:
-    state = load_checkpoint(checkpoint, identity, torch.device("cpu"), aim=aim) if checkpoint else None
-    if state is not None:
-        return Trials(state["unit"], state["value"], state["seconds"])
-    nothing = torch.empty(0, dtype=torch.float64)
-    return Trials(nothing.new_empty(0, space.figures, len(space.names)), nothing, nothing)
 
 
 def at_least_one(method: object, *names: str) -> None:

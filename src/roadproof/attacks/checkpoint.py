@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,47 +15,49 @@ from roadproof.io.files import write_tensors
 from roadproof.io.identity import digest
 
 
-def save_checkpoint(path: Path, identity: str, state: dict[str, Tensor], *, aim: str = "") -> None:
-    """Write the tensors of a search, marked with the identity of that search.
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """The file that keeps a running search, marked with the identity of that search.
 
     Args:
-        path: file to write.
+        path: file that keeps the search; None keeps nothing.
         identity: text that tells this search from every other.
-        state: the tensors of the search by name.
         aim: name of the objective; empty where nobody said.
-
-    Raises:
-        OutputError: the file cannot be written.
     """
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-    write_tensors(path, tensors, {"identity": digest(identity), "aim": aim})
 
+    path: Path | None
+    identity: str
+    aim: str = ""
 
-def load_checkpoint(path: Path, identity: str, device: torch.device, *, aim: str = "") -> dict[str, Tensor] | None:
-    """The tensors of a search; None if there is no file, it is damaged, or it belongs to another search.
+    def save(self, state: dict[str, Tensor]) -> None:
+        """Write the tensors of the search by name.
 
-    Args:
-        path: file that may hold a search.
-        identity: text that tells this search from every other.
-        device: torch device of the tensors.
-        aim: name of the objective; empty where nobody said.
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        if self.path is not None:
+            tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+            write_tensors(self.path, tensors, {"identity": digest(self.identity), "aim": self.aim})
 
-    Raises:
-        RoadproofError: the file holds a search for another objective.
-    """
-    if not path.exists():
-        return None
-    try:
-        with cast("Any", safe_open)(path, framework="pt") as stored:
-            metadata: dict[str, str] = stored.metadata() or {}
-            if (other := metadata.get("aim", "")) != aim and other and aim:
-                raise RoadproofError(
-                    f"{path} holds an interrupted search for the {other}, this one is for the {aim}; choose another "
-                    "folder, or remove it"
-                )
-            if metadata.get("identity") != digest(identity):
-                return None
-            names: list[str] = stored.keys()
-            return {name: stored.get_tensor(name).to(device) for name in names}
-    except (SafetensorError, OSError):
-        return None
+    def load(self, device: torch.device) -> dict[str, Tensor] | None:
+        """The tensors on a device; None if there is no file, it is damaged, or it belongs to another search.
+
+        Raises:
+            RoadproofError: the file holds a search for another objective.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        try:
+            with cast("Any", safe_open)(self.path, framework="pt") as stored:
+                metadata: dict[str, str] = stored.metadata() or {}
+                if (other := metadata.get("aim", "")) != self.aim and other and self.aim:
+                    raise RoadproofError(
+                        f"{self.path} holds an interrupted search for the {other}, this one is for the {self.aim}; "
+                        "choose another folder, or remove it"
+                    )
+                if metadata.get("identity") != digest(self.identity):
+                    return None
+                names: list[str] = stored.keys()
+                return {name: stored.get_tensor(name).to(device) for name in names}
+        except (SafetensorError, OSError):
+            return None

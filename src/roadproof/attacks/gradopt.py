@@ -24,7 +24,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from roadproof.attacks.captured import Replay, in_words, replay_of
-from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
+from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.objective import Measure, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, side_by_side
@@ -166,11 +166,11 @@ def gradopt(
         Eqs. tloss and composite; "Computing Adversarial Perturbations" of the paper.
     """
     seed, starts = running["seed"], running.get("starts", ())
-    checkpoint, on_step = running.get("checkpoint"), running.get("on_step", lambda _iteration, _best: None)
-    aim = running.get("aim", "")
+    on_step = running.get("on_step", lambda _iteration, _best: None)
     given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
-    state = load_checkpoint(checkpoint, identity, measure.device, aim=aim) if checkpoint else None
+    checkpoint = Checkpoint(running.get("checkpoint"), identity, running.get("aim", ""))
+    state = checkpoint.load(measure.device)
     at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
     if state is None:
         state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
@@ -201,10 +201,9 @@ def gradopt(
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
             state = replay.go_on() if isinstance(replay, Replay) else _step(beside, space, state, **adam)
             on_step(done + int(state["done"]), float(state["best"].max()))
-            if checkpoint:
-                frames = measure.frames_evaluated + (0 if climbed is measure else climbed.frames_evaluated)
-                whole = state | {"rung": torch.tensor(number), "frames": torch.tensor(frames), "behind": behind}
-                save_checkpoint(checkpoint, identity, whole, aim=aim)
+            frames = measure.frames_evaluated + (0 if climbed is measure else climbed.frames_evaluated)
+            told = {"rung": torch.tensor(number), "frames": torch.tensor(frames), "behind": behind}
+            checkpoint.save(state | told)
         # The memory of a graph is free before the next is recorded.
         del replay
         if climbed is not measure:

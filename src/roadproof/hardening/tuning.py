@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from roadproof.attacks.checkpoint import load_checkpoint, save_checkpoint
+from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of
 from roadproof.controllers.conditional import ConditionalNetwork
@@ -207,12 +207,12 @@ def _keep(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, path
     kept = {"steps": torch.tensor(steps)}
     for k, each in enumerate(parameters):
         kept |= {f"{k}.value": each} | {f"{k}.{name}": moment for name, moment in optimiser.state[each].items()}
-    save_checkpoint(path, "", kept)
+    Checkpoint(path, "").save(kept)
 
 
 def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, path: Path) -> int:
     """Put back what a file keeps, where there is one that is whole; the number of steps done."""
-    kept = load_checkpoint(path, "", parameters[0].device)
+    kept = Checkpoint(path, "").load(parameters[0].device)
     if kept is None:
         return 0
     for k, each in enumerate(parameters):
