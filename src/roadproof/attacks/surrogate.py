@@ -20,7 +20,7 @@ from roadproof.attacks.groups import STEERED, Group, divergence, require_directi
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import answer_of, require_gradient, steer_of
+from roadproof.controllers.asking import steer_of
 from roadproof.errors import ControllerError
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
@@ -225,11 +225,7 @@ class Surrogate:
 
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
         self.frames_evaluated += len(frames)
-        if self._replayed:
-            answer = answer_of(self.controller, "steer", frames, speed, command)
-            require_gradient(answer, frames, "steer")
-            return answer.float()
-        return steer_of(self.controller, frames, speed, command).float()
+        return steer_of(self.controller, frames, speed, command, finite=not self._replayed).float()
 
 
 def _repeated(pattern: Pattern, times: int) -> Pattern:

@@ -24,17 +24,24 @@ from roadproof.io.pictures import MOST_PIXELS
 NO_GRADIENT = "compute it in torch from the frames on: no detach, no_grad, numpy, argmax or rounding on the way"
 
 
-def steer_of(controller: Controller, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, " b"]:
+def steer_of(
+    controller: Controller, frames: Frames, speed_mps: Speeds, command: Commands, *, finite: bool = True
+) -> Float[Tensor, " b"]:
     """What `Controller.steer` answers, checked: steering of each frame, in steer units, (B,).
+
+    Args:
+        controller: the controller.
+        frames: RGB in [0, 1], (B, 3, H, W).
+        speed_mps: speed of the car at each frame, m/s, (B,).
+        command: what the route asks at each frame, in CARLA's codes, (B,).
+        finite: whether to look for NaN and infinity, for which the device is waited for.
 
     Raises:
         ControllerError: the controller raises, or does not answer with one finite number per frame that is
             differentiable in frames that carry gradients; the message names what came.
     """
     answer = answer_of(controller, "steer", frames, speed_mps, command)
-    require_finite(answer, "steer")
-    require_gradient(answer, frames, "steer")
-    return answer
+    return _usable(answer, "steer", frames, finite=finite)
 
 
 def controls_of(
@@ -45,10 +52,7 @@ def controls_of(
     Raises:
         ControllerError: the controller raises, or answers wrongly, as in `steer_of` but with three numbers per frame.
     """
-    answer = answer_of(controller, "controls", frames, speed_mps, command)
-    require_finite(answer, "controls")
-    require_gradient(answer, frames, "controls")
-    return answer
+    return _usable(answer_of(controller, "controls", frames, speed_mps, command), "controls", frames)
 
 
 def controls_after_of(
@@ -72,10 +76,7 @@ def controls_after_of(
         found = _in_words(cast("object", pair))
         raise ControllerError(f"{what} answered {found}, expected a tuple: the controls, and what it remembers")
     answer, after = answers
-    controls = _checked(answer, member, frames)
-    require_finite(controls, member)
-    require_gradient(controls, frames, member)
-    return controls, after
+    return _usable(_checked(answer, member, frames), member, frames), after
 
 
 def next_controls_of(
@@ -188,29 +189,19 @@ def _checked(answer: object, member: str, frames: Frames) -> Float[Tensor, "b ..
     return answer
 
 
-def require_finite(answer: Float[Tensor, "b ..."], member: str) -> None:
-    """Refuse an answer with NaN or infinity in it.
-
-    Raises:
-        ControllerError: the answer has such values; the message says for how many frames.
-    """
-    finite = answer.detach().isfinite()
-    if not bool(finite.all()):
-        broken = int((~finite.reshape(len(answer), -1).all(1)).sum())
+def _usable(
+    answer: Float[Tensor, "b ..."], member: str, frames: Frames, *, finite: bool = True
+) -> Float[Tensor, "b ..."]:
+    """An answer that is finite, where that is looked for, and has a gradient if the frames carry them."""
+    if finite and not bool((known := answer.detach().isfinite()).all()):
+        broken = int((~known.reshape(len(answer), -1).all(1)).sum())
         raise ControllerError(
             f"the controller's {member} answered NaN or infinity for {broken} of {len(answer)} frames; check its "
             "weights, divisions by zero and logarithms"
         )
-
-
-def require_gradient(answer: Float[Tensor, "b ..."], frames: Frames, member: str) -> None:
-    """Refuse an answer without gradients if the frames carry them.
-
-    Raises:
-        ControllerError: the answer has no gradient.
-    """
     if torch.is_grad_enabled() and frames.requires_grad and not answer.requires_grad:
         raise ControllerError(f"the controller's {member} answered without a gradient to the frames; {NO_GRADIENT}")
+    return answer
 
 
 def _in_words(value: object) -> str:
