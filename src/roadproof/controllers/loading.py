@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from roadproof.controllers.asking import frame_size_of
-from roadproof.controllers.cards import PLANNERS, ControllerCard, read_card
+from roadproof.controllers.cards import ControllerCard, read_card
 from roadproof.controllers.cil import CIL
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
@@ -27,12 +27,11 @@ from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.steering import CruiseControl, NetworkController
 from roadproof.controllers.temporal import TemporalNet, temporal_controller
 from roadproof.controllers.trajectory import TrajectoryController
-from roadproof.controllers.waypoint import WAYPOINT_ON_CARLA, WaypointNet, waypoint_controller
+from roadproof.controllers.waypoint import WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
 from roadproof.io.files import AnyPath, as_path, write_tensors
 
-ARCHITECTURES = ("cil", "pilotnet", "conditional-pilotnet", *PLANNERS)
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
     "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, "
@@ -41,6 +40,19 @@ SPECS = (
 )
 
 _METADATA_KEY = "roadproof"
+
+ARCHITECTURES: dict[str, Callable[[ControllerCard], CIL | ConditionalPilotNet | NetworkController]] = {
+    "cil": lambda card: CIL(width=card.width),
+    "pilotnet": lambda card: pilotnet_controller(
+        activation=card.activation,
+        preparation=card.preparation or PILOTNET_ON_CARLA,
+        cruise=CruiseControl(target_mps=card.target_speed_mps),
+    ),
+    "conditional-pilotnet": lambda card: ConditionalPilotNet(preparation=card.preparation or PILOTNET_ON_CARLA),
+    "waypoint": lambda card: waypoint_controller(preparation=card.preparation, law=card.tracking),
+    "temporal": lambda card: temporal_controller(preparation=card.preparation, law=card.tracking),
+}
+"""What makes the network that a card describes, with fresh weights, by the name of its architecture."""
 
 
 def runs_code(spec: str) -> bool:
@@ -231,22 +243,9 @@ def _from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
             f"{path} says {found} about its architecture; write {' or '.join(f'{a}:{path}' for a in ARCHITECTURES)}, "
             f"or put a card beside it as {path.with_suffix('.json').name}"
         )
-    if card.architecture in ("cil", "conditional-pilotnet"):
-        network = CIL(width=card.width) if card.architecture == "cil" else _conditional_pilotnet(card)
-        _fill(network, state, path)
-        return network
-    if card.architecture in PLANNERS:
-        fresh = waypoint_controller if card.architecture == "waypoint" else temporal_controller
-        planner = fresh(preparation=card.preparation or WAYPOINT_ON_CARLA, law=card.tracking)
-        _fill(planner.network, state, path)
-        return planner
-    controller = pilotnet_controller(
-        activation=card.activation,
-        preparation=card.preparation or PILOTNET_ON_CARLA,
-        cruise=CruiseControl(target_mps=card.target_speed_mps),
-    )
-    _fill(controller.network, state, path)
-    return controller
+    made = ARCHITECTURES[card.architecture](card)
+    _fill(made.network if isinstance(made, NetworkController) else made, state, path)
+    return made
 
 
 def _read_weights(path: Path) -> tuple[dict[str, Shaped[Tensor, "..."]], str | None]:
@@ -258,10 +257,6 @@ def _read_weights(path: Path) -> tuple[dict[str, Shaped[Tensor, "..."]], str | N
     except (SafetensorError, OSError) as error:
         raise ControllerError(f"{path} is not a safetensors file or is damaged: {error}") from error
     return state, metadata.get(_METADATA_KEY)
-
-
-def _conditional_pilotnet(card: ControllerCard) -> ConditionalPilotNet:
-    return ConditionalPilotNet(preparation=card.preparation or PILOTNET_ON_CARLA)
 
 
 def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Path) -> None:
