@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from roadproof.controllers.frames import one_frame_batch
+from roadproof.controllers.frames import control_of
 from roadproof.controllers.protocol import Commands, Frames, Speeds
 from roadproof.datatypes import Command, Control
 
@@ -92,9 +92,7 @@ class ConditionalNetwork(nn.Module):
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """The control that `controls` gives for one frame."""
-        with torch.no_grad():
-            steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
-        return Control(steer=steer, throttle=gas, brake=brake)
+        return control_of(self, frame, speed_mps, command)
 
     def _controls(self, image: Float[Tensor, "b image"], speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         joined = self.joined(image, (speed_mps / SPEED_SCALE_MPS).to(image.dtype)[:, None])

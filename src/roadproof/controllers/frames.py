@@ -14,6 +14,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from roadproof.constants import constant, kept
+from roadproof.controllers.protocol import PedalController
+from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 
 
@@ -105,6 +107,14 @@ def one_frame_batch(
         torch.tensor([speed_mps], dtype=torch.float32, device=device),
         torch.tensor([int(command)], device=device),
     )
+
+
+def control_of(
+    controller: PedalController, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int
+) -> Control:
+    """The control that a controller's `controls` gives for one camera frame."""
+    with torch.no_grad():
+        return Control(*map(float, controller.controls(*one_frame_batch(controller, frame, speed_mps, command))[0]))
 
 
 def yuv_from_rgb(frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:

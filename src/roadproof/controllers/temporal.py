@@ -26,7 +26,7 @@ from roadproof.controllers.history import TICK_S, kept_after
 from roadproof.controllers.protocol import Commands, Frames, Speeds
 from roadproof.controllers.tracking import LinearMPC, PurePursuit
 from roadproof.controllers.trajectory import Plan, TrajectoryController
-from roadproof.controllers.waypoint import FLAT, WAYPOINT_CRUISE, WAYPOINT_ON_CARLA, WaypointNet
+from roadproof.controllers.waypoint import FLAT, WaypointNet, planner
 from roadproof.controllers.weights import seeded
 
 NOTES, APART_S = 7, 0.1
@@ -102,22 +102,7 @@ class TemporalPlanner(TrajectoryController):
 
 
 def temporal_controller(
-    *,
-    preparation: FramePreparation = WAYPOINT_ON_CARLA,
-    law: PurePursuit | LinearMPC | None = None,
-    seed: int = 0,
+    *, preparation: FramePreparation | None = None, law: PurePursuit | LinearMPC | None = None, seed: int = 0
 ) -> TemporalPlanner:
-    """The network as a controller, with fresh weights.
-
-    Args:
-        preparation: how the network's 88×200 input is made from the frames; by default from those of CARLA's agent.
-        law: law that steers along the path; None for pure pursuit as the expert steers.
-        seed: seed of the initial weights.
-    """
-    return TemporalPlanner(
-        TemporalNet(seed=seed),
-        preparation=preparation,
-        law=law,
-        inputs=("frames", "speed_mps", "command"),
-        cruise=WAYPOINT_CRUISE,
-    )
+    """The network as a controller, with fresh weights; its arguments are those of `waypoint_controller`."""
+    return planner(TemporalPlanner, TemporalNet(seed=seed), preparation, law)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from roadproof.controllers.frames import FramePreparation, one_frame_batch
+from roadproof.controllers.frames import FramePreparation, control_of
 from roadproof.controllers.protocol import Commands, Speeds, Stacks
 from roadproof.controllers.steering import CruiseControl, NetworkController
 from roadproof.controllers.tracking import LinearMPC, PurePursuit, lengths_of
@@ -103,9 +103,7 @@ class TrajectoryController(NetworkController):
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """The control that `controls` gives for one frame."""
-        with torch.no_grad():
-            steer, gas, brake = map(float, self.controls(*one_frame_batch(self, frame, speed_mps, command))[0])
-        return Control(steer=steer, throttle=gas, brake=brake)
+        return control_of(self, frame, speed_mps, command)
 
     def controls_along(self, plan: Plan, speed_mps: Speeds) -> Float[Tensor, "b 3"]:
         """Steer, throttle and brake along a plan that was made already, inside their ranges, (B, 3)."""

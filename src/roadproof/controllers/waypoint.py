@@ -15,6 +15,8 @@ References:
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -37,6 +39,8 @@ WAYPOINT_ON_CARLA = FramePreparation(frame_size=(88, 200), mean=(0.5, 0.5, 0.5),
 
 WAYPOINT_CRUISE = CruiseControl(gain_per_mps=0.36, hold=0.04)
 """The pedals of the expert in the town, which the target speeds are learnt for."""
+
+Kind = TypeVar("Kind", bound=TrajectoryController)
 
 _CHANNELS, _SQUEEZED, _HEAD = (16, 32, 64, 96, 96), 16, 128
 _STRIDES = (2, 2, 2, 1)
@@ -103,10 +107,7 @@ class _Block(nn.Module):
 
 
 def waypoint_controller(
-    *,
-    preparation: FramePreparation = WAYPOINT_ON_CARLA,
-    law: PurePursuit | LinearMPC | None = None,
-    seed: int = 0,
+    *, preparation: FramePreparation | None = None, law: PurePursuit | LinearMPC | None = None, seed: int = 0
 ) -> TrajectoryController:
     """The network as a controller, with fresh weights.
 
@@ -115,9 +116,16 @@ def waypoint_controller(
         law: law that steers along the path; None for pure pursuit as the expert steers.
         seed: seed of the initial weights.
     """
-    return TrajectoryController(
-        WaypointNet(seed=seed),
-        preparation=preparation,
+    return planner(TrajectoryController, WaypointNet(seed=seed), preparation, law)
+
+
+def planner(
+    kind: type[Kind], network: WaypointNet, preparation: FramePreparation | None, law: PurePursuit | LinearMPC | None
+) -> Kind:
+    """A controller of some kind around the network; preparation and law are those of `waypoint_controller`."""
+    return kind(
+        network,
+        preparation=preparation or WAYPOINT_ON_CARLA,
         law=law,
         inputs=("frames", "speed_mps", "command"),
         cruise=WAYPOINT_CRUISE,
