@@ -184,18 +184,7 @@ def kept_attack(
 ) -> AttackResult:
     """Search once: if the folder already holds the result of this search, read it instead.
 
-    Args:
-        folder: folder of the result; it also keeps the checkpoint of the running search.
-        recordings: calibrated recordings of the drives, as in `attack`.
-        controller: the controller that is attacked; it computes on `device`.
-        space: the search space: the patterns that are allowed.
-        objective: what the search makes large, as in `attack`.
-        method: the search method, as in `attack`.
-        groups: groups of recorded drives, each attacked together; the method's own by default.
-        seed: seed of everything random.
-        device: torch device on which the search computes.
-        starts: candidates of an earlier search to start from, each in its own group.
-        on_step: called after every step with its number and the best value so far.
+    `folder` is that of the result, and keeps the checkpoint of the running search; all else is as in `attack`.
 
     Raises:
         RoadproofError: the stored result is damaged or belongs to another search, or the search itself fails.

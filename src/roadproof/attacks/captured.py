@@ -12,6 +12,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from typing import TypedDict, Unpack
 
 import torch
 
@@ -28,6 +29,22 @@ LOOK_S = 0.5
 _HELD = ("unit", "best_unit", "best", "exp_avg", "exp_avg_sq")
 
 
+class Steps(TypedDict):
+    """The steps of one rung.
+
+    Args:
+        learning_rate: Adam's learning rate.
+        momentum: Adam's β₁.
+        iterations: number of steps of the rung.
+        state: the state that the steps begin with; it is not changed.
+    """
+
+    learning_rate: float
+    momentum: float
+    iterations: int
+    state: State
+
+
 class Replay:
     """The steps of one rung, on tensors that stay where they are.
 
@@ -35,10 +52,7 @@ class Replay:
         measure: the measure that is made large, whose frames are counted.
         same: the measure whose steps are the same operations every time, see `Surrogate.replayable`.
         space: the search space.
-        learning_rate: Adam's learning rate.
-        momentum: Adam's β₁.
-        iterations: number of steps of the rung.
-        state: the state that the steps begin with; it is not changed.
+        **steps: learning rate, momentum, iterations and state; see `Steps`.
 
     Attributes:
         again: takes one step more, which nobody waits for or looks at; `go_on` is what a search calls.
@@ -48,20 +62,13 @@ class Replay:
     """
 
     def __init__(
-        self,
-        measure: RecordedMeasure,
-        same: RecordedMeasure,
-        space: SearchSpace,
-        *,
-        learning_rate: float,
-        momentum: float,
-        iterations: int,
-        state: State,
+        self, measure: RecordedMeasure, same: RecordedMeasure, space: SearchSpace, **steps: Unpack[Steps]
     ) -> None:
+        state, momentum = steps["state"], steps["momentum"]
         self._measure, self._same, self._space, self._momentum = measure, same, space, momentum
-        self._done, self._left = int(state["done"]), iterations - int(state["done"])
+        self._done, self._left = int(state["done"]), steps["iterations"] - int(state["done"])
         unit, history = state["unit"], state["history"]
-        numbers = [corrected(learning_rate, momentum, 1 + self._done + k) for k in range(self._left)]
+        numbers = [corrected(steps["learning_rate"], momentum, 1 + self._done + k) for k in range(self._left)]
         self._rate, self._root = (torch.tensor(each, device=unit.device) for each in zip(*numbers, strict=True))
         self._begin = {name: state[name] for name in _HELD} | {
             "row": torch.zeros(1, dtype=torch.int64, device=unit.device),
@@ -110,40 +117,15 @@ class Replay:
             self._now[name].copy_(tensor)
 
 
-def replay_of(
-    measure: RecordedMeasure,
-    space: SearchSpace,
-    *,
-    learning_rate: float,
-    momentum: float,
-    iterations: int,
-    state: State,
-) -> Replay | str | None:
-    """The steps of a rung as a replay; why there is none, in words; None where there is no need, as on a CPU.
-
-    Args:
-        measure: the measure that is made large.
-        space: the search space.
-        learning_rate: Adam's learning rate.
-        momentum: Adam's β₁.
-        iterations: number of steps of the rung.
-        state: the state that the steps begin with.
-    """
-    if measure.device.type not in RECORDERS or int(state["done"]) >= iterations:
+def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Steps]) -> Replay | str | None:
+    """The steps of a rung as a `Replay`; why there is none, in words; None where there is no need, as on a CPU."""
+    if measure.device.type not in RECORDERS or int(steps["state"]["done"]) >= steps["iterations"]:
         return None
     same = measure.replayable() if isinstance(measure, Surrogate) else None
     if same is None:
         return "their operations differ from step to step"
     try:
-        return Replay(
-            measure,
-            same,
-            space,
-            learning_rate=learning_rate,
-            momentum=momentum,
-            iterations=iterations,
-            state=state,
-        )
+        return Replay(measure, same, space, **steps)
     except (RuntimeError, RoadproofError) as error:
         return in_one_line(error)
 

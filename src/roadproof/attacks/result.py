@@ -45,7 +45,7 @@ class Candidate:
 
     Args:
         pattern: the best pattern of this start.
-        group: name of the group of drives that it was found on, such as "clean+right".
+        group: name of the group of drives that it was found on, such as "clean+right", or "slower".
         surrogate_shift: mean steering shift per frame towards that group's side on recorded frames, in steer units;
             None without recorded frames.
         predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors;
@@ -83,19 +83,10 @@ class AttackResult:
     drives that chose the pattern: other drives have to report it.
 
     Args:
-        pattern: the strongest pattern.
-        group: the group it was found for, e.g. "clean+right", or "slower".
+        pattern: the strongest pattern, that of the first candidate, whose are also group, surrogate_shift, predicted_m,
+            predicted_range_m, predicted_mps, predicted_range_mps and driven; see `Candidate`.
         objective: what was made large: "steering shift", "path deviation", "speed change", or the name of the user's
             own.
-        surrogate_shift: mean steering shift of the pattern per frame towards that group's side, in steer units; None
-            without recorded frames.
-        predicted_m: the paper's deviation in the recorded world, metres, mean over recorded weathers and small errors;
-            None if the search did not drive there, or was for a change of the speed.
-        predicted_range_m: least and largest of these predicted deviations, metres; None if there are none.
-        predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
-            recorded weathers and small errors; None if the search was not for a change of the speed.
-        predicted_range_mps: least and largest of these predicted changes, m/s; None if there are none.
-        driven: effect of the strongest pattern in the drive that chose it; None if nothing was driven in a simulator.
         by_group: best value of every group, in the objective's unit: steer units per frame, metres, or m/s; for the
             published method a sum over frames.
         candidates: best pattern of every start, the strongest first, by the least predicted effect if there is one.

@@ -42,14 +42,9 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """Frames and answers of many drives, one after the other.
+    """Frames and answers of many drives, one after the other; what is not named here is as in a `Shard`.
 
     Args:
-        frames: RGB, 0 to 255.
-        speed_mps: speed of the car at each frame.
-        command: command at each frame, in CARLA's codes.
-        expert: steer, throttle and brake that the expert would give at each frame.
-        path_m: points of the route ahead, metres ahead of and left of the car.
         first: number of the first frame of each frame's drive.
     """
 
