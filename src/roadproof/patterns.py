@@ -8,6 +8,7 @@ Convention:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -53,9 +54,13 @@ class Pattern:
         if len(set(counts)) != 1 or counts[0] < 1:
             raise PatternError(f"{counts[0]} shapes, {counts[1]} boxes, {counts[2]} colours; expected K ≥ 1 of each")
 
-    def __getitem__(self, index: int | tuple[int, ...]) -> Pattern:
-        """One pattern of a batch."""
-        return Pattern(self.shapes, self.boxes[index], self.colours[index])
+    def __getitem__(self, index: int | tuple[int, ...] | slice | None) -> Pattern:
+        """One pattern of a batch, some of them, or a batch of one."""
+        return self.mapped(lambda part: part[index])
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Pattern:
+        """The pattern with its boxes and its colours changed by one function, such as moved to a device."""
+        return Pattern(self.shapes, change(self.boxes), change(self.colours))
 
     @property
     def painted_share(self) -> Float[Tensor, "*b"]:
@@ -148,7 +153,7 @@ def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray,
     centre = (np.stack([columns.ravel(), rows.ravel()], -1) + 0.5) * scale - 0.5
     jacobian = np.broadcast_to(np.eye(2) * scale, (size_px**2, 2, 2))
     footprints = Footprints.of(centre, jacobian, "area")
-    single = Pattern(pattern.shapes, pattern.boxes.detach().cpu().float(), pattern.colours.detach().cpu().float())
+    single = pattern.mapped(lambda part: part.detach().cpu().float())
     seen = visibilities(coverages(single, footprints))
     alpha = seen.sum(0)
     colour = (single.colours.mT @ seen) / alpha.clamp_min(1e-6)

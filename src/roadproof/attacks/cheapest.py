@@ -222,8 +222,7 @@ class _Run:
     @property
     def pattern(self) -> Pattern:
         """The pattern at the current point of the search."""
-        here = self.space.pattern(self.unit[0, 0].detach())
-        return Pattern(here.shapes, here.boxes.cpu(), here.colours.cpu())
+        return self.space.pattern(self.unit[0, 0].detach()).mapped(Tensor.cpu)
 
     def level(self) -> Level:
         """Area, number of figures and predicted deviation of the current pattern."""

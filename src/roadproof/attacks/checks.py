@@ -65,9 +65,7 @@ def check_world(measure: ClosedLoopMeasure, pattern: Pattern) -> tuple[Check, ..
         measure: the measure in the recorded world that the search made large.
         pattern: the pattern found; one pattern, not a batch.
     """
-    on_device = Pattern(
-        pattern.shapes, pattern.boxes[None].to(measure.device), pattern.colours[None].to(measure.device)
-    )
+    on_device = pattern[None].mapped(lambda part: part.to(measure.device))
     with torch.no_grad():
         bare = [world.roll(measure.controller) for world in measure.worlds]
         painted = [world.roll(measure.controller, on_device) for world in measure.worlds]

@@ -60,7 +60,7 @@ def show_pattern(
     # What the controller answers has no direction.
     surrogate = Surrogate(recordings, controller, [replace(group, direction=Direction.EITHER)], device=device)
     view = surrogate.views[0]
-    on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
+    on_device = pattern[None].mapped(lambda part: part.to(device))
     with torch.no_grad():
         shift = surrogate.shifts([on_device])[0][0].cpu().numpy()
         painted = composite(on_device, view)[0].permute(0, 2, 3, 1).mul(255).round().to(torch.uint8).cpu().numpy()

@@ -155,7 +155,9 @@ class Surrogate:
         """Steer on composited minus steer on clean frames, for every group, pattern and frame."""
         looks = self._looks
         if looks is not None:
-            patterns = [looks.placed(_repeated(each, len(looks)), self.recordings.canvas) for each in patterns]
+            times = len(looks)
+            repeated = [each.mapped(lambda part: part.repeat_interleave(times, 0)) for each in patterns]
+            patterns = [looks.placed(each, self.recordings.canvas) for each in repeated]
         copies = len(patterns[0].boxes)
         frames = self._compositor(copies)(patterns, looks)
         if looks is not None:
@@ -228,13 +230,6 @@ class Surrogate:
         return steer_of(self.controller, frames, speed, command, finite=not self._replayed).float()
 
 
-def _repeated(pattern: Pattern, times: int) -> Pattern:
-    """Each pattern of a batch so many times, one after another."""
-    return Pattern(
-        pattern.shapes, pattern.boxes.repeat_interleave(times, 0), pattern.colours.repeat_interleave(times, 0)
-    )
-
-
 def _patterns(space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> list[Pattern]:
     return [space.pattern(group) for group in unit]
 
@@ -246,19 +241,9 @@ def _view(recordings: RecordingSet, drives: Sequence[Recording], device: torch.d
         recordings.view,
         recordings.colour,
         camera=recordings.camera,
-        maps=_joined_maps([drive.maps for drive in drives]),
+        maps=PixelMaps.joined([drive.maps for drive in drives]),
         device=device,
     )
-
-
-def _joined_maps(parts: Sequence[PixelMaps | None]) -> PixelMaps | None:
-    maps = [part for part in parts if part is not None]
-    if len(maps) < len(parts):
-        return None
-    gain, offset, visible = (
-        torch.cat([getattr(part, name) for part in maps]) for name in ("gain", "offset", "visible")
-    )
-    return PixelMaps(gain, offset, visible, maps[0].response)
 
 
 def _joined(parts: Sequence[np.ndarray], device: torch.device | str, dtype: torch.dtype) -> Tensor:

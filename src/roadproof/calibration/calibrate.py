@@ -14,7 +14,7 @@ from jaxtyping import Float
 from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
 from roadproof.calibration.replays import Replays, drive_digest
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
-from roadproof.calibration.two_paint import Paints, at_frames, look_at_paints
+from roadproof.calibration.two_paint import Paints, look_at_paints
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
@@ -165,7 +165,7 @@ def calibrate(
     else:
         paints = [_look(replays, drives, drive, refine=method is Method.TWO_PAINT) for drive in drives.drives]
         geometry = [_from_paints(paint) for paint in paints]
-        maps = [at_frames(paint.maps, list(g.found)) for paint, g in zip(paints, geometry, strict=True)]
+        maps = [paint.maps.at(list(g.found)) for paint, g in zip(paints, geometry, strict=True)]
         colour, residual = ColourTransform(AffineResponse.identity()), None
     for drive, found in zip(drives.drives, geometry, strict=True):
         _check(drive, found)

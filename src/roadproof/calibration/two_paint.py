@@ -90,8 +90,3 @@ def look_at_paints(
         if seen_px[k] < LEAST_PX
     }
     return Paints(maps, found, errors, dropped)
-
-
-def at_frames(maps: PixelMaps, kept: list[int]) -> PixelMaps:
-    """The maps of the frames with the given indices."""
-    return PixelMaps(maps.gain[kept], maps.offset[kept], maps.visible[kept], maps.response)

@@ -54,7 +54,7 @@ class Conspicuousness:
 
 def conspicuousness(pattern: Pattern, site: Site) -> Conspicuousness:
     """How conspicuous one pattern is on a stretch of road."""
-    one = Pattern(pattern.shapes, pattern.boxes.detach().double().cpu(), pattern.colours.detach().double().cpu())
+    one = pattern.mapped(lambda part: part.detach().double().cpu())
     colours = one.colours.numpy()
     shares = np.array(
         [

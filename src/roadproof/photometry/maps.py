@@ -7,6 +7,7 @@ two pictures show where the canvas is seen, occlusion included.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -46,6 +47,20 @@ class PixelMaps:
         for name in ("gain", "offset", "visible"):
             if not bool(getattr(self, name).isfinite().all()):
                 raise ColourError(f"{name} of the pixel maps has NaN or infinite values")
+
+    def at(self, frames: list[int] | slice) -> PixelMaps:
+        """The maps of some frames, by their indices."""
+        return PixelMaps(self.gain[frames], self.offset[frames], self.visible[frames], self.response)
+
+    @staticmethod
+    def joined(parts: Sequence[PixelMaps | None]) -> PixelMaps | None:
+        """The maps of several drives, one after the other; None if one has none."""
+        maps = [part for part in parts if part is not None]
+        if len(maps) < len(parts):
+            return None
+        names = ("gain", "offset", "visible")
+        gain, offset, visible = (torch.cat([getattr(part, name) for part in maps]) for name in names)
+        return PixelMaps(gain, offset, visible, maps[0].response)
 
 
 def pixel_maps_from_two_paints(

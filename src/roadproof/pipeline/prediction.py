@@ -96,7 +96,7 @@ def predict(
     """
     world = RecordedWorld(recordings.by_weather()[0], device=device)
     world.fit(controller)
-    on_device = Pattern(pattern.shapes, pattern.boxes[None].to(device), pattern.colours[None].to(device))
+    on_device = pattern[None].mapped(lambda part: part.to(device))
     with torch.no_grad():
         rolled = world.roll(controller, on_device)
     foretold = world.foretold(controller, on_device, UNSURE)

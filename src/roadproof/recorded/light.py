@@ -10,6 +10,7 @@ from torch import Tensor
 from roadproof.compositing.view import camera_points, canvas_pixels
 from roadproof.coverage import Footprints, canvas_share
 from roadproof.geometry import CameraModel, CropResize
+from roadproof.photometry import PixelMaps
 from roadproof.recordings import RecordingSet
 
 _SEEN = 0.02
@@ -62,19 +63,16 @@ def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"
 
     Where the canvas is not seen, the mean of the frame stands: a moved picture looks a little beyond its edge.
     """
-    maps = [drive.maps for drive in recordings.recordings]
-    if any(each is None for each in maps):
+    maps = PixelMaps.joined([drive.maps for drive in recordings.recordings])
+    if maps is None:
         return None
-    gain = torch.cat([each.gain for each in maps if each is not None])
-    offset = torch.cat([each.offset for each in maps if each is not None])
-    visible = torch.cat([each.visible for each in maps if each is not None])
     homographies = np.concatenate([drive.image_from_canvas for drive in recordings.recordings])
     expected = _expected_share(homographies, recordings.view, recordings.camera)
-    values = torch.cat([gain, offset], -1).float()
-    known = (visible > _SEEN)[..., None]
+    values = torch.cat([maps.gain, maps.offset], -1).float()
+    known = (maps.visible > _SEEN)[..., None]
     mean = (values * known).sum((1, 2)) / known.sum((1, 2)).clamp_min(1)
     values = torch.where(known, values, mean[:, None, None])
-    free = torch.where(expected > _MOSTLY_ROAD, visible / expected.clamp_min(_MOSTLY_ROAD), 1.0).clamp(0.0, 1.0)
+    free = torch.where(expected > _MOSTLY_ROAD, maps.visible / expected.clamp_min(_MOSTLY_ROAD), 1.0).clamp(0.0, 1.0)
     return torch.cat([values, free[..., None]], -1).flatten(0, 2).to(device)
 
 

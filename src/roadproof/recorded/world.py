@@ -180,11 +180,7 @@ class RecordedWorld:
         """
         count = len(starts) * (1 if pattern is None else len(pattern.boxes))
         if pattern is not None:
-            pattern = Pattern(
-                pattern.shapes,
-                pattern.boxes.repeat_interleave(len(starts), 0),
-                pattern.colours.repeat_interleave(len(starts), 0),
-            )
+            pattern = pattern.mapped(lambda part: part.repeat_interleave(len(starts), 0))
             pattern = pattern if looks is None else looks.placed(pattern, self.recordings.canvas)
         car = self.begin(starts, count // len(starts))
         course = self.course
@@ -265,9 +261,7 @@ class RecordedWorld:
             bare = self.roll(controller, starts=starts, looks=looks)
             paths = [self.whole_path(bare, k) for k in range(len(starts))]
             for first in range(0, len(patterns.boxes), at_once):
-                part = slice(first, first + at_once)
-                some = Pattern(patterns.shapes, patterns.boxes[part], patterns.colours[part])
-                rolled = self.roll(controller, some, starts=starts, looks=looks)
+                rolled = self.roll(controller, patterns[first : first + at_once], starts=starts, looks=looks)
                 count = len(rolled.x_m)
                 deviations += [deviation_m(paths[k % len(starts)], self.whole_path(rolled, k)) for k in range(count)]
                 change = rolled.speed_mps - bare.speed_mps.repeat(count // len(starts), 1)

@@ -119,9 +119,7 @@ class Recording:
     def thinned(self, every: int) -> Recording:
         """Every n-th frame, counted back from the last one, which shows the canvas largest; the track stays whole."""
         frames = slice((len(self.frames) - 1) % every, None, every)
-        maps = self.maps and PixelMaps(
-            self.maps.gain[frames], self.maps.offset[frames], self.maps.visible[frames], self.maps.response
-        )
+        maps = self.maps and self.maps.at(frames)
         kept = {name: getattr(self, name)[frames] for name in ("frames", *PER_FRAME)}
         return replace(self, maps=maps, **kept)
 
