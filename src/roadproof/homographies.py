@@ -18,6 +18,7 @@ _MOST_SCALE = 1e9
 
 Points = Float[np.ndarray, "*n 2"]
 Homography = Float[np.ndarray, "3 3"]
+Homographies = Float[np.ndarray, "f 3 3"]
 
 
 def homogeneous(

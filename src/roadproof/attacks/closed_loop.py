@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.groups import Group, to_side
+from roadproof.attacks.groups import Group, Points, Values, to_side
 from roadproof.attacks.surrogate import FIXED, Surrogate
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
@@ -68,11 +68,7 @@ class ClosedLoopMeasure(ABC):
     """
 
     def __init__(
-        self,
-        recordings: RecordingSet,
-        controller: Controller,
-        groups: Sequence[Group],
-        **rolling: Unpack[Rolling],
+        self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], **rolling: Unpack[Rolling]
     ) -> None:
         device, variation = rolling.get("device", "cpu"), rolling.get("variation")
         # Refuses controllers and groups that do not fit, and reads the steering shift in the end.
@@ -124,14 +120,12 @@ class ClosedLoopMeasure(ABC):
             # Not cleared: a copy of this measure may have these drives with looks of its own.
             self._bare = {}
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def values(self, space: SearchSpace, unit: Points) -> Values:
         """Mean towards each group's direction, at R points per group, without gradients."""
         with torch.no_grad():
             return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
 
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """Mean towards each group's direction and its gradient at R points a group of a search space.
 
         The gradient of each point is scaled to unit length: a closed loop amplifies, and by how much says nothing about
@@ -149,9 +143,7 @@ class ClosedLoopMeasure(ABC):
             gradients.append((flat / length).view_as(gradient))
         return torch.cat(values, 1), torch.cat(gradients, 1)
 
-    def readings(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"]]:
+    def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, Float[Tensor, "g r s"]]:
         """Steering shift on the recorded frames, and what is predicted with small errors.
 
         The predictions of all weathers stand one after another.
@@ -173,12 +165,12 @@ class ClosedLoopMeasure(ABC):
         """What tells this measure from others on the same drives."""
         return self._starts, self.every
 
-    def _parts(self, unit: Float[Tensor, "g r k n"]) -> Iterator[Float[Tensor, "g s k n"]]:
+    def _parts(self, unit: Points) -> Iterator[Float[Tensor, "g s k n"]]:
         pictures = len(self.groups) * sum(self._pictures(world) for world in self.worlds)
         at_once = max(1, MAX_PICTURES // pictures)
         yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
 
-    def _values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def _values(self, space: SearchSpace, unit: Points) -> Values:
         patterns = space.pattern(unit.flatten(0, 1))
         each = [self.read(world, self.roll(world, patterns)) for world in self.worlds]
         read = torch.cat([part.view(*unit.shape[:2], -1) for part in each], -1)

@@ -17,10 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from roadproof.attacks.groups import Direction, Group
+from roadproof.attacks.groups import Direction, Group, Points, Values
 from roadproof.attacks.objective import Objective, PathDeviation, SteeringShift
 from roadproof.controllers import Controller
 from roadproof.datatypes import Observation, Weather
@@ -113,7 +111,7 @@ class DrivenMeasure:
                 )
             self._known = kept.drives
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def values(self, space: SearchSpace, unit: Points) -> Values:
         """Values of R points of a search space; each takes one drive, unless its pattern was driven over before."""
         effects = [self.effect(space.pattern(point)) for point in unit[0]]
         found = [each.deviation if self._deviates else each.steering for each in effects]

@@ -26,6 +26,7 @@ from torch import Tensor
 from roadproof.attacks.captured import Replay, in_words, replay_of
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.groups import Points, Values
 from roadproof.attacks.objective import Measure, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
@@ -121,8 +122,8 @@ class Search:
         steps: how steps were run on a GPU, in words; empty on a CPU.
     """
 
-    best_unit: Float[Tensor, "g r k n"]
-    best: Float[Tensor, "g r"]
+    best_unit: Points
+    best: Values
     history: Float[Tensor, "i g c"]
     gave_way: dict[int, float] = field(default_factory=dict[int, float])
     steps: str = ""
@@ -218,12 +219,8 @@ def gradopt(
 
 
 def _starts(
-    measure: RecordedMeasure,
-    space: SearchSpace,
-    count: int,
-    seed: int,
-    given: Sequence[Float[Tensor, "s k n"]],
-) -> Float[Tensor, "g r k n"]:
+    measure: RecordedMeasure, space: SearchSpace, count: int, seed: int, given: Sequence[Float[Tensor, "s k n"]]
+) -> Points:
     """Random points of every group, of which the first are replaced by the points given."""
     unit = space.random((len(measure.groups), count), torch.Generator().manual_seed(seed))
     for group, points in enumerate(given):
@@ -231,16 +228,14 @@ def _starts(
     return unit.to(measure.device)
 
 
-def _screened(
-    measure: RecordedMeasure | Beside, space: SearchSpace, unit: Float[Tensor, "g r k n"], count: int, seed: int
-) -> Float[Tensor, "g r k n"]:
+def _screened(measure: RecordedMeasure | Beside, space: SearchSpace, unit: Points, count: int, seed: int) -> Points:
     """The starts, the last of which are the best of many random points by a measure."""
     drawn = space.random((len(unit), DRAWN), torch.Generator().manual_seed(seed)).to(unit)
     kept = _at(drawn, measure.values(space, drawn).topk(count, 1).indices)
     return torch.cat([unit[:, :-count], kept], 1)
 
 
-def _at(unit: Float[Tensor, "g r k n"], index: Int64[Tensor, "g i"]) -> Float[Tensor, "g i k n"]:
+def _at(unit: Points, index: Int64[Tensor, "g i"]) -> Float[Tensor, "g i k n"]:
     """Of every group's points those with the given numbers."""
     return unit[torch.arange(len(unit), device=index.device)[:, None], index]
 

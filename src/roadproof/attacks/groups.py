@@ -19,6 +19,12 @@ from torch import Tensor
 from roadproof.errors import RecordingError
 from roadproof.recordings import Recording, RecordingSet, Side
 
+Points = Float[Tensor, "g r k n"]
+"""R points of a search space for each of G groups: K figures of N parameters each, in the unit cube."""
+
+Values = Float[Tensor, "g r"]
+"""A value of each of R points, for each of G groups."""
+
 
 class Direction(StrEnum):
     """Where an attack takes the car: to one side, to less or more speed, or to whichever of two gives way."""

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.deviation import DeviationMeasure
-from roadproof.attacks.groups import Group
+from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.speed import SpeedMeasure, require_pedals
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.variation import Variation
@@ -27,7 +27,7 @@ from roadproof.recorded.world import Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
-Readings: TypeAlias = tuple[Float[Tensor, "g r"], Float[Tensor, "g r s"] | None]
+Readings: TypeAlias = tuple[Values, Float[Tensor, "g r s"] | None]
 """Of each pattern: the mean steering shift on recorded frames, and the deviation predicted in metres, where it is (for
 a `SpeedMeasure` the change of the speed in m/s): in each of some drives that differ by as little as a prediction may be
 wrong."""
@@ -45,7 +45,7 @@ class Measure(Protocol):
         """The torch device on which patterns are valued."""
         ...
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def values(self, space: SearchSpace, unit: Points) -> Values:
         """Values (G, R) of R points per group of a search space, without gradients."""
         ...
 
@@ -66,13 +66,11 @@ class RecordedMeasure(Measure, Protocol):
         """The steering shift on the same recorded frames, from which a search may begin."""
         ...
 
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """Values (G, R) of R points per group, and their gradients or the directions in which they rise."""
         ...
 
-    def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Readings:
+    def readings(self, space: SearchSpace, unit: Points) -> Readings:
         """Steering shift and predicted deviation of R points per group, for the result of a search."""
         ...
 

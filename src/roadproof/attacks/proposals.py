@@ -17,10 +17,10 @@ from roadproof.attacks.expected_improvement import most_promising
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
-Propose: TypeAlias = Callable[
-    [Float[np.ndarray, "t d"], Float[np.ndarray, " t"], int],
-    Float[np.ndarray, "b d"],
-]
+Cube = Float[np.ndarray, "_ d"]
+"""Some points of the unit cube."""
+
+Propose: TypeAlias = Callable[[Cube, Float[np.ndarray, " t"], int], Cube]
 """Points tried, their values, how many new ones are wanted; the new points."""
 
 PUBLISHED_ACQUISITION = {"drawn": 100_000, "climbs": 250}
@@ -34,7 +34,7 @@ _CMA_SIGMA_NEAR = 1 / 30
 def random(space: SearchSpace, seed: int) -> Propose:
     """Points drawn as the authors draw the starts of their gradient search."""
 
-    def propose(tried: Float[np.ndarray, "t d"], _: Float[np.ndarray, " t"], count: int) -> Float[np.ndarray, "b d"]:
+    def propose(tried: Cube, _: Float[np.ndarray, " t"], count: int) -> Cube:
         return np.concatenate(
             [
                 space.random((1,), torch.Generator().manual_seed(derived_seed(seed, len(tried) + i)))
@@ -71,9 +71,7 @@ def published_bo(ranges: Float[np.ndarray, " d"], random_calls: int, seed: int) 
     except ImportError as error:
         raise _missing(error) from None
 
-    def propose(
-        tried: Float[np.ndarray, "t d"], value: Float[np.ndarray, " t"], count: int
-    ) -> Float[np.ndarray, "b d"]:
+    def propose(tried: Cube, value: Float[np.ndarray, " t"], count: int) -> Cube:
         if len(tried) < random_calls:
             drawn = np.random.RandomState(seed).uniform(size=(random_calls, len(ranges)))
             return drawn[len(tried) : len(tried) + count]
@@ -99,9 +97,7 @@ def optuna(sampler: Literal["gp", "tpe"], dimensions: int, seed: int) -> Propose
     library.logging.set_verbosity(library.logging.WARNING)
     ranges = {f"p{index:03d}": library.distributions.FloatDistribution(0.0, 1.0) for index in range(dimensions)}
 
-    def propose(
-        tried: Float[np.ndarray, "t d"], value: Float[np.ndarray, " t"], count: int
-    ) -> Float[np.ndarray, "b d"]:
+    def propose(tried: Cube, value: Float[np.ndarray, " t"], count: int) -> Cube:
         fresh = derived_seed(seed, len(tried))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # some options of the samplers are marked experimental
@@ -141,9 +137,7 @@ def cma_es(dimensions: int, seed: int, given: int = 0) -> Propose:
     except ImportError as error:
         raise _missing(error) from None
 
-    def propose(
-        tried: Float[np.ndarray, "t d"], value: Float[np.ndarray, " t"], count: int
-    ) -> Float[np.ndarray, "b d"]:
+    def propose(tried: Cube, value: Float[np.ndarray, " t"], count: int) -> Cube:
         bounds = np.tile([0.0, 1.0], (dimensions, 1))
         middle = tried[value[:given].argmax()] if given else np.full(dimensions, 0.5)
         sigma = _CMA_SIGMA_NEAR if given else _CMA_SIGMA

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.groups import Group, divergence
+from roadproof.attacks.groups import Group, Points, Values, divergence
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.published import AntialiasedView, MaskedView, pasted, view_canvas_published
 from roadproof.controllers import Controller
@@ -72,15 +72,13 @@ class PublishedMeasure:
         """The surrogate, which has exact gradients of the steering shift."""
         return self._exact
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def values(self, space: SearchSpace, unit: Points) -> Values:
         """δ at R points per group of the published search space, (G, R)."""
         with torch.no_grad():
             rows = [[self._shown(space, group, point)[0] for point in points] for group, points in enumerate(unit)]
         return torch.stack([torch.stack(row) for row in rows])
 
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """δ and the paper's approximation of its gradient, one point after another."""
         values, gradients = unit.new_empty(unit.shape[:2]), torch.empty_like(unit)
         for group, points in enumerate(unit):
@@ -88,7 +86,7 @@ class PublishedMeasure:
                 values[group, start], gradients[group, start] = self._climbed(space, group, point)
         return values, gradients
 
-    def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> tuple[Float[Tensor, "g r"], None]:
+    def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, None]:
         """The mean steering shift per frame; None for the deviation, which this measure does not know."""
         lengths = unit.new_tensor([sum(lengths) for lengths in self._exact.lengths])
         return self.values(space, unit) / lengths[:, None], None

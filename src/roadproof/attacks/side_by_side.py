@@ -17,12 +17,11 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar, cast
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Module
 
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
-from roadproof.attacks.groups import Group
+from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
@@ -72,7 +71,7 @@ class Beside:
         """The groups of the measure."""
         return self._whole.groups
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def values(self, space: SearchSpace, unit: Points) -> Values:
         """The values of R points per group, without gradients."""
 
         def valued(part: RecordedMeasure, points: Tensor) -> Tensor:
@@ -80,9 +79,7 @@ class Beside:
 
         return self._joined(unit, self._each(valued, unit))
 
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """The values of R points per group, and their gradients."""
 
         def climbed(part: RecordedMeasure, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
-from roadproof.attacks.groups import SPEEDS, Direction, Group, require_directions, to_side
+from roadproof.attacks.groups import SPEEDS, Direction, Group, Values, require_directions, to_side
 from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller, PedalController
 from roadproof.errors import ControllerError
@@ -54,7 +54,7 @@ class SpeedMeasure(ClosedLoopMeasure):
         """The mean change of the speed, m/s, negative where the car is slower, of R patterns in each of S drives."""
         return world.foretold(self.controller, patterns, UNSURE, looks).speed_change_mps
 
-    def rank(self, predicted: Float[Tensor, "g r s"]) -> Float[Tensor, "g r"]:
+    def rank(self, predicted: Float[Tensor, "g r s"]) -> Values:
         """The least change over small errors in each group's direction, m/s."""
         sides = [to_side(part, group.direction) for group, part in zip(self.groups, predicted, strict=True)]
         return torch.stack(sides).amin(-1)

@@ -12,9 +12,9 @@ Nothing here asks the device for a number, so that the same operations run one b
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.groups import Points
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.attacks.side_by_side import Beside
 from roadproof.errors import RoadproofError
@@ -27,13 +27,13 @@ BETA_2, EPSILON = 0.999, 1e-8
 """Adam's own."""
 
 
-def state_at(unit: Float[Tensor, "g r k n"]) -> State:
+def state_at(unit: Points) -> State:
     """The state of a search that begins at some points."""
     best = torch.full(unit.shape[:2], -torch.inf, device=unit.device)
     return {"best_unit": unit.clone(), "best": best, "history": best.new_empty(0, *best.shape)} | begun(unit)
 
 
-def begun(unit: Float[Tensor, "g r k n"]) -> State:
+def begun(unit: Points) -> State:
     """Points at which a fresh optimiser begins."""
     still = {"exp_avg": torch.zeros_like(unit), "exp_avg_sq": torch.zeros_like(unit)}
     return {"unit": unit, "done": torch.tensor(0), **still}

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.groups import STEERED, Group, divergence, require_directions
+from roadproof.attacks.groups import STEERED, Group, Points, Values, divergence, require_directions
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
@@ -137,7 +137,7 @@ class Surrogate:
         """The surrogate itself, since it is open loop already."""
         return self
 
-    def divergences(self, patterns: Sequence[Pattern]) -> Float[Tensor, "g r"]:
+    def divergences(self, patterns: Sequence[Pattern]) -> Values:
         """δ per frame of R patterns for each group, differentiable in the patterns.
 
         Args:
@@ -174,14 +174,12 @@ class Surrogate:
             for part, clean, view in zip(parts, self._clean_looked, self.views, strict=True)
         ]
 
-    def values(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> Float[Tensor, "g r"]:
+    def values(self, space: SearchSpace, unit: Points) -> Values:
         """δ per frame at points of a search space, without gradients, a bounded number of frames at a time."""
         with torch.no_grad():
             return torch.cat([self.divergences(_patterns(space, part)) for part in self._batches(unit)], 1)
 
-    def values_and_gradients(
-        self, space: SearchSpace, unit: Float[Tensor, "g r k n"]
-    ) -> tuple[Float[Tensor, "g r"], Float[Tensor, "g r k n"]]:
+    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """δ per frame and its gradient at R points a group of a search space, a bounded number of frames at a time."""
         values: list[Tensor] = []
         gradients: list[Tensor] = []
@@ -193,7 +191,7 @@ class Surrogate:
             gradients.append(gradient)
         return torch.cat(values, 1), torch.cat(gradients, 1)
 
-    def readings(self, space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> tuple[Float[Tensor, "g r"], None]:
+    def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, None]:
         """The mean steering shift per frame; None for the deviation, which the surrogate does not know."""
         return self.values(space, unit), None
 
@@ -206,7 +204,7 @@ class Surrogate:
                 digest.update(tensor.cpu().numpy().tobytes())
         return digest.hexdigest()
 
-    def _batches(self, unit: Float[Tensor, "g r k n"]) -> tuple[Tensor, ...]:
+    def _batches(self, unit: Points) -> tuple[Tensor, ...]:
         """Parts of at most MAX_FRAMES frames, as even as can be; at least one pattern a group each."""
         looks = 1 if self._looks is None else len(self._looks)
         at_once = max(1, MAX_FRAMES // (looks * sum(len(view.frames) for view in self.views)))
@@ -230,7 +228,7 @@ class Surrogate:
         return steer_of(self.controller, frames, speed, command, finite=not self._replayed).float()
 
 
-def _patterns(space: SearchSpace, unit: Float[Tensor, "g r k n"]) -> list[Pattern]:
+def _patterns(space: SearchSpace, unit: Points) -> list[Pattern]:
     return [space.pattern(group) for group in unit]
 
 

@@ -29,6 +29,10 @@ from scipy.spatial.transform import Rotation
 
 from roadproof.coverage import FOOTPRINT_VARIANCE
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
+from roadproof.homographies import Homographies
+
+Pictures = Float[np.ndarray, "f h w"]
+"""A number of every pixel of F pictures."""
 
 SQUARES = 4
 """Along each side of the canvas in the dark frames."""
@@ -59,16 +63,11 @@ class OutlineFit:
         outline_px: mean distance of predicted from measured edges per frame, camera px, (F,); NaN if none is in view.
     """
 
-    image_from_canvas: Float[np.ndarray, "f 3 3"]
+    image_from_canvas: Homographies
     outline_px: Float[np.ndarray, " f"]
 
 
-def fit_outline(
-    prior: Float[np.ndarray, "f 3 3"],
-    contrast: Float[np.ndarray, "f h w"],
-    camera: CameraModel,
-    view: CropResize,
-) -> OutlineFit:
+def fit_outline(prior: Homographies, contrast: Pictures, camera: CameraModel, view: CropResize) -> OutlineFit:
     """Move homographies until canvas and squares lie where they are seen.
 
     Args:
@@ -88,10 +87,7 @@ def fit_outline(
 
 
 def outline_errors_px(
-    image_from_canvas: Float[np.ndarray, "f 3 3"],
-    contrast: Float[np.ndarray, "f h w"],
-    camera: CameraModel,
-    view: CropResize,
+    image_from_canvas: Homographies, contrast: Pictures, camera: CameraModel, view: CropResize
 ) -> Float[np.ndarray, " f"]:
     """Mean distance of predicted from measured edges per frame, camera px; NaN if no edge is in view."""
     unmoved = np.zeros((len(contrast), 6))
@@ -99,8 +95,8 @@ def outline_errors_px(
 
 
 def predicted_contrast(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel
-) -> tuple[Float[np.ndarray, "f h w"], Float[np.ndarray, "f h w"]]:
+    image_from_canvas: Homographies, view: CropResize, camera: CameraModel
+) -> tuple[Pictures, Pictures]:
     """Share of the canvas in every pixel's footprint, and the predicted contrast p, which the squares reduce."""
     canvas_from_input = np.linalg.inv(view.input_from_camera @ image_from_canvas)
     through, bend = sight(view, camera)
@@ -115,9 +111,7 @@ def predicted_contrast(
     return share.reshape(shape), paint.reshape(shape)
 
 
-def moved(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], moves: Float[np.ndarray, "f 6"], camera: CameraModel
-) -> Float[np.ndarray, "f 3 3"]:
+def moved(image_from_canvas: Homographies, moves: Float[np.ndarray, "f 6"], camera: CameraModel) -> Homographies:
     """Homographies of a camera turned by ω and shifted by τ in its own axes.
 
     Args:
@@ -136,8 +130,8 @@ class _Outline:
 
     def __init__(
         self,
-        prior: Float[np.ndarray, "f 3 3"],
-        contrast: Float[np.ndarray, "f h w"],
+        prior: Homographies,
+        contrast: Pictures,
         camera: CameraModel,
         view: CropResize,
         blur_px: int,
@@ -185,9 +179,7 @@ class _Outline:
         image_from_canvas = moved(self._prior, moves, self._camera)
         return self._shares(np.linalg.inv(self._view.input_from_camera @ image_from_canvas), self._pixel)
 
-    def _shares(
-        self, canvas_from_input: Float[np.ndarray, "f 3 3"], pixel: Float[np.ndarray, "p 3"]
-    ) -> Float[np.ndarray, " p"]:
+    def _shares(self, canvas_from_input: Homographies, pixel: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
         """Share of each footprint that lies on the canvas (`coverage`, for one rectangle that is not turned)."""
         return _canvas_shares(canvas_from_input[self._frame], pixel, self._bend, self._variance)[1]
 
@@ -217,9 +209,7 @@ def _canvas_shares(
     return np.where(ahead, share, 0.0), np.where(ahead, share - GREY * grey, 0.0)
 
 
-def _over_gain(
-    contrast: Float[np.ndarray, "f h w"], expected: Float[np.ndarray, "f h w"]
-) -> Float[np.ndarray, "f h w"]:
+def _over_gain(contrast: Pictures, expected: Pictures) -> Pictures:
     """D / g with the g that suits a pixel's neighbourhood best; 0 where nothing is expected or seen."""
     fit, power = (_box_mean(values, _GAIN_PX) for values in (contrast * expected, expected**2))
     known = (power > 1e-3) & (fit > _SEEN * power)
@@ -235,9 +225,7 @@ def _tent(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     return t * (1.0 - 0.5 * np.abs(t))
 
 
-def _blurred(
-    contrast: Float[np.ndarray, "f h w"], blur_px: int
-) -> tuple[Float[np.ndarray, "f h w"], Bool[np.ndarray, "f h w"]]:
+def _blurred(contrast: Pictures, blur_px: int) -> tuple[Pictures, Bool[np.ndarray, "f h w"]]:
     """Contrast averaged over a tent of this half-width, and where that did not need pixels beyond the picture."""
     if blur_px == 0:
         return contrast, np.ones(contrast.shape, bool)
@@ -248,12 +236,12 @@ def _blurred(
     return shares, whole
 
 
-def _box_mean(pictures: Float[np.ndarray, "f h w"], reach_px: int) -> Float[np.ndarray, "f h w"]:
+def _box_mean(pictures: Pictures, reach_px: int) -> Pictures:
     """Means over squares around each pixel; beyond the pictures there is 0."""
     return cast("Any", ndimage).uniform_filter(pictures, 2 * reach_px + 1, mode="constant", axes=(1, 2))
 
 
-def _near_edge(contrast: Float[np.ndarray, "f h w"]) -> Bool[np.ndarray, "f h w"]:
+def _near_edge(contrast: Pictures) -> Bool[np.ndarray, "f h w"]:
     """The pixels within reach of a place where the contrast changes."""
     size = 2 * _REACH_PX + 1
     return ndimage.morphological_gradient(contrast, (1, size, size)) > 0.25

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives import Drive, Drives
 from roadproof.driving.rollout import drive_again
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX
+from roadproof.homographies import Homographies
 from roadproof.io.arrays import read_record, write_archive
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -43,9 +44,9 @@ class Replays:
         self.calls = 0
         self.seconds = 0.0
         self._simulator, self._drives, self._folder, self._on_call = simulator, drives, folder, on_call
-        self._stated: dict[str, Float[np.ndarray, "f 3 3"]] = {}
+        self._stated: dict[str, Homographies] = {}
 
-    def stated(self, drive: Drive) -> Float[np.ndarray, "f 3 3"] | None:
+    def stated(self, drive: Drive) -> Homographies | None:
         """The homographies the simulator itself states, for reports alone; None before the first replay of a drive."""
         return self._stated.get(drive.name)
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel
-from roadproof.homographies import homogeneous
+from roadproof.homographies import Homographies, homogeneous
 from roadproof.io.records import RecordFile, Saved
 
 _GRID = 9
@@ -74,7 +74,7 @@ CalibrationReport.FILE = RecordFile(
 
 
 def stated_errors_px(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], stated: Float[np.ndarray, "g 3 3"], camera: CameraModel
+    image_from_canvas: Homographies, stated: Float[np.ndarray, "g 3 3"], camera: CameraModel
 ) -> Float[np.ndarray, " n"]:
     """Distances in the picture between two views of a 9×9 grid of canvas points, corners included, where it shows them.
 

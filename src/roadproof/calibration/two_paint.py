@@ -13,6 +13,7 @@ from roadproof.calibration.replays import Replays, uniform
 from roadproof.drives import Drive
 from roadproof.errors import CalibrationError, ColourError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
+from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
 from roadproof.simulators.protocol import PatternImage
 
@@ -31,7 +32,7 @@ class Paints:
     """
 
     maps: PixelMaps
-    image_from_canvas: Float[np.ndarray, "f 3 3"]
+    image_from_canvas: Homographies
     outline_px: Float[np.ndarray, " f"]
     dropped: dict[int, str]
 
@@ -45,13 +46,7 @@ def dark_target() -> PatternImage:
 
 
 def look_at_paints(
-    replays: Replays,
-    drive: Drive,
-    prior: Float[np.ndarray, "f 3 3"],
-    camera: CameraModel,
-    view: CropResize,
-    *,
-    refine: bool,
+    replays: Replays, drive: Drive, prior: Homographies, camera: CameraModel, view: CropResize, *, refine: bool
 ) -> Paints:
     """Replay a drive over a light and a dark canvas.
 

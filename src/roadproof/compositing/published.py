@@ -22,6 +22,7 @@ from torch import Tensor
 from roadproof.compositing.view import CanvasView
 from roadproof.coverage import Shape, coverage, polygon_vertices
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
+from roadproof.homographies import Homographies
 from roadproof.photometry import ColourTransform
 
 _OFF_CANVAS = CANVAS_SIZE_PX**2
@@ -98,7 +99,7 @@ MaskedView: TypeAlias = BinaryView | AntialiasedView
 
 def view_canvas_published(
     frames: UInt8[np.ndarray, "f h w 3"],
-    image_from_canvas: Float[np.ndarray, "f 3 3"],
+    image_from_canvas: Homographies,
     view: CropResize,
     colour: ColourTransform | None,
     *,
@@ -112,7 +113,7 @@ def view_canvas_published(
 
 
 def nearest_canvas_pixels(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel | None = None
+    image_from_canvas: Homographies, view: CropResize, camera: CameraModel | None = None
 ) -> Int[np.ndarray, "f h w"]:
     """The canvas pixel nearest to where every input pixel looks, row-major; CANVAS_SIZE_PX² where it is off the canvas.
 

@@ -13,6 +13,7 @@ from roadproof.compositing.runs import Runs
 from roadproof.coverage import Footprints, canvas_share
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
+from roadproof.homographies import Homographies
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 from roadproof.photometry.responses import response_on
 
@@ -78,7 +79,7 @@ class OwnViews(CanvasPixels):
 
 def view_canvas(
     frames: UInt8[np.ndarray, "f h w 3"],
-    image_from_canvas: Float[np.ndarray, "f 3 3"],
+    image_from_canvas: Homographies,
     view: CropResize,
     colour: ColourTransform,
     *,
@@ -130,7 +131,7 @@ def view_canvas(
 
 
 def canvas_pixels(
-    image_from_canvas: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel | None = None
+    image_from_canvas: Homographies, view: CropResize, camera: CameraModel | None = None
 ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p 2"], Float[np.ndarray, "p 2 2"]]:
     """Pixels of the controller's input whose footprint touches the canvas, in front of the camera.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from roadproof.compositing.view import camera_points, canvas_pixels
 from roadproof.coverage import Footprints, canvas_share
 from roadproof.geometry import CameraModel, CropResize
+from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps
 from roadproof.recordings import RecordingSet
 
@@ -76,9 +77,7 @@ def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"
     return torch.cat([values, free[..., None]], -1).flatten(0, 2).to(device)
 
 
-def _expected_share(
-    homographies: Float[np.ndarray, "f 3 3"], view: CropResize, camera: CameraModel
-) -> Float[Tensor, "f h w"]:
+def _expected_share(homographies: Homographies, view: CropResize, camera: CameraModel) -> Float[Tensor, "f h w"]:
     """Share of every pixel that would lie on the canvas if nothing stood in its way."""
     index, centre, jacobian = canvas_pixels(homographies, view, camera)
     footprints = Footprints.of(centre, jacobian, view.resampling)
