@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.closed_loop import Rolling
 from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.speed import SpeedMeasure, require_pedals
@@ -148,6 +149,10 @@ class ClosedLoop:
         """The name of the objective in words, for results and reports."""
         return self.word + _over(self.variation)
 
+    def rolling(self, device: torch.device | str) -> Rolling:
+        """How a measure drives over patterns on a device."""
+        return {"starts": self.starts, "every": self.every, "variation": self.variation, "device": device}
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PathDeviation(ClosedLoop):
@@ -174,16 +179,8 @@ class PathDeviation(ClosedLoop):
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
     ) -> DeviationMeasure:
         """The measure in the recorded world of the whole set, closed loop."""
-        return DeviationMeasure(
-            recordings,
-            controller,
-            groups,
-            starts=self.starts,
-            every=self.every,
-            saturation_m=self.saturation_m,
-            device=device,
-            variation=self.variation,
-        )
+        rolling = self.rolling(device)
+        return DeviationMeasure(recordings, controller, groups, saturation_m=self.saturation_m, **rolling)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -206,15 +203,7 @@ class SpeedChange(ClosedLoop):
             ControllerError: the controller only steers.
         """
         require_pedals(controller)
-        return SpeedMeasure(
-            recordings,
-            controller,
-            groups,
-            starts=self.starts,
-            every=self.every,
-            device=device,
-            variation=self.variation,
-        )
+        return SpeedMeasure(recordings, controller, groups, **self.rolling(device))
 
 
 def _over(variation: Variation | None) -> str:
