@@ -6,7 +6,6 @@ took most of Bayesian optimisation: 7 s of processor time a proposal and more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -46,7 +45,6 @@ def most_promising(
     return best
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class ExpectedImprovement:
     """The expected improvement of a fitted process over the best value it was fitted to, with its gradient.
 
@@ -54,13 +52,9 @@ class ExpectedImprovement:
         process: a fitted `GaussianProcessRegressor` with a Matérn-5/2 kernel of one length, its values as they are.
     """
 
-    process: Any
-    _best: float = field(init=False)
-    _inverse: Float[np.ndarray, "t t"] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_best", float(self.process.y_train_.max()))
-        object.__setattr__(self, "_inverse", linalg.cho_solve((self.process.L_, True), np.eye(len(self.process.L_))))
+    def __init__(self, process: Any) -> None:  # noqa: ANN401  # its library is an extra
+        self.process, self._best = process, float(process.y_train_.max())
+        self._inverse: Float[np.ndarray, "t t"] = linalg.cho_solve((process.L_, True), np.eye(len(process.L_)))
 
     def at(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """The improvement expected at each point; none where there is no doubt left."""
