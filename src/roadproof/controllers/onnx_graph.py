@@ -26,7 +26,7 @@ class _Node(NamedTuple):
     attributes: dict[str, Any]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    spent: tuple[str, ...]
+    spent: tuple[str, ...] = ()
     """Values that no later node needs."""
 
 
@@ -74,7 +74,7 @@ class OnnxGraph(nn.Module):
             if value.name not in self._buffer_of
         }
         """Shape of each input; None where it is not fixed."""
-        nodes: list[tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]] = []
+        nodes: list[_Node] = []
         for node in graph.node:
             attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}
             if isinstance(attributes.get("value"), TensorProto):
@@ -89,7 +89,7 @@ class OnnxGraph(nn.Module):
                     f"{' with several outputs' if several else ''}, which roadproof does not know; known are "
                     f"{', '.join(OPERATORS)}. Export the network as .pt2, or wrap it yourself as module:factory"
                 )
-            nodes.append((node.op_type, attributes, tuple(node.input), tuple(node.output)))
+            nodes.append(_Node(node.op_type, attributes, tuple(node.input), tuple(node.output)))
         self._nodes = _with_spent_values(nodes, keep=self.output)
 
     def _keep(self, name: str, constant: Tensor) -> None:
@@ -122,16 +122,13 @@ class OnnxGraph(nn.Module):
         return output
 
 
-def _with_spent_values(
-    nodes: list[tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]], keep: str
-) -> tuple[_Node, ...]:
+def _with_spent_values(nodes: list[_Node], keep: str) -> tuple[_Node, ...]:
     """The nodes, each with the values that it is the last to use; without this every map would stay in memory."""
-    made = {output for *_, outputs in nodes for output in outputs}
+    made = {output for node in nodes for output in node.outputs}
     seen, result = {keep}, list[_Node]()
-    for operator, attributes, inputs, outputs in reversed(nodes):
-        spent = tuple({name for name in inputs if name in made and name not in seen})
-        seen.update(inputs)
-        result.append(_Node(operator, attributes, inputs, outputs, spent))
+    for node in reversed(nodes):
+        result.append(node._replace(spent=tuple(({*node.inputs} & made) - seen)))
+        seen.update(node.inputs)
     return tuple(reversed(result))
 
 
