@@ -160,19 +160,6 @@ def _gemm(a: Attributes, x: Inputs) -> Tensor:
     return product if _get(x, 2) is None else product + a.get("beta", 1.0) * x[2]
 
 
-def _batch_normalization(a: Attributes, x: Inputs) -> Tensor:
-    return functional.batch_norm(x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5))
-
-
-def _layer_normalization(a: Attributes, x: Inputs) -> Tensor:
-    shape = x[0].shape[a.get("axis", -1) :]
-    return functional.layer_norm(x[0], shape, x[1], _get(x, 2), a.get("epsilon", 1e-5))
-
-
-def _group_normalization(a: Attributes, x: Inputs) -> Tensor:
-    return functional.group_norm(x[0], a["num_groups"], x[1], x[2], a.get("epsilon", 1e-5))
-
-
 def _split(a: Attributes, x: Inputs) -> tuple[Tensor, ...]:
     axis = a.get("axis", 0)
     count, parts = a.get("num_outputs"), _integers(_get(x, 1))
@@ -249,10 +236,6 @@ def _pad(a: Attributes, x: Inputs) -> Tensor:
     return functional.pad(x[0], last_first, value=0.0 if value is None else float(value))
 
 
-def _clip(_: Attributes, x: Inputs) -> Tensor:
-    return torch.clamp(x[0], min=_get(x, 1), max=_get(x, 2))
-
-
 def _expand(_: Attributes, x: Inputs) -> Tensor:
     # A size of 1 in the shape asks for the input's own: the broadcast of both.
     like = x[0].new_empty(_integers(x[1]) or [])
@@ -262,18 +245,6 @@ def _expand(_: Attributes, x: Inputs) -> Tensor:
 def _constant_of_shape(a: Attributes, x: Inputs) -> Tensor:
     value = a.get("value", torch.zeros(1))
     return value.to(x[0].device).expand(_integers(x[0]) or [])
-
-
-def _divide(_: Attributes, x: Inputs) -> Tensor:
-    return x[0] / x[1] if x[0].is_floating_point() else torch.div(x[0], x[1], rounding_mode="trunc")
-
-
-def _shape(a: Attributes, x: Inputs) -> Tensor:
-    return torch.tensor(x[0].shape[a.get("start", 0) : a.get("end")], dtype=torch.int64, device=x[0].device)
-
-
-def _range(_: Attributes, x: Inputs) -> Tensor:
-    return torch.arange(*(part.item() for part in x), dtype=x[0].dtype, device=x[0].device)
 
 
 def _reduced(kind: Callable[..., Tensor]) -> Operator:
@@ -287,10 +258,6 @@ def _reduced(kind: Callable[..., Tensor]) -> Operator:
     return apply
 
 
-def _length(x: Tensor, *, dim: tuple[int, ...], keepdim: bool) -> Tensor:
-    return x.square().sum(dim, keepdim=keepdim).sqrt()
-
-
 def _elementwise(kind: Callable[..., Tensor]) -> Operator:
     return lambda _, x: kind(*x)
 
@@ -300,18 +267,20 @@ OPERATORS: dict[str, Operator] = {
     "Add": _elementwise(torch.add),
     "And": _elementwise(torch.logical_and),
     "AveragePool": _average_pool,
-    "BatchNormalization": _batch_normalization,
+    "BatchNormalization": lambda a, x: functional.batch_norm(
+        x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5)
+    ),
     "Cast": lambda a, x: x[0].to(_DTYPES[a["to"]]),
     "Ceil": _elementwise(torch.ceil),
     "Celu": lambda a, x: functional.celu(x[0], a.get("alpha", 1.0)),
-    "Clip": _clip,
+    "Clip": lambda _, x: torch.clamp(x[0], min=_get(x, 1), max=_get(x, 2)),
     "Concat": lambda a, x: torch.cat(list(x), dim=a["axis"]),
     "ConstantOfShape": _constant_of_shape,
     "Conv": _conv,
     "ConvTranspose": _transposed_conv,
     "Cos": _elementwise(torch.cos),
     "DepthToSpace": _depth_to_space,
-    "Div": _divide,
+    "Div": lambda _, x: torch.div(x[0], x[1], rounding_mode=None if x[0].is_floating_point() else "trunc"),
     "Dropout": lambda _, x: x[0],
     "Einsum": lambda a, x: torch.einsum(a["equation"].decode(), *x),
     "Elu": lambda a, x: functional.elu(x[0], a.get("alpha", 1.0)),
@@ -331,15 +300,17 @@ OPERATORS: dict[str, Operator] = {
     "GlobalMaxPool": lambda _, x: x[0].amax(dim=tuple(range(2, x[0].ndim)), keepdim=True),
     "Greater": _elementwise(torch.gt),
     "GreaterOrEqual": _elementwise(torch.ge),
-    "GroupNormalization": _group_normalization,
+    "GroupNormalization": lambda a, x: functional.group_norm(x[0], a["num_groups"], x[1], x[2], a.get("epsilon", 1e-5)),
     "HardSigmoid": lambda a, x: (x[0] * a.get("alpha", 0.2) + a.get("beta", 0.5)).clamp(0.0, 1.0),
-    "HardSwish": lambda _, x: functional.hardswish(x[0]),
+    "HardSwish": _elementwise(functional.hardswish),
     "Identity": lambda _, x: x[0],
     "InstanceNormalization": lambda a, x: functional.instance_norm(
         x[0], weight=x[1], bias=x[2], eps=a.get("epsilon", 1e-5)
     ),
     "LSTM": lstm,
-    "LayerNormalization": _layer_normalization,
+    "LayerNormalization": lambda a, x: functional.layer_norm(
+        x[0], x[0].shape[a.get("axis", -1) :], x[1], _get(x, 2), a.get("epsilon", 1e-5)
+    ),
     "LeakyRelu": lambda a, x: functional.leaky_relu(x[0], a.get("alpha", 0.01)),
     "Less": _elementwise(torch.lt),
     "LessOrEqual": _elementwise(torch.le),
@@ -358,9 +329,9 @@ OPERATORS: dict[str, Operator] = {
     "PRelu": lambda _, x: torch.where(x[0] < 0, x[0] * x[1], x[0]),
     "Pad": _pad,
     "Pow": _elementwise(torch.pow),
-    "Range": _range,
+    "Range": lambda _, x: torch.arange(*(part.item() for part in x), dtype=x[0].dtype, device=x[0].device),
     "Reciprocal": _elementwise(torch.reciprocal),
-    "ReduceL2": _reduced(_length),
+    "ReduceL2": _reduced(lambda x, dim, keepdim: x.square().sum(dim, keepdim=keepdim).sqrt()),
     "ReduceMax": _reduced(torch.amax),
     "ReduceMean": _reduced(torch.mean),
     "ReduceMin": _reduced(torch.amin),
@@ -370,7 +341,9 @@ OPERATORS: dict[str, Operator] = {
     "Resize": _resize,
     "Round": _elementwise(torch.round),
     "Selu": lambda _, x: functional.selu(x[0]),
-    "Shape": _shape,
+    "Shape": lambda a, x: torch.tensor(
+        x[0].shape[a.get("start", 0) : a.get("end")], dtype=torch.int64, device=x[0].device
+    ),
     "Sigmoid": _elementwise(torch.sigmoid),
     "Sign": _elementwise(torch.sign),
     "Sin": _elementwise(torch.sin),
