@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.gradopt import Search, random_search
@@ -109,7 +107,7 @@ def check_gradients(measure: RecordedMeasure, space: SearchSpace, search: Search
     _, at_start = measure.values_and_gradients(
         space, space.random((len(measure.groups), 2), torch.Generator().manual_seed(0)).to(measure.device)
     )
-    dead = sum(float(_zero_share(part)) for part in (gradient, at_start)) / 2
+    dead = sum(float((part == 0).float().mean()) for part in (gradient, at_start)) / 2
     passed = dead < 0.5
     return Check(
         "non-zero gradients",
@@ -120,10 +118,6 @@ def check_gradients(measure: RecordedMeasure, space: SearchSpace, search: Search
         else "the controller does not pass gradients on (argmax, rounding, detach, saturation): make it "
         "differentiable, or search without gradients",
     )
-
-
-def _zero_share(gradient: Float[Tensor, "*n"]) -> Float[Tensor, ""]:
-    return (gradient == 0).float().mean()
 
 
 def check_bounds(space: SearchSpace, search: Search) -> Check:

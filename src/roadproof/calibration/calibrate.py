@@ -159,7 +159,7 @@ def calibrate(
     on_call(0)
     began = time.perf_counter()
     if method is Method.PUBLISHED:
-        geometry = [_from_points(replays, drives, drive) for drive in drives.drives]
+        geometry = [_Geometry(*homographies_from_points(replays, drive, settings.camera)) for drive in drives.drives]
         maps: list[PixelMaps | None] = [None] * len(geometry)
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
@@ -190,11 +190,6 @@ def calibrate(
         obstacles=obstacles_of(simulator, settings.scenario),
     )
     return Calibrated(recordings, report, _parts(drives, method))
-
-
-def _from_points(replays: Replays, drives: Drives, drive: Drive) -> _Geometry:
-    found, dropped, residuals = homographies_from_points(replays, drive, drives.settings.camera)
-    return _Geometry(found, dropped, residuals)
 
 
 def _look(replays: Replays, drives: Drives, drive: Drive, *, refine: bool) -> Paints:

@@ -121,14 +121,11 @@ class Course:
     def law(self, place: Place) -> Float[Tensor, " r"]:
         """Steering on the bare road at each place, by the fitted law."""
         d = place.right_m.clamp(-_FAR_M, _FAR_M)
-        p, q, r = self._slopes()
+        p, q, r = self._law.unbind()
         return self.at(self.steer, place.s_m) + p * d + q * place.turned_rad + r * d * d.abs()
-
-    def _slopes(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self._law[0], self._law[1], self._law[2]
 
     def feedback(self, place: Place) -> Float[Tensor, " r"]:
         """Zero, with the gradient of the law in the pose, which stands for what the picture would answer to a move."""
-        p, q, _ = self._slopes()
+        p, q, _ = self._law.unbind()
         d, e = place.right_m, place.turned_rad
         return p * (d - d.detach()) + q * (e - e.detach())

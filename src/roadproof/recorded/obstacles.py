@@ -71,7 +71,8 @@ class Obstacles:
         """
         x, y, yaw = car.x_m, car.y_m, car.yaw_rad
         # Most of the time nothing touches: that is asked without gradients, which would cost twice as much.
-        if not self._touched(x.detach(), y.detach(), yaw.detach()):
+        here = (each.detach() for each in (x, y, yaw))
+        if not len(self) or not (_distances(self._circles(*here), self._boxes)[0] < RADIUS_M).any():
             return car
         pushed = torch.zeros_like(x)
         for _ in range(_PUSHES):
@@ -94,10 +95,6 @@ class Obstacles:
         """The middles of each car's circles."""
         ahead = self._ahead
         return torch.stack([x[:, None] + ahead * yaw.cos()[:, None], y[:, None] + ahead * yaw.sin()[:, None]], -1)
-
-    def _touched(self, x: Float[Tensor, " r"], y: Float[Tensor, " r"], yaw: Float[Tensor, " r"]) -> bool:
-        """Whether any car is inside an obstacle."""
-        return len(self) > 0 and bool((_distances(self._circles(x, y, yaw), self._boxes)[0] < RADIUS_M).any())
 
 
 def _distances(

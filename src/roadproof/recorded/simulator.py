@@ -164,7 +164,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         Raises:
             SimulatorError: no reset was made yet.
         """
-        return _gap_of(self._world.bank.nearest(_poses(self._running().car)))
+        return _gap_of(self._world.bank.nearest(Poses(*self._running().car[:3])))
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px.
@@ -216,7 +216,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         return VehicleState(x + canvas.x_m, y + canvas.y_m, canvas.z_m, yaw, speed)
 
     def _observe(self, drive: _Drive) -> Observation:
-        course, poses = self._world.course, _poses(drive.car)
+        course, poses = self._world.course, Poses(*drive.car[:3])
         nearest = self._world.bank.nearest(poses)
         frame = self._frame(poses, nearest, drive.pattern)
         ending = None
@@ -244,10 +244,6 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         size = (view.right_px - view.left_px, view.bottom_px - view.top_px)
         picture.paste(Image.fromarray(frame).resize(size, Image.Resampling.NEAREST), (view.left_px, view.top_px))
         return np.asarray(picture)
-
-
-def _poses(car: Motion) -> Poses:
-    return Poses(car.x_m, car.y_m, car.yaw_rad)
 
 
 def _gap_of(gap: Gap) -> RecordedGap:

@@ -188,10 +188,10 @@ class RecordedWorld:
         controls = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
         off = torch.tensor([start.steer for start in starts], dtype=torch.float64, device=self.device)
         off = off.repeat(count // len(starts))
-        gap = self.bank.nearest(Poses(car.x_m, car.y_m, car.yaw_rad))
+        gap = self.bank.nearest(Poses(*car[:3]))
         memory: object = None
         for step in range(course.count):
-            poses = Poses(car.x_m, car.y_m, car.yaw_rad)
+            poses = Poses(*car[:3])
             place = course.locate(poses)
             if step % every == 0:
                 gap = self.bank.nearest(poses.detached())

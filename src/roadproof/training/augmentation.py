@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -55,23 +55,16 @@ class Augmentation:
         mixing = saturation * torch.eye(3).to(frames) + (1.0 - saturation) / 3.0
         pixels = frames.contiguous().flatten(2)
         varied = torch.baddbmm(gain * mean * (1.0 - contrast), gain * contrast * mixing, pixels)
-        varied = self._blurred(varied.reshape(frames.shape).clamp_(0.0, 1.0), generator)
-        return self._noisy(varied, generator).clamp_(0.0, 1.0)
-
-    def _blurred(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
-        chosen = _some(len(frames), self.blurred, generator)
-        if len(chosen):
-            frames[chosen] = functional.avg_pool2d(frames[chosen], 3, 1, 1, count_include_pad=False)
-        return frames
-
-    def _noisy(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
-        chosen = _some(len(frames), self.noisy, generator)
-        if len(chosen):
-            strength = self.noise * torch.rand(len(chosen), 1, 1, 1, generator=generator)
-            noise = torch.randn(len(chosen), *frames.shape[1:], generator=generator) * strength
-            frames[chosen] += noise.to(frames)
-        return frames
+        varied = varied.reshape(frames.shape).clamp_(0.0, 1.0)
+        if len(blurred := some(self.blurred, len(varied), generator)):
+            varied[blurred] = functional.avg_pool2d(varied[blurred], 3, 1, 1, count_include_pad=False)
+        if count := len(noisy := some(self.noisy, len(varied), generator)):
+            strength = self.noise * torch.rand(count, 1, 1, 1, generator=generator)
+            noise = torch.randn(count, *varied.shape[1:], generator=generator) * strength
+            varied[noisy] += noise.to(varied)
+        return varied.clamp_(0.0, 1.0)
 
 
-def _some(count: int, share: float, generator: torch.Generator) -> Tensor:
+def some(share: float, count: int, generator: torch.Generator) -> Int[Tensor, " c"]:
+    """Numbers below a count, each of them chosen with a probability of `share`."""
     return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, sight
+from roadproof.training.augmentation import some
 
 FARTHEST_M = 40.0
 MOST = 5
@@ -43,7 +44,7 @@ class PastedPaint:
             frames: RGB in [0, 1].
             generator: where the randomness comes from.
         """
-        chosen = (torch.rand(len(frames), generator=generator) < self.share).nonzero()[:, 0]
+        chosen = some(self.share, len(frames), generator)
         if not len(chosen):
             return frames
         inside, ground = self._inside.to(frames.device), self._ground.to(frames)
