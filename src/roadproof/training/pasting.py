@@ -25,17 +25,15 @@ ALONG_RAD = math.radians(25.0)
 
 
 class PastedPaint:
-    """Pastes one to five rectangles in a share of the pictures; half of them lie nearly along the road.
+    """Pastes one to five rectangles in a share of CARLA's agent's pictures; half of them lie nearly along the road.
 
     Args:
         share: share of the pictures that get rectangles, 0 to 1.
-        camera: the camera the pictures are from.
-        input: how the pictures were cut from the camera's.
     """
 
-    def __init__(self, share: float, camera: CameraModel = CIL_CAMERA, input: CropResize = CIL_INPUT) -> None:  # noqa: A002
+    def __init__(self, share: float) -> None:
         self.share = share
-        self._inside, self._ground = _ground_seen(camera, input)
+        self._inside, self._ground = _ground_seen(CIL_CAMERA, CIL_INPUT)
 
     def __call__(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
         """Copies with paint in some of them; drawn on the CPU, whatever the frames are on.
