@@ -29,12 +29,7 @@ def steer_of(
 ) -> Float[Tensor, " b"]:
     """What `Controller.steer` answers, checked: steering of each frame, in steer units, (B,).
 
-    Args:
-        controller: the controller.
-        frames: RGB in [0, 1], (B, 3, H, W).
-        speed_mps: speed of the car at each frame, m/s, (B,).
-        command: what the route asks at each frame, in CARLA's codes, (B,).
-        finite: whether to look for NaN and infinity, for which the device is waited for.
+    Without `finite` it is not looked for NaN and infinity, for which the device has to be waited for.
 
     Raises:
         ControllerError: the controller raises, or does not answer with one finite number per frame that is
@@ -84,13 +79,7 @@ def next_controls_of(
 ) -> tuple[Float[Tensor, "b c"], object]:
     """All that a controller of any kind says: steer, throttle and brake, (B, 3), or steer alone, (B, 1).
 
-    Args:
-        controller: the controller.
-        memory: what this gave with the frames before; None at the first ones.
-        frames: RGB in [0, 1], (B, 3, H, W).
-        speed_mps: speed of the car at each frame, m/s, (B,).
-        command: what the route asks at each frame, in CARLA's codes, (B,).
-        elapsed_s: seconds since the frames before; 0 at the first ones.
+    It comes with what is remembered; the arguments are those of `TemporalController.controls_after`.
 
     Raises:
         ControllerError: the controller raises, or answers wrongly.

@@ -59,13 +59,7 @@ class ConditionalNetwork(nn.Module):
         raise NotImplementedError
 
     def forward(self, frames: Frames, speed_mps: Speeds, command: Commands) -> ConditionalOutput:
-        """Controls and predicted speed, in the network's own dtype; what training needs.
-
-        Args:
-            frames: RGB in [0, 1], (B, 3, H, W).
-            speed_mps: measured speed of the car at each frame, m/s, (B,).
-            command: what the route asks at each frame, in CARLA's codes (`datatypes.Command`), (B,).
-        """
+        """Controls and predicted speed, in the network's own dtype; what training needs."""
         image = self.image_feature(frames)
         return ConditionalOutput(self._controls(image, speed_mps, command), self.speed_branch(image)[:, 0])
 
