@@ -7,7 +7,7 @@ References:
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from roadproof.controllers.frames import control_of
-from roadproof.controllers.protocol import Commands, Frames, Speeds
+from roadproof.controllers.protocol import Commands, Frames, PedalController, Speeds
 from roadproof.datatypes import Command, Control
 
 SPEED_SCALE_MPS = 25.0
@@ -86,7 +86,7 @@ class ConditionalNetwork(nn.Module):
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """The control that `controls` gives for one frame."""
-        return control_of(self, frame, speed_mps, command)
+        return control_of(cast("PedalController", self), frame, speed_mps, command)  # with a subclass's input_size
 
     def _controls(self, image: Float[Tensor, "b image"], speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         joined = self.joined(image, (speed_mps / SPEED_SCALE_MPS).to(image.dtype)[:, None])

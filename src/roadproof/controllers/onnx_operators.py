@@ -258,6 +258,10 @@ def _reduced(kind: Callable[..., Tensor]) -> Operator:
     return apply
 
 
+def _length(x: Tensor, *, dim: tuple[int, ...], keepdim: bool) -> Tensor:
+    return x.square().sum(dim, keepdim=keepdim).sqrt()
+
+
 def _elementwise(kind: Callable[..., Tensor]) -> Operator:
     return lambda _, x: kind(*x)
 
@@ -331,7 +335,7 @@ OPERATORS: dict[str, Operator] = {
     "Pow": _elementwise(torch.pow),
     "Range": lambda _, x: torch.arange(*(part.item() for part in x), dtype=x[0].dtype, device=x[0].device),
     "Reciprocal": _elementwise(torch.reciprocal),
-    "ReduceL2": _reduced(lambda x, dim, keepdim: x.square().sum(dim, keepdim=keepdim).sqrt()),
+    "ReduceL2": _reduced(_length),
     "ReduceMax": _reduced(torch.amax),
     "ReduceMean": _reduced(torch.mean),
     "ReduceMin": _reduced(torch.amin),
