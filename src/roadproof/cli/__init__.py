@@ -1,6 +1,7 @@
 """The command line: thin verbs over the public functions, one file a verb.
 
-A `RoadproofError` is one line on standard error and exit code 2, a traceback only with `--debug`.
+Verbs import what they work with when they are called: torch takes seconds, which `--help` and mistakes in the options
+should not. A `RoadproofError` is one line on standard error and exit code 2, a traceback only with `--debug`.
 """
 
 from __future__ import annotations

@@ -79,7 +79,6 @@ def attack(
     paint: Paint,
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks import OBJECTIVES, method_of, parse_groups, site_of
     from roadproof.attacks import attack as run
     from roadproof.attacks.objective import varied

@@ -28,7 +28,6 @@ def calibrate(
 ) -> None:
     """Find out where the canvas is in recorded drives and how paint looks there. A second call goes on where the first
     ended."""  # noqa: D205, D209
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.calibration import METHODS, Calibrated, replays_needed
     from roadproof.calibration import calibrate as run
     from roadproof.cli.progress import progress

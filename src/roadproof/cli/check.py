@@ -37,7 +37,6 @@ def check(
     out: Out = Path("out/check"),
 ) -> None:
     """Check a controller against stored, random and fresh patterns: exit code 0 passed, 1 not, 2 not run."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.errors import CheckError

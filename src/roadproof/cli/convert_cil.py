@@ -22,7 +22,6 @@ def convert_cil(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Convert the checkpoint of CARLA's imitation learning agent, which the paper attacks, to weights."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.controllers import convert_cil as convert
 
     convert(checkpoint, out, overwrite=overwrite)

@@ -44,7 +44,6 @@ def demo(
     paint: Paint,
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks.cheapest import in_words
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import stages

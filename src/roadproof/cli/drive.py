@@ -39,7 +39,6 @@ def drive(
     out: options.NewOut = Path("out/drive"),
 ) -> None:
     """Drive a scenario and film it."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.cli.progress import progress
     from roadproof.datatypes import Weather
     from roadproof.driving.episode import Episode

@@ -71,7 +71,6 @@ def evaluate(
     out: options.Out = Path("out/evaluation"),
 ) -> None:
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.cli.progress import stages
     from roadproof.controllers import Controller
     from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns

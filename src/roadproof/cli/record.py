@@ -44,7 +44,6 @@ def record(
     out: options.Out = Path("out/runs"),
 ) -> None:
     """Record drives past the canvas, clean and perturbed: a run for each scenario, in a folder of its name."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from dataclasses import replace
 
     from roadproof.cli.progress import progress

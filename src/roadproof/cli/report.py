@@ -13,7 +13,6 @@ def report(
     folder: Annotated[Path, argument("Of a run: record, recordings, attack, evaluation.")],
 ) -> None:
     """Show a run as one self-contained page, report.html, and its numbers as result.json."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.report.page import write_report
 
     page = write_report(folder)

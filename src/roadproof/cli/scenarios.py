@@ -20,7 +20,6 @@ def scenarios(
     out: Annotated[Path | None, unset("File for a picture of them on their map.")] = None,
 ) -> None:
     """List the scenarios, and draw them on their map."""
-    # Matplotlib takes a second to import; `--help` should not.
     from rich.text import Text
 
     from roadproof.roads.maps import load_map, scenario_route

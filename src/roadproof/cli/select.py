@@ -27,7 +27,6 @@ def select(
 
     In recordings the drives are predicted.
     """
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.attacks import AttackResult
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller

@@ -33,7 +33,6 @@ def run(
     trust: Trust = False,
 ) -> None:
     """Find and evaluate a pattern for every scenario, number of figures, method and seed of a plan."""
-    # Torch takes seconds to import; `--help` should not.
     from roadproof.cli.progress import HOURS_S, progress
     from roadproof.controllers import load_controller
     from roadproof.study.folder import is_done
@@ -109,7 +108,6 @@ def tables(
     out: Annotated[Path | None, unset("Folder for the results.", default="FOLDER/tables")] = None,
 ) -> None:
     """Make a study's tables and figures: tables.html, tables.md, a .tex of each table, figures as PNG."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.study.folder import read_table
     from roadproof.study.page import write_tables
 

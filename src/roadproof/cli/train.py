@@ -33,7 +33,6 @@ def train(
     collect_only: Annotated[bool, typer.Option("--collect-only", help="Stop before learning.")] = False,
 ) -> None:
     """Collect drives, learn from them, let the network drive, learn from that; goes on where it was interrupted."""
-    # Torch takes seconds to import; `--help` and mistakes in the options should not.
     from roadproof.cli.progress import stages
     from roadproof.io.locks import hold
     from roadproof.training.recipe import Recipe, follow, gather
