@@ -63,35 +63,32 @@ def progress(
         total: how many steps the stage has.
         value: format of the number that is shown beside the steps.
         begun: how many steps were done before; they say nothing on the time left.
-        remember_s: how many seconds of past steps tell the time left; `HOURS_S` where each step takes minutes.
+        remember_s: as `stages` takes it.
 
     Yields:
         The function to call with how many steps are done and the number beside them.
     """
-    with _shown(remember_s) as show:
+    with stages(remember_s) as show:
         show(title, begun, total, value.format(0.0))
         yield lambda done, number: show(title, done, total, value.format(number))
 
 
 @contextmanager
-def stages() -> Generator[Show]:
+def stages(remember_s: float = _SECONDS_S) -> Generator[Show]:
     """Show each of several stages, and give the function that says how far they are.
+
+    Args:
+        remember_s: how many seconds of past steps tell the time left; `HOURS_S` where each step takes minutes.
 
     Yields:
         The function to call with a stage's name, the steps done, how many there are, and what to show beside them.
     """
-    with _shown(_SECONDS_S) as show:
-        yield show
-
-
-@contextmanager
-def _shown(remember_s: float) -> Generator[Show]:
     console = Console(stderr=True)
     if _loudness is Loudness.QUIET:
         yield lambda _title, _done, _total, _value: None
     elif _loudness is Loudness.USUAL and console.is_terminal:
-        with _bars(console, remember_s) as bar:
-            yield _Bars(bar).show
+        with _Bars(console, remember_s) as bars:
+            yield bars.show
     else:
         lines = _Lines()
         ended = threading.Event()
@@ -104,17 +101,26 @@ def _shown(remember_s: float) -> Generator[Show]:
             watch.join()
 
 
-class _Bars:
+class _Bars(Progress):
     """A bar for each stage."""
 
-    def __init__(self, bar: Progress) -> None:
-        self._bar = bar
-        self._tasks: dict[str, TaskID] = {}
+    def __init__(self, console: Console, remember_s: float) -> None:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[value]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        super().__init__(*columns, console=console, transient=True, speed_estimate_period=remember_s)
+        self._by_title: dict[str, TaskID] = {}
 
     def show(self, title: str, done: int, total: int, value: str) -> None:
-        if title not in self._tasks:
-            self._tasks[title] = self._bar.add_task(title, total=total, completed=done, value=value)
-        self._bar.update(self._tasks[title], completed=done, total=total, value=value)
+        if title not in self._by_title:
+            self._by_title[title] = self.add_task(title, total=total, completed=done, value=value)
+        self.update(self._by_title[title], completed=done, total=total, value=value)
 
 
 class _Lines:
@@ -161,16 +167,3 @@ def in_words(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
-
-
-def _bars(console: Console, remember_s: float) -> Progress:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[value]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    return Progress(*columns, console=console, transient=True, speed_estimate_period=remember_s)
