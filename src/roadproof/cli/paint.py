@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -56,6 +56,14 @@ _OPTIONS: dict[str, Any] = {
         Path | None, _grouped(unset("TOML file with the same in tables named paint and variation; options come first."))
     ],
 }
+_FIELDS = {
+    "max_area": "max_area_m2",
+    "colours": "colours",
+    "printable": "printable",
+    "contrast": "contrast",
+    "keep_out": "keep_out_m",
+}
+"""The fields of `PaintLimits`, by the names of their options."""
 
 
 def with_paint(command: Callable[..., None]) -> Callable[..., None]:
@@ -76,7 +84,7 @@ def with_paint(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def called(**values: Any) -> None:  # noqa: ANN401
         asked = {name: values.pop(name) for name in _OPTIONS}
-        command(**values, paint=_paint(**asked))
+        command(**values, paint=_paint(asked))
 
     keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=own[each.name]) for each in plain]
     called.__signature__ = signature.replace(parameters=[*keyword, *added])  # type: ignore[attr-defined]
@@ -84,39 +92,22 @@ def with_paint(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
-def _paint(
-    *,
-    max_area: float | None,
-    colours: str | None,
-    printable: bool,
-    contrast: tuple[float, float] | None,
-    keep_out: float | None,
-    robust: bool,
-    paint: Path | None,
-) -> Paint:
-    """The limits and the variation of the options and the file.
-
-    Raises:
-        RoadproofError: the file is missing or damaged, or a value is out of its range.
-    """
-    if not (printable or robust) and all(each is None for each in (max_area, colours, contrast, keep_out, paint)):
+def _paint(asked: Mapping[str, Any]) -> Paint:
+    """The limits and the variation of the options, by their names in `_OPTIONS`, and of the file."""
+    given = {name: value for name, value in asked.items() if value is not None and value is not False}
+    if not given:
         # Torch takes seconds to import; commands without limits read their other options first.
         return Paint(None, None)
     from roadproof.compositing import Variation
     from roadproof.paint import PaintLimits
 
-    limits, variation = (None, None) if paint is None else _read(paint)
-    said: dict[str, Any] = {
-        "max_area_m2": max_area,
-        "colours": None if colours is None else tuple(each.strip() for each in colours.split(",")),
-        "printable": printable or None,
-        "contrast": contrast,
-        "keep_out_m": keep_out,
-    }
-    said = {name: value for name, value in said.items() if value is not None}
+    limits, variation = _read(given["paint"]) if "paint" in given else (None, None)
+    said = {field: given[name] for name, field in _FIELDS.items() if name in given}
+    if "colours" in said:
+        said["colours"] = tuple(each.strip() for each in said["colours"].split(","))
     if said:
         limits = replace(limits or PaintLimits(), **said)
-    return Paint(limits, variation or (Variation() if robust else None))
+    return Paint(limits, variation or (Variation() if "robust" in given else None))
 
 
 def _read(path: Path) -> tuple[PaintLimits | None, Variation | None]:
