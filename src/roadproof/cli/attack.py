@@ -142,11 +142,7 @@ def attack(
 def _check_attacked(
     attacked: Controller, drives: RecordingSet, method: Method, objective: Objective, *, device: str, dtype: str
 ) -> None:
-    """Refuse a controller that the search cannot work on, before it begins; say where its arithmetic is slow.
-
-    Raises:
-        ControllerError: the controller fails on frames like the recorded ones, or lacks what the objective needs.
-    """
+    """Refuse a controller that the search cannot work on, before it begins; say where its arithmetic is slow."""
     from roadproof.attacks import SpeedChange
     from roadproof.attacks.speed import require_pedals
     from roadproof.controllers.checks import require_usable
@@ -161,12 +157,7 @@ def _check_attacked(
 
 
 def _check_cheapest(drives: RecordingSet, objective: str) -> None:
-    """Refuse to look for the least paint where it cannot be told.
-
-    Raises:
-        RecordingError: the recordings cannot be driven in.
-        RoadproofError: the search before it is not in metres.
-    """
+    """Refuse to look for the least paint where it cannot be told."""
     from roadproof.errors import RecordingError, RoadproofError
 
     if not drives.is_placed:

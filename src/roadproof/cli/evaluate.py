@@ -98,7 +98,9 @@ def evaluate(
     if recorded is not None and recorded.canvas is not None and where.scenario is not None:
         check_canvas(where.scenario.canvas, recorded.canvas)
     who = options.driver_of(controller, device)
-    runs = _runs(runs, cars + pedestrians)
+    runs = 10 if runs is None else runs
+    if runs and not cars + pedestrians:
+        raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
     begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
     with where.open() as (world, driven):
@@ -134,11 +136,7 @@ def evaluate(
 
 
 def _figures(pattern: Path, *, needed: bool) -> Pattern | None:
-    """The figures of a pattern; None of a picture.
-
-    Raises:
-        PatternError: the file is damaged, or a picture where figures are needed.
-    """
+    """The figures of a pattern; None of a picture, which is refused where figures are needed."""
     from roadproof.patterns import load_pattern
 
     if pattern.suffix == ".json":
@@ -148,26 +146,10 @@ def _figures(pattern: Path, *, needed: bool) -> Pattern | None:
     return None
 
 
-def _runs(given: int | None, others: int) -> int:
-    """Drives in traffic: those asked for, or ten.
-
-    Raises:
-        RoadproofError: drives in traffic are wanted, and nobody is to be on the road.
-    """
-    runs = 10 if given is None else given
-    if runs and not others:
-        raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
-    return runs
-
-
 def _check_recorded(
     recorded: Recorded, weathers: tuple[Weather, ...], runs: int | None, recordings: Path | None
 ) -> None:
-    """Refuse what recordings cannot give, before anything is driven.
-
-    Raises:
-        RoadproofError: another weather, traffic, or renders to compare with, are asked for.
-    """
+    """Refuse what recordings cannot give, before anything is driven: other weathers, traffic, renders."""
     if other := [weather for weather in weathers if weather != recorded.weather]:
         raise RoadproofError(
             f"--weathers has {other[0]}, but the drives were recorded at {recorded.weather}; leave it out"

@@ -78,11 +78,7 @@ def argument(about: str) -> Any:  # noqa: ANN401
 
 
 def _simulator(spec: str) -> str:
-    """What `--simulator` names, once it names a simulator; recordings are looked at by the verbs that drive in them.
-
-    Raises:
-        SimulatorError: no simulator has this name, or it is one that the verb cannot drive in.
-    """
+    """What `--simulator` names, once it names a simulator; recordings are looked at by the verbs that drive in them."""
     if spec != "town":
         # The road map comes with it; `--help` is spared.
         from roadproof.simulators.loading import check_spec
@@ -97,11 +93,7 @@ def _world(spec: str) -> str:
 
 
 def _device(device: str) -> str:
-    """The torch device that `--device` names.
-
-    Raises:
-        DeviceError: there is no such device.
-    """
+    """The torch device that `--device` names, once there is such a device."""
     if device == "cpu":
         return device
     # Torch takes seconds to import; most commands never come here.
