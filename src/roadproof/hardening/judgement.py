@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -186,13 +185,13 @@ class Judge:
             RoadproofError: a stage refuses; the message says why.
         """
         run, folder = self.run, self.run.judged(self.number, self.scenario)
-        tested = run.attack_to_judge(self.simulator, self.number, self.scenario, self.on_progress)
+        tested = run.attack(self.simulator, self.number, self.scenario, self.on_progress, judging=True)
         calls = sum(cost.simulator_calls for cost in tested.cost.values())
         judged = [self._judged(tested.evaluation, SEARCHED, calls)]
         controller, recordings = run.controller(self.number), load_recordings(folder / "recordings")
         for number, (kind, (method, space)) in enumerate(run.budget.kinds(run.space).items(), 1):
             place = folder / f"kind-{number}"
-            steps = method.steps(run.budget.judge.objective)
+            title, steps = f"Searching, {kind}", method.steps(run.budget.judge.objective)
             found = kept_attack(
                 place / "attack",
                 recordings,
@@ -202,16 +201,15 @@ class Judge:
                 method=method,
                 seed=run.judging_seed,
                 device=run.device,
-                on_step=partial(self._searching, f"Searching, {kind}", steps),
+                on_step=lambda step, best, title=title, steps=steps: self.on_progress(
+                    title, step, steps, f"{best:.2f}"
+                ),
             )
             judged.append(self._driven(controller, found.pattern, place / "evaluation", kind))
         if self.number:
             old = load_pattern(run.judged(0, self.scenario) / "pattern.json")
             judged.append(self._driven(controller, old, folder / "old", OLD))
         return judged
-
-    def _searching(self, title: str, steps: int, step: int, best: float) -> None:
-        self.on_progress(title, step, steps, f"{best:.2f}")
 
     def _driven(self, controller: Controller, pattern: Pattern, place: Path, kind: str) -> Judged:
         asked = self.run.budget.judge

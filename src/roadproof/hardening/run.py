@@ -8,7 +8,6 @@ from pathlib import Path
 from roadproof.controllers import Controller, load_controller
 from roadproof.controllers.loading import runs_code
 from roadproof.hardening.budget import HardeningBudget
-from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace, derived_seed
@@ -78,44 +77,22 @@ class Run:
         """The seed of all judging, which no round has."""
         return self.seed + _FRESH
 
-    def attack(self, simulator: Simulator, number: int, scenario: Scenario, on_progress: OnProgress) -> StressTest:
-        """Attack a round's controller afresh on a street for training.
+    def attack(
+        self, simulator: Simulator, number: int, scenario: Scenario, on_progress: OnProgress, *, judging: bool = False
+    ) -> StressTest:
+        """Attack a round's controller afresh on a street for training, or in the same way on one for judging.
 
         Raises:
             RoadproofError: a stage refuses; the message says why.
         """
-        folder, seed = self.round(number) / scenario.name, self.seed_of(number)
-        return self._test(simulator, number, scenario, folder, self.budget.attack, seed, on_progress)
-
-    def attack_to_judge(
-        self, simulator: Simulator, number: int, scenario: Scenario, on_progress: OnProgress
-    ) -> StressTest:
-        """Attack a round's controller on a street for judging, as in training.
-
-        Raises:
-            RoadproofError: a stage refuses; the message says why.
-        """
-        folder, seed = self.judged(number, scenario), self.judging_seed
-        return self._test(simulator, number, scenario, folder, self.budget.judge, seed, on_progress)
-
-    def _test(
-        self,
-        simulator: Simulator,
-        number: int,
-        scenario: Scenario,
-        folder: Path,
-        budget: Budget,
-        seed: int,
-        on_progress: OnProgress,
-    ) -> StressTest:
         return stress_test(
             simulator,
             self.controller(number),
             scenario,
-            folder,
-            budget=budget,
+            self.judged(number, scenario) if judging else self.round(number) / scenario.name,
+            budget=self.budget.judge if judging else self.budget.attack,
             space=self.space,
-            seed=seed,
+            seed=self.judging_seed if judging else self.seed_of(number),
             controller_name=self.name(number),
             device=self.device,
             film=False,
