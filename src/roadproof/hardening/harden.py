@@ -22,6 +22,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
 from roadproof.hardening.judgement import Clean, Judge, Judged, Judgement, clean_drives
 from roadproof.hardening.run import WEIGHTS, Run
-from roadproof.hardening.together import StreetWork, attack_street, judge_street, together
+from roadproof.hardening.together import StreetWork, attack_street, judge_street
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.hardening.views import Street
@@ -47,6 +48,7 @@ from roadproof.io.identity import ANSWERS
 from roadproof.io.locks import working_in
 from roadproof.pipeline.stage_costs import Ledger, StageCost
 from roadproof.pipeline.stress_test import OnProgress, StressTest
+from roadproof.processes import Opened, spread
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
@@ -245,7 +247,7 @@ class _Hardening:
                 street.add_ways(driver, space.pattern(points.to(run.device)))
                 streets.append(street)
                 found.append(points)
-        title = f"Round {number}: learning"
+        title, checkpoint = f"Round {number}: learning", run.round(number) / "learning.safetensors"
         with self.ledger.stage("learn"):
             tune(
                 network,
@@ -258,11 +260,11 @@ class _Hardening:
                 seed=run.seed_of(number),
                 device=run.device,
                 step=self.step,
-                checkpoint=run.round(number) / "learning.safetensors",
+                checkpoint=checkpoint,
                 on_step=lambda step, loss: self.tell(title, step, tuning.steps, f"loss {loss:.4f}"),
             )
         _save(network, run, number)
-        (run.round(number) / "learning.safetensors").unlink(missing_ok=True)
+        checkpoint.unlink(missing_ok=True)
 
     def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
         """Judge the controllers before and after on other streets."""
@@ -280,22 +282,20 @@ class _Hardening:
 
     def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, Clean]:
         """Drive over the bare road with the controllers before and after."""
-
-        def of(number: int) -> Clean:
-            title = f"Bare road, {'after' if number else 'before'}"
-            return clean_drives(
-                self.simulator,
-                self.run.controller(number),
-                scenarios,
-                self.run.budget.clean_weathers,
-                self.run.round(number) / "clean",
-                on_drive=lambda done, total: self.tell(title, done, total, "drives"),
-            )
-
         with self.ledger.stage("bare road"):
-            both = of(0), of(best)
-            self.ledger.calls("bare road", sum(each.drives for each in both))
-        return both
+            before, after = (
+                clean_drives(
+                    self.simulator,
+                    self.run.controller(number),
+                    scenarios,
+                    self.run.budget.clean_weathers,
+                    self.run.round(number) / "clean",
+                    on_drive=lambda done, total, when=when: self.tell(f"Bare road, {when}", done, total, "drives"),
+                )
+                for number, when in ((0, "before"), (best, "after"))
+            )
+            self.ledger.calls("bare road", before.drives + after.drives)
+        return before, after
 
     def town(self) -> Dataset | None:
         """Frames of the controller's clean drives through the town, where there is one."""
@@ -316,8 +316,9 @@ class _Hardening:
         """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
         if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
             self.tell(title, 0, len(scenarios), "streets")
-            done = together(work, self.run, number, scenarios, self.factory, self.processes)
-            for count, scenario in enumerate(done, 1):
+            on_street = partial(work, self.run, number)
+            done = spread(on_street, scenarios, Opened(self.factory), processes=self.processes)
+            for count, (scenario, _) in enumerate(done, 1):
                 self.tell(title, count, len(scenarios), f"streets, {scenario.name} is done")
 
     def _under(self, title: str) -> OnProgress:
