@@ -82,13 +82,9 @@ class HardeningBudget:
         """What judging searches besides `judge`: method and search space by the name of the kind."""
         shapes = SearchSpace(figures=space.figures, family="free", shape=self.unseen_shape, limits=space.limits)
         return {
-            f"{self.unseen.word}, {self._calls} patterns tried": (self.unseen, space),
+            f"{self.unseen.word}, {self.unseen.steps(self.judge.objective)} patterns tried": (self.unseen, space),
             f"{self.unseen_shape}s by gradient": (self.judge.method, shapes),
         }
-
-    @property
-    def _calls(self) -> int:
-        return self.unseen.steps(self.judge.objective)
 
 
 HARDENING_BUDGETS = {

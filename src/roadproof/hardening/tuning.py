@@ -228,16 +228,16 @@ class _Paint:
     """Draws patterns, and makes them worse for a controller."""
 
     def __init__(self, space: SearchSpace, found: Float[Tensor, "p k n"], tuning: Tuning) -> None:
-        self._space, self._found, self._tuning = space, found, tuning
+        self.space, self._found, self._tuning = space, found, tuning
 
     def draw(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
         """Points of the search space: some found ones, slightly moved, some random ones."""
-        unit = self._space.random((count,), generator).to(self._found)
+        unit = self.space.random((count,), generator).to(self._found)
         known = torch.rand(count, generator=generator) < (self._tuning.found if len(self._found) else 0.0)
         moved = 0.02 * torch.randn(unit.shape, generator=generator)
         if bool(known.any()):
             picked = torch.randint(len(self._found), (count,), generator=generator)
-            near = self._space.project(self._found[picked.to(unit.device)] + moved.to(unit))
+            near = self.space.project(self._found[picked.to(unit.device)] + moved.to(unit))
             unit = torch.where(known.to(unit.device)[:, None, None], near, unit)
         return unit
 
@@ -249,16 +249,11 @@ class _Paint:
             return unit
         for _ in range(self._tuning.climbs):
             leaf = unit.detach().requires_grad_()
-            frames = views.painted(self._space.pattern(leaf))
+            frames = views.painted(self.space.pattern(leaf))
             steer = answers(network, frames, views.speed_mps, views.command)[:, 0]
             (gradient,) = torch.autograd.grad((steer - target).abs().sum(), leaf)
-            unit = self._space.project(leaf.detach() + self._tuning.climb * gradient.sign())
+            unit = self.space.project(leaf.detach() + self._tuning.climb * gradient.sign())
         return unit
-
-    def on(self, unit: Float[Tensor, "b k n"], views: Views) -> Float[Tensor, "b 3 h w"]:
-        """The pictures with them painted."""
-        with torch.no_grad():
-            return views.painted(self._space.pattern(unit))
 
 
 def _of_street(
@@ -278,7 +273,9 @@ def _of_street(
     unit = paint.draw(len(views.frames), draw)
     unit = paint.climbed(unit, views, cast("Controller", network), target[:, 0])
     bare = (torch.rand(len(unit), generator=draw) < tuning.bare).to(unit.device)
-    frames = torch.where(bare[:, None, None, None], views.frames, paint.on(unit, views))
+    with torch.no_grad():
+        painted = views.painted(paint.space.pattern(unit))
+    frames = torch.where(bare[:, None, None, None], views.frames, painted)
     return TuningBatch(frames, views.speed_mps, views.command, target)
 
 
