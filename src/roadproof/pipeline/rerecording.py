@@ -25,7 +25,6 @@ from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.calibration import Method as Calibration
 from roadproof.controllers import Controller
 from roadproof.drives import Drives, record_along
-from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.errors import CalibrationError, RecordingError
 from roadproof.pipeline.selection import Selection, select_by_driving
@@ -117,7 +116,8 @@ def search_on(
     clean = Drives(settings=drives.settings, drives=drives.drives[:1])
     steps = _gone_on(found.method).steps(objective)
     per_round = steps + best
-    known, last, done = _ranked(found, selection), _Driven(selection, folder / "selection"), list[Round]()
+    known, last, drives_of_last = _ranked(found, selection), selection, folder / "selection"
+    done: list[Round] = []
     for number in range(1, rounds + 1):
         place, before = folder / f"round-{number}", per_round * (number - 1)
 
@@ -125,8 +125,9 @@ def search_on(
             on_step(before + now, per_round * rounds, word)
 
         tell(0, "recording")
+        bare, driven = last.episodes(drives_of_last)
         try:
-            added, calls = _recorded(simulator, controller, clean, last, method, place)
+            added, calls = _recorded(simulator, controller, clean, driven, method, place)
         except (CalibrationError, RecordingError) as error:
             return Rounds(first=selection, done=tuple(done), stopped=f"round {number}: {error}")
         recordings = replace(recordings, recordings=(*recordings.recordings, added))
@@ -153,29 +154,13 @@ def search_on(
             best=best,
             weather=drives.settings.weather,
             folder=place / "selection",
-            clean=last.bare(),
+            clean=bare,
             on_drive=lambda n, far, tell=tell: tell(steps + n - 1, f"{far:.2f} m"),
         )
         done.append(Round(attack=again, selection=chosen, simulator_calls=calls + chosen.simulator_calls))
         known = sorted([*_ranked(again, chosen), *known], key=lambda each: -each[0])
-        last = _Driven(chosen, place / "selection")
+        last, drives_of_last = chosen, place / "selection"
     return Rounds(first=selection, done=tuple(done))
-
-
-@dataclass(frozen=True, slots=True)
-class _Driven:
-    """A selection and the folder of its drives."""
-
-    selection: Selection
-    folder: Path
-
-    def bare(self) -> Episode:
-        """The episode of the drive over the bare road."""
-        return load_episodes(self.folder, [self.selection.driven[0].trial.clean])[0]
-
-    def over_chosen(self) -> Episode:
-        """The episode of the drive over the pattern that was chosen."""
-        return load_episodes(self.folder, [self.selection.driven[self.selection.chosen].trial.painted])[0]
 
 
 def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Candidate]]:
@@ -186,10 +171,10 @@ def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Cand
 
 
 def _recorded(
-    simulator: Simulator, controller: Controller, clean: Drives, last: _Driven, method: Calibration, place: Path
+    simulator: Simulator, controller: Controller, clean: Drives, last: Episode, method: Calibration, place: Path
 ) -> tuple[Recording, int]:
     """The recording of the last pattern's path, without paint and calibrated, and the number of drives it took."""
-    drive = record_along(simulator, controller, clean, last.over_chosen(), name=place.name, folder=place)
+    drive = record_along(simulator, controller, clean, last, name=place.name, folder=place)
     both = replace(clean, drives=(*clean.drives, drive))
     calibrated = Calibrated.kept(place, both, method)
     if calibrated is None:

@@ -16,7 +16,7 @@ from roadproof.attacks import Candidate, PathDeviation, SpeedChange
 from roadproof.attacks.groups import Direction
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
-from roadproof.driving.drive_store import CLEAN, Conditions, Episodes
+from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
@@ -97,6 +97,15 @@ class Selection:
     def deviation_m(self) -> float:
         """The paper's deviation of the drive over the chosen pattern, in metres."""
         return self.driven[self.chosen].trial.deviation_m
+
+    def episodes(self, folder: Path) -> tuple[Episode, ...]:
+        """The drive over the bare road, and the one over the chosen pattern, from the folder of the drives.
+
+        Raises:
+            EpisodeError: a drive is missing or damaged.
+        """
+        trial = self.driven[self.chosen].trial
+        return load_episodes(folder, (trial.clean, trial.painted))
 
     def save(self, folder: AnyPath) -> None:
         """Write the choice beside the drives.

@@ -15,7 +15,6 @@ from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import identity_of
 from roadproof.drives import Drives, record
-from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
@@ -35,8 +34,9 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
 CHEAPEST = "cheapest"
-_NONE = "roadproof-cheapest-none", 1
 """The folder of a run with the least paint for a deviation."""
+
+_NONE = "roadproof-cheapest-none", 1
 
 OnProgress: TypeAlias = Callable[[str, int, int, str], object]
 """Called with the name of a stage, how many of its steps are done, how many there are, and a word on the last one."""
@@ -231,8 +231,7 @@ class Stages:
         done = enumerate(() if rounds is None else rounds.done, 1)
         number = next((k for k, each in done if each.selection is chosen), 0)
         place = self.folder / f"round-{number}" if number else self.folder
-        trial = chosen.driven[chosen.chosen].trial
-        clean, painted = load_episodes(place / "selection", (trial.clean, trial.painted))
+        clean, painted = chosen.episodes(place / "selection")
         prediction = predict(recordings, self.controller, pattern, clean, painted, device=self.device)
         prediction.save(path)
         return prediction
