@@ -6,14 +6,13 @@ from pathlib import Path
 
 from PIL import Image
 
-import roadproof
 from roadproof.hardening.harden import Hardened
 from roadproof.hardening.judgement import Judged
 from roadproof.io.files import write_text
 from roadproof.io.html import encoded
 from roadproof.patterns import load_pattern, raster
 from roadproof.report.charts import by_round
-from roadproof.report.html import environment
+from roadproof.report.html import rendered
 
 _BADGES = {"helped": "holds", "not shown": "swayed", "did not help": "fails"}
 
@@ -30,8 +29,8 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
     """
     judged = () if found.judgement is None else found.judgement.judged
     verdict = None if found.judgement is None else found.judgement.verdict()
-    text = environment().get_template("hardening.html.jinja").render(
-        version=roadproof.__version__,
+    text = rendered(
+        "hardening.html.jinja",
         found=found,
         verdict=verdict,
         badge="" if verdict is None else _BADGES[verdict.outcome],
@@ -45,7 +44,7 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
             }
             for name in dict.fromkeys(each.scenario for each in judged)
         ],
-    )  # fmt: skip
+    )
     page = folder / "hardening.html"
     write_text(page, text)
     return page

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import roadproof
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluation import ATTACK, Row
 from roadproof.driving.intervals import Mean, mean_95
@@ -18,7 +17,7 @@ from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path, write_text
 from roadproof.io.html import encoded
 from roadproof.report import charts
-from roadproof.report.html import environment
+from roadproof.report.html import rendered
 from roadproof.report.road_view import on_asphalt
 from roadproof.report.run import Judged, read_run
 from roadproof.report.top_view import top_view
@@ -108,8 +107,8 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
     first = judged[0].evaluation.scenario
     kinds = sorted({each.predicted for each in runs})
     same_place = all(each.evaluation.scenario.canvas == first.canvas for each in judged)
-    text = environment().get_template("compare.html.jinja").render(
-        version=roadproof.__version__,
+    text = rendered(
+        "compare.html.jinja",
         runs=runs,
         kinds=kinds,
         weathers=weathers,
@@ -119,7 +118,7 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
         else None,
         patterns=[encoded(on_asphalt(each.paint, 360, each.evaluation.scenario.canvas), "PNG") for each in judged],
         above=[_above(each, number) for number, each in enumerate(runs)],
-    )  # fmt: skip
+    )
     write_text(as_path(page), text)
     return runs
 

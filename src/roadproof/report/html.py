@@ -13,12 +13,13 @@ from jaxtyping import UInt8
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image
 
+import roadproof
 from roadproof.io.html import data_url, encoded
 from roadproof.report.formatting import aside_in_words, in_words, mean_in_words, spread_in_words
 
 
-def environment() -> Environment:
-    """The templates of pages. Everything shown is escaped; a name that is not there is an error."""
+def rendered(template: str, **values: object) -> str:
+    """A page made by a template. Everything shown is escaped; a name that is not there is an error."""
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),
         autoescape=True,
@@ -38,7 +39,7 @@ def environment() -> Environment:
         "words": in_words,
     }
     cast("dict[str, Any]", templates.filters).update(filters)
-    return templates
+    return templates.get_template(template).render(version=roadproof.__version__, **values)
 
 
 def _picture(pixels: UInt8[np.ndarray, "h w 3"], *, kind: str) -> str:

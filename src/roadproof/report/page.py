@@ -5,24 +5,22 @@ write_report(Path("out/run"))   # out/run/report.html, out/run/result.json
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-import roadproof
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
 from roadproof.driving.infractions import counted
-from roadproof.io.files import AnyPath, as_path, write_text
+from roadproof.io.files import AnyPath, as_path, write_json, write_text
 from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording, evenly
 from roadproof.report import charts
-from roadproof.report.html import environment
+from roadproof.report.html import rendered
 from roadproof.report.road_view import on_asphalt
 from roadproof.report.run import Run, read_run
 from roadproof.report.top_view import top_view
@@ -65,9 +63,8 @@ def write_report(folder: AnyPath) -> Path:
     """
     folder = as_path(folder)
     run = read_run(folder)
-    result = json.dumps(result_of(run), indent=1, ensure_ascii=False) + "\n"
-    page = render(run)
-    write_text(folder / "result.json", result)
+    result, page = result_of(run), render(run)
+    write_json(folder / "result.json", result)
     write_text(folder / "report.html", page)
     return folder / "report.html"
 
@@ -76,28 +73,24 @@ def render(run: Run) -> str:
     """The page of a run. Everything shown is escaped."""
     fidelity = run.judged and run.judged.fidelity
     frames = 0 if fidelity is None else len(fidelity.clean)
-    return (
-        environment()
-        .get_template("page.html.jinja")
-        .render(
-            version=roadproof.__version__,
-            name=run.name,
-            run=run,
-            verdict=verdict(run),
-            figures=key_figures(run),
-            judged=run.judged,
-            counted=counted,
-            charts=_charts(run),
-            passage=_passage(run),
-            pattern=_pattern(run),
-            attack=run.attack,
-            fidelity=fidelity,
-            shown_frames=evenly(frames, SHOWN_COMPOSITES).tolist(),
-            recorded=_recorded(run),
-            recordings=run.recordings,
-            calibration=run.calibration,
-            commands=run.commands,
-        )
+    return rendered(
+        "page.html.jinja",
+        name=run.name,
+        run=run,
+        verdict=verdict(run),
+        figures=key_figures(run),
+        judged=run.judged,
+        counted=counted,
+        charts=_charts(run),
+        passage=_passage(run),
+        pattern=_pattern(run),
+        attack=run.attack,
+        fidelity=fidelity,
+        shown_frames=evenly(frames, SHOWN_COMPOSITES).tolist(),
+        recorded=_recorded(run),
+        recordings=run.recordings,
+        calibration=run.calibration,
+        commands=run.commands,
     )
 
 

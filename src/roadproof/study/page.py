@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import roadproof
 from roadproof.io.files import write_text
 from roadproof.io.html import data_url
 from roadproof.report.formatting import in_words
-from roadproof.report.html import environment
+from roadproof.report.html import rendered
 from roadproof.report.plots import save
 from roadproof.study.charts import Picture, by_figures, progress
 from roadproof.study.folder import reference_of
@@ -78,8 +77,8 @@ def _page(
         (len(results.methods), "methods", ", ".join(map(described, results.methods))),
         (f"{jobs - gaps} of {jobs}", "jobs done", f"{gaps} failed or missing, listed below" if gaps else ""),
     ]
-    return environment().get_template("study.html.jinja").render(
-        version=roadproof.__version__,
+    return rendered(
+        "study.html.jinja",
         name=name,
         sentence=sentence,
         facts=[{"value": value, "label": label, "note": note} for value, label, note in facts],
@@ -92,7 +91,7 @@ def _page(
             }
             for picture in pictures
         ],
-    )  # fmt: skip
+    )
 
 
 def _markdown(name: str, sentence: str, results: Results, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
