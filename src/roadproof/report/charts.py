@@ -26,22 +26,10 @@ from roadproof.pipeline.prediction import Prediction
 from roadproof.report.formatting import in_words
 from roadproof.report.plots import LINE_STYLES, draw_search, in_units, show_as_it_is
 
-VARIABLES = {
-    "ink": "#010101",
-    "muted": "#010102",
-    "rule": "#010103",
-    "clean": "#010104",
-    "painted": "#010105",
-    "predicted": "#010106",
-    "canvas": "#010107",
-    "third": "#010108",
-    "fourth": "#010109",
-    "asphalt": "#01010a",
-    "kerb": "#01010b",
-    "grass": "#01010c",
-    "marking": "#01010d",
-    "paper": "#01010e",
-}
+_NAMES = "ink muted rule clean painted predicted canvas third fourth asphalt kerb grass marking paper"
+VARIABLES = {name: f"#{0x010100 + k:06x}" for k, name in enumerate(_NAMES.split(), 1)}
+"""The stand-in colour of each variable."""
+
 INK, MUTED, RULE, CLEAN, PAINTED, PREDICTED, CANVAS = list(VARIABLES.values())[:7]
 SERIES = (PAINTED, PREDICTED, VARIABLES["third"], VARIABLES["fourth"])
 

@@ -1,16 +1,6 @@
-"""A run folder, as far as it has come: what each stage left, read for the report.
+"""A run folder, as far as it has come: what each stage left (`pipeline.stress_test`), read for the report.
 
-RUN/record/DRIVE/episode.npz   recorded drives
-RUN/recordings/                the same, calibrated (`roadproof.recordings`)
-RUN/attack/                    what the attack found (`roadproof.attacks`)
-RUN/selection/                 optional: its candidates, driven (`pipeline.selection`)
-RUN/round-N/selection/         optional: those of a re-recording round (`roadproof.pipeline.rerecording`)
-RUN/evaluation/                what driving over it showed (`driving.evaluation`)
-RUN/prediction.npz             optional: the predicted path beside the driven one (`pipeline.prediction`)
-RUN/cheapest/                  optional: the least paint for a deviation, driven over (`attacks.cheapest`)
-RUN/pattern.json               optional: the pattern that was chosen in the end
-RUN/run.json                   optional: what the stages took (`roadproof.pipeline.stage_costs`)
-RUN/commands.txt               optional: the commands that made it, one a line; each stage's folder may have its own
+RUN/commands.txt has the commands that made it, one a line; each stage's folder may have its own.
 """
 
 from __future__ import annotations
