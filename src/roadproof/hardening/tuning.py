@@ -173,14 +173,15 @@ def tune(
     network.to(device=place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
     parameters = [each for each in network.parameters() if each.requires_grad]
     optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
-    paint = _Paint(space, found.to(device), tuning)
+    pictures = _Pictures(space, found.to(device), tuning, teacher, cast("Controller", network))
+    count = tuning.batch if town is None else tuning.batch // 2
     paste, weights, total = PastedPaint(0.5), None if town is None else town.weights(), 0.0
     begun = 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
     for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
-        parts = [_of_street(streets[number % len(streets)], teacher, network, paint, tuning, town is None, draw)]
+        parts = [pictures.of_street(streets[number % len(streets)], count, draw)]
         if town is not None and weights is not None:
-            seen = town.batch(torch.multinomial(weights, tuning.batch // 2, replacement=True, generator=draw), device)
+            seen = town.batch(torch.multinomial(weights, count, replacement=True, generator=draw), device)
             with torch.no_grad():
                 target = answers(teacher, seen.frames, seen.speed_mps, seen.command)
             parts.append(TuningBatch(paste(seen.frames, draw), seen.speed_mps, seen.command, target))
@@ -224,59 +225,53 @@ def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, pa
     return int(kept["steps"])
 
 
-class _Paint:
-    """Draws patterns, and makes them worse for a controller."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pictures:
+    """Draws pictures of streets, and patterns on them, which it makes worse for the controller that learns."""
 
-    def __init__(self, space: SearchSpace, found: Float[Tensor, "p k n"], tuning: Tuning) -> None:
-        self.space, self._found, self._tuning = space, found, tuning
+    space: SearchSpace
+    found: Float[Tensor, "p k n"]
+    tuning: Tuning
+    teacher: Controller
+    network: Controller
 
-    def draw(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
+    def of_street(self, street: Street, count: int, draw: torch.Generator) -> TuningBatch:
+        """Pictures of a street, most of them painted."""
+        views = street.draw(count, draw)
+        with torch.no_grad():
+            target = answers(self.teacher, views.frames, views.speed_mps, views.command)
+            target[:, 0] = street.returning(views.place, target[:, 0])
+        unit = self._climbed(self._drawn(len(views.frames), draw), views, target[:, 0])
+        bare = (torch.rand(len(unit), generator=draw) < self.tuning.bare).to(unit.device)
+        with torch.no_grad():
+            painted = views.painted(self.space.pattern(unit))
+        frames = torch.where(bare[:, None, None, None], views.frames, painted)
+        return TuningBatch(frames, views.speed_mps, views.command, target)
+
+    def _drawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
         """Points of the search space: some found ones, slightly moved, some random ones."""
-        unit = self.space.random((count,), generator).to(self._found)
-        known = torch.rand(count, generator=generator) < (self._tuning.found if len(self._found) else 0.0)
+        unit = self.space.random((count,), generator).to(self.found)
+        known = torch.rand(count, generator=generator) < (self.tuning.found if len(self.found) else 0.0)
         moved = 0.02 * torch.randn(unit.shape, generator=generator)
         if bool(known.any()):
-            picked = torch.randint(len(self._found), (count,), generator=generator)
-            near = self.space.project(self._found[picked.to(unit.device)] + moved.to(unit))
+            picked = torch.randint(len(self.found), (count,), generator=generator)
+            near = self.space.project(self.found[picked.to(unit.device)] + moved.to(unit))
             unit = torch.where(known.to(unit.device)[:, None, None], near, unit)
         return unit
 
-    def climbed(
-        self, unit: Float[Tensor, "b k n"], views: Views, network: Controller, target: Float[Tensor, " b"]
+    def _climbed(
+        self, unit: Float[Tensor, "b k n"], views: Views, target: Float[Tensor, " b"]
     ) -> Float[Tensor, "b k n"]:
         """The same, some steps towards where the controller's steering is further from its target."""
         if views.canvas is None:
             return unit
-        for _ in range(self._tuning.climbs):
+        for _ in range(self.tuning.climbs):
             leaf = unit.detach().requires_grad_()
             frames = views.painted(self.space.pattern(leaf))
-            steer = answers(network, frames, views.speed_mps, views.command)[:, 0]
+            steer = answers(self.network, frames, views.speed_mps, views.command)[:, 0]
             (gradient,) = torch.autograd.grad((steer - target).abs().sum(), leaf)
-            unit = self.space.project(leaf.detach() + self._tuning.climb * gradient.sign())
+            unit = self.space.project(leaf.detach() + self.tuning.climb * gradient.sign())
         return unit
-
-
-def _of_street(
-    street: Street,
-    teacher: Controller,
-    network: nn.Module,
-    paint: _Paint,
-    tuning: Tuning,
-    alone: bool,
-    draw: torch.Generator,
-) -> TuningBatch:
-    """Pictures of a street, most of them painted."""
-    views = street.draw(tuning.batch if alone else tuning.batch // 2, draw)
-    with torch.no_grad():
-        target = answers(teacher, views.frames, views.speed_mps, views.command)
-        target[:, 0] = street.returning(views.place, target[:, 0])
-    unit = paint.draw(len(views.frames), draw)
-    unit = paint.climbed(unit, views, cast("Controller", network), target[:, 0])
-    bare = (torch.rand(len(unit), generator=draw) < tuning.bare).to(unit.device)
-    with torch.no_grad():
-        painted = views.painted(paint.space.pattern(unit))
-    frames = torch.where(bare[:, None, None, None], views.frames, painted)
-    return TuningBatch(frames, views.speed_mps, views.command, target)
 
 
 def _mixed(place: torch.device) -> torch.autocast:
