@@ -118,7 +118,10 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
                 best = [np.asarray(course.best, np.float64) for course in own]
                 _draw_course(axes, at, best, plain(method), style(results, method))
             axes.set_xscale("log")
-            _plain_ticks(axes)
+            # 1, 2, 5, 10 … in words, however few decades there are.
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.set_ylim(bottom=0.0)
             reached = "deviation of the best so far, m" if column == 0 else ""
             _label(axes, name, reached)
@@ -132,13 +135,6 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
         "on composited frames is a point, where its answer was driven.",
         figure,
     )
-
-
-def _plain_ticks(axes: Axes) -> None:
-    """1, 2, 5, 10 … in words, however few decades there are."""
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_course(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -39,16 +38,7 @@ from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """What a search gave.
-
-    Args:
-        pattern: the pattern that the search chose.
-        calls: how many drives of the simulator the search took.
-        seconds: how long the search took.
-        evaluation_s: seconds of drives made already that belong to the evaluation.
-        history: how the search went.
-        site: the road under the pattern.
-    """
+    """What a search gave and took; `evaluation_s` are seconds of drives that belong to the evaluation already."""
 
     pattern: Pattern
     calls: int
@@ -79,16 +69,18 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         parts = _evaluate(job, world, controller, found.pattern, scratch)
         shown = parts[0].shown()
         clean, painted = load_episodes(scratch / PARTS[0], [shown.clean, shown.painted])
-        pictures = _pictures(world, parts, scratch, found.pattern)
+        paint, pictures = raster(found.pattern), dict[str, bytes]()
+        for name, part in zip(PARTS, parts, strict=False):
+            pictures |= passages(world, part, scratch / name, paint)
     costs: CostColumns = {
         "search_calls": found.calls,
         "search_seconds": found.seconds,
         "evaluation_calls": sum(part.simulator_calls for part in parts),
         "seconds": found.seconds + found.evaluation_s + sum(part.seconds for part in parts),
     }
-    paint = paint_columns(conspicuousness(found.pattern, found.site))
+    told = paint_columns(conspicuousness(found.pattern, found.site))
     rows = tuple(
-        Row(**job_columns(job), controller=job.controller, **drive_columns(trial), **paint, **costs)
+        Row(**job_columns(job), controller=job.controller, **drive_columns(trial), **told, **costs)
         for part in parts
         for trial in part.trials
     )
@@ -97,13 +89,6 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     files["paths.npz"] = packed({"clean_xy": path_of(clean), "painted_xy": path_of(painted)})
     files["history.json"] = found.history.to_json()
     return JobResult(rows, files | pictures)
-
-
-def _pictures(world: Simulator, parts: Sequence[Evaluation], scratch: Path, pattern: Pattern) -> dict[str, bytes]:
-    paint, files = raster(pattern), dict[str, bytes]()
-    for name, part in zip(PARTS, parts, strict=False):
-        files |= passages(world, part, scratch / name, paint)
-    return files
 
 
 def space_of(job: Job) -> SearchSpace:

@@ -6,7 +6,7 @@ out. In every row that compares two methods both means are over the cases that b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from roadproof.driving.intervals import Mean
@@ -14,6 +14,7 @@ from roadproof.report.formatting import MISSING, in_words
 from roadproof.scenarios import KINDS
 from roadproof.study.kept_jobs import StatedMethod
 from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, PENALTY, Block, Metric, Results
+from roadproof.study.rows import JobId
 from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios, paired, wilcoxon_p
 from roadproof.study.table import Cell, Estimate, Heading, Table, headings, slug
 from roadproof.study.table_notes import table_note
@@ -36,7 +37,9 @@ def paper_tables(results: Results) -> tuple[Table, ...]:
             name += "-2"
         taken.add(name)
         tables += _against(results, results.reference.name, theirs.name, name)
-    return (*tables, *gaps_table(results))
+    if gaps := results.gaps():
+        tables.append(_gaps_table(results, gaps))
+    return tuple(tables)
 
 
 def _against(results: Results, ours: str, theirs: str, name: str) -> list[Table]:
@@ -203,20 +206,15 @@ def methods_table(results: Results) -> Table:
     )
 
 
-def gaps_table(results: Results) -> tuple[Table, ...]:
-    """Every job that failed or is not complete, and why; no table where all are done."""
-    gaps = results.gaps()
-    if not gaps:
-        return ()
-    return (
-        Table(
-            name=GAPS,
-            title="What failed or is missing",
-            note=f"{len(gaps)} of {len(results.jobs)} jobs. The same study run again tries them again.",
-            header=(headings("scenario", "K", "method", "seed", "why"),),
-            rows=tuple((*map(str, job), reason) for job, reason in gaps.items()),
-            left=5,
-        ),
+def _gaps_table(results: Results, gaps: Mapping[JobId, str]) -> Table:
+    """Every job that failed or is not complete, and why."""
+    return Table(
+        name=GAPS,
+        title="What failed or is missing",
+        note=f"{len(gaps)} of {len(results.jobs)} jobs. The same study run again tries them again.",
+        header=(headings("scenario", "K", "method", "seed", "why"),),
+        rows=tuple((*map(str, job), reason) for job, reason in gaps.items()),
+        left=5,
     )
 
 

@@ -76,20 +76,16 @@ def run_study(
 def _attempt(job: Job, scratch: Path, work: Work) -> JobResult:
     """A job's result, whatever it raises: one bad job must not stop the night. The process is the job's own."""
     keep_freed_memory()
-    _compute_with_one_thread()
+    # Where a search ends depends on its threads, and rows must not depend on how many jobs run. What is loaded already
+    # keeps to limits, what is loaded later to the variable.
+    import_module("threadpoolctl").threadpool_limits(1)
+    os.environ["OMP_NUM_THREADS"] = "1"
     try:
         scratch.mkdir(parents=True, exist_ok=True)
         return work(job, scratch)
     except Exception as error:
         kind = "" if isinstance(error, RoadproofError) else f"{type(error).__name__}: "
         return failed(job, f"{kind}{error}")
-
-
-def _compute_with_one_thread() -> None:
-    """Use one thread from now on: where a search ends depends on it, and rows must not depend on how many jobs run."""
-    # What is loaded already keeps to limits, what is loaded later to the variable.
-    import_module("threadpoolctl").threadpool_limits(1)
-    os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def _on_this_machine(jobs: Sequence[Job], folder: Path, work: Work, workers: int) -> Generator[tuple[Job, JobResult]]:
