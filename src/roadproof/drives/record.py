@@ -193,9 +193,7 @@ def _clean(simulator: SimulatorT, driver: Controller | Driver[SimulatorT], setti
     last_s = float(episode.time_s[chosen[0][-1]])
     harm = [event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= last_s]
     note = f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas" if harm else ""
-    return _drive(
-        Plan("clean", settings.trajectories.plans()[0].side, 0.0, 0), episode, chosen, episode.steer, note=note
-    )
+    return _drive(settings.trajectories.plans()[0], episode, chosen, episode.steer, note=note)
 
 
 def _perturbed(
@@ -273,11 +271,7 @@ Chosen: TypeAlias = tuple[Int[np.ndarray, " f"], UInt8[np.ndarray, "f h w 3"], I
 
 
 def _chosen(film: _Film, settings: Settings, name: str) -> Chosen:
-    """The steps and frames to keep, and their indices among the collected frames.
-
-    Raises:
-        RecordingError: the canvas is not in view.
-    """
+    """The steps and frames to keep, and their indices among the collected frames; the canvas must be in view."""
     shows = in_view(film.states, settings.scenario.canvas, settings.camera, settings.view, settings.window.least_px)
     which = np.flatnonzero(shows)
     if which.size == 0:

@@ -35,11 +35,9 @@ DAMAGE = (
     EOFError,
     KeyError,
     MemoryError,
-    NotImplementedError,
     OSError,
     OverflowError,
-    RecursionError,
-    RuntimeError,
+    RuntimeError,  # as NotImplementedError and RecursionError are
     SyntaxError,
     TypeError,
     ValueError,

@@ -127,11 +127,7 @@ def kept_inside(folder: Path) -> Generator[None]:
 
 
 def _check_inside(path: Path) -> None:
-    """Check that a file or folder to write lies where its name says.
-
-    Raises:
-        OutputError: a link in a folder that is worked in leads out of it.
-    """
+    """Check that a file or folder to write lies where its name says, in a folder that is worked in."""
     for root in _kept_inside:
         if path.absolute().is_relative_to(root) and not path.parent.resolve().is_relative_to(root.resolve()):
             raise OutputError(f"{path.parent} is reached by a link that leads out of {root}; remove the link")

@@ -241,11 +241,7 @@ def _is_array(kind: object) -> bool:
 
 
 def _typed(stored: Any, kind: Any, name: str) -> object:  # noqa: ANN401
-    """A field's value, from what a file holds of it.
-
-    Raises:
-        ValueError: the value is of another type; says which.
-    """
+    """A field's value, from what a file holds of it; a `ValueError` says which field is of another type."""
     if _is_array(kind):
         return _array(np.asarray(stored), kind, name)
     if isinstance(stored, np.ndarray):

@@ -150,7 +150,10 @@ def compare_with_rendered(
         RecordingError: there is no such drive, or it has another number or size of frames.
         EpisodeError: no frame shows paint.
     """
-    recorded = _drive(recordings, drive)
+    recorded = next((each for each in recordings.recordings if each.name == drive), None)
+    if recorded is None:
+        names = ", ".join(each.name for each in recordings.recordings)
+        raise RecordingError(f"the set has no drive {drive!r}, expected one of {names}")
     if rendered.shape != recorded.frames.shape:
         raise RecordingError(
             f"drive {drive} has frames of shape {recorded.frames.shape}, the rendered ones {rendered.shape}; "
@@ -206,14 +209,6 @@ def is_drive_of(recorded: Recording, episode: Episode) -> bool:
     steps = recorded.frame_number
     inside = int(steps.max()) < len(episode)
     return inside and bool(np.allclose(episode.speed_mps[steps], recorded.speed_mps, atol=0.02))
-
-
-def _drive(recordings: RecordingSet, name: str) -> Recording:
-    for recording in recordings.recordings:
-        if recording.name == name:
-            return recording
-    names = ", ".join(recording.name for recording in recordings.recordings)
-    raise RecordingError(f"the set has no drive {name!r}, expected one of {names}")
 
 
 def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) -> Bool[np.ndarray, "f h w"]:

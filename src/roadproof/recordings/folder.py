@@ -143,25 +143,22 @@ def save_recordings(recordings: RecordingSet, folder: AnyPath, *, compact: bool 
     def write(part: Path) -> None:
         for recording in recordings.recordings:
             _write_drive(recording, part / recording.name, compact=compact)
-        _MANIFEST.write(part / "recordings.json", _manifest(recordings))
+        manifest = _Manifest(
+            origin=recordings.origin,
+            camera=recordings.camera,
+            crop_resize=recordings.view,
+            colour=recordings.colour,
+            canvas=recordings.canvas,
+            marks=recordings.marks,
+            obstacles=recordings.obstacles,
+            drives=tuple(
+                _Drive(name=each.name, side=each.side, frames=len(each.frames), weather=each.weather)
+                for each in recordings.recordings
+            ),
+        )
+        _MANIFEST.write(part / "recordings.json", manifest)
 
     write_folder_atomically(folder, write)
-
-
-def _manifest(recordings: RecordingSet) -> _Manifest:
-    return _Manifest(
-        origin=recordings.origin,
-        camera=recordings.camera,
-        crop_resize=recordings.view,
-        colour=recordings.colour,
-        canvas=recordings.canvas,
-        marks=recordings.marks,
-        obstacles=recordings.obstacles,
-        drives=tuple(
-            _Drive(name=each.name, side=each.side, frames=len(each.frames), weather=each.weather)
-            for each in recordings.recordings
-        ),
-    )
 
 
 def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:

@@ -200,11 +200,7 @@ def _inverse_square(rows: Float[np.ndarray, "r s"]) -> Float[np.ndarray, "s s"]:
 
 
 def _pose(directions: Float[np.ndarray, "m 3"], grid: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, " 6"]:
-    """Where a board is whose corners are seen in some directions, p.
-
-    Raises:
-        GeometryError: no board is seen like this.
-    """
+    """Where a board is whose corners are seen in some directions, p; a `GeometryError` where none is seen so."""
     # Towards the board, where no direction is at right angles to the view: a fisheye sees such ones.
     aim = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(0)
     aside = np.cross(aim, np.eye(3)[np.abs(aim).argmin()])
