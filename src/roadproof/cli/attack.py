@@ -79,7 +79,7 @@ def attack(
     paint: Paint,
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
-    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, site_of
+    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern, site_of
     from roadproof.attacks import attack as run
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
@@ -87,6 +87,7 @@ def attack(
     from roadproof.coverage import Shape
     from roadproof.pipeline.estimate import of_search
     from roadproof.recordings import load_recordings
+    from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
 
     space = SearchSpace(
@@ -130,7 +131,8 @@ def attack(
         )
     result.save(out)
     keep_command(out)
-    _draw(result, drives, attacked, chosen, device, out)
+    winner = next(group for group in chosen if str(group) == result.group)
+    draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
     checkpoint.unlink(missing_ok=True)
     _summarise(result, out)
     found = stored(out / "result.json")
@@ -164,16 +166,6 @@ def _check_cheapest(drives: RecordingSet, objective: str) -> None:
         raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
     if objective == "speed":
         raise RoadproofError("--cheapest is in metres of deviation, --objective speed in m/s; leave one of them out")
-
-
-def _draw(
-    result: AttackResult, drives: RecordingSet, attacked: Controller, groups: Sequence[Group], device: str, out: Path
-) -> None:
-    from roadproof.attacks import show_pattern
-    from roadproof.report.plots import draw_attack
-
-    winner = next(group for group in groups if str(group) == result.group)
-    draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
 
 
 def _less_paint(

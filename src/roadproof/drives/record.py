@@ -162,9 +162,6 @@ def record_along(
     return drive
 
 
-Frame: TypeAlias = UInt8[np.ndarray, "h w 3"]
-
-
 @dataclass(slots=True)
 class _Film:
     """Collects the frames of a drive near the canvas, from which those to keep are chosen."""
@@ -172,7 +169,7 @@ class _Film:
     scenario: Scenario
     window: Window
     steps: list[int] = field(default_factory=list[int])
-    frames: list[Frame] = field(default_factory=list[Frame])
+    frames: list[UInt8[np.ndarray, "h w 3"]] = field(default_factory=list[UInt8[np.ndarray, "h w 3"]])
     states: list[VehicleState] = field(default_factory=list[VehicleState])
     step: int = 0
 

@@ -23,7 +23,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -197,7 +196,10 @@ def harden(
             judgement=judgement,
             cost=ledger.cost,
         )
-        _write(found, folder)
+        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(found)
+        if found.judgement is not None:
+            content["verdict"] = asdict(found.judgement.verdict())
+        write_json(folder / "hardening.json", content)
     return found
 
 
@@ -356,10 +358,3 @@ def _save(network: nn.Module, run: Run, number: int) -> None:
         return
     tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}
     write_tensors(path, tensors, {"roadproof-origin": origin})
-
-
-def _write(found: Hardened, folder: Path) -> None:
-    content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(found)
-    if found.judgement is not None:
-        content["verdict"] = asdict(found.judgement.verdict())
-    write_json(folder / "hardening.json", content)

@@ -117,15 +117,13 @@ def write_comparison(folders: Sequence[AnyPath], page: AnyPath) -> tuple[Compare
         if same_place and len(kinds) == 1
         else None,
         patterns=[encoded(on_asphalt(each.paint, 360, each.evaluation.scenario.canvas), "PNG") for each in judged],
-        above=[_above(each, number) for number, each in enumerate(runs)],
+        above=[
+            top_view(each.evaluation.scenario, each.paint, each.clean, each.painted, f"above-{number}")
+            for number, each in enumerate(judged)
+        ],
     )
     write_text(as_path(page), text)
     return runs
-
-
-def _above(each: Compared, number: int) -> charts.Chart:
-    judged = each.judged
-    return top_view(judged.evaluation.scenario, judged.paint, judged.clean, judged.painted, f"above-{number}")
 
 
 def _name(path: Path, paths: Sequence[Path]) -> str:

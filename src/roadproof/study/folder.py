@@ -140,5 +140,4 @@ def pandas() -> Any:  # noqa: ANN401  # the module
 
 
 def _write_json(path: Path, content: object) -> None:
-    text = json.dumps(content, indent=1, default=str, allow_nan=False) + "\n"
-    write_text(path, text)
+    write_text(path, json.dumps(content, indent=1, default=str, allow_nan=False) + "\n")
