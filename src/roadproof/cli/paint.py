@@ -56,14 +56,8 @@ _OPTIONS: dict[str, Any] = {
         Path | None, _grouped(unset("TOML file with the same in tables named paint and variation; options come first."))
     ],
 }
-_FIELDS = {
-    "max_area": "max_area_m2",
-    "colours": "colours",
-    "printable": "printable",
-    "contrast": "contrast",
-    "keep_out": "keep_out_m",
-}
-"""The fields of `PaintLimits`, by the names of their options."""
+_FIELDS = {"max_area": "max_area_m2", "keep_out": "keep_out_m"}
+"""The fields of `PaintLimits` that are not called as their options are."""
 
 
 def with_paint(command: Callable[..., None]) -> Callable[..., None]:
@@ -102,7 +96,7 @@ def _paint(asked: Mapping[str, Any]) -> Paint:
     from roadproof.paint import PaintLimits
 
     limits, variation = _read(given["paint"]) if "paint" in given else (None, None)
-    said = {field: given[name] for name, field in _FIELDS.items() if name in given}
+    said = {_FIELDS.get(name, name): value for name, value in given.items() if name not in ("robust", "paint")}
     if "colours" in said:
         said["colours"] = tuple(each.strip() for each in said["colours"].split(","))
     if said:
