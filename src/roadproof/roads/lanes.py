@@ -13,7 +13,7 @@ from jaxtyping import Float
 from roadproof.errors import ScenarioError
 from roadproof.roads.opendrive import MAX_WIDTH_M
 from roadproof.roads.polylines import interpolated, polyline_stations
-from roadproof.roads.records import LaneRecord, OpenDrive, Road, Section
+from roadproof.roads.records import LaneRecord, MarkRecord, OpenDrive, Road, Section
 
 Line = Float[np.ndarray, "n 3"]
 
@@ -23,20 +23,11 @@ JOINT_GAP_M = 0.5
 UNPAINTED = ("none", "curb")
 
 
-@dataclass(frozen=True, slots=True)
-class RoadMark:
-    """A painted line: "solid", "broken", "solid solid" …, "white" or "yellow", and its width."""
-
-    kind: str
-    colour: str
-    width_m: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkLine:
     """A stretch of painted line, once for both lanes it divides; `start_m` is its station, for the phase of dashes."""
 
-    mark: RoadMark
+    mark: MarkRecord
     points: Line
     start_m: float
     junction: str | None
@@ -130,7 +121,8 @@ def build_lanes(drive: OpenDrive) -> tuple[list[Lane], list[MarkLine]]:
             for record in section.lanes.values():
                 marks += _mark_lines(road, section, record, borders)
     lanes = [replace(lane, index=i) for i, lane in enumerate(lanes)]
-    return _linked(drive, lanes), marks
+    by_place = {(lane.road, lane.section, lane.number): lane for lane in lanes}
+    return [replace(lane, successors=_successors(drive, lane, by_place)) for lane in lanes], marks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,27 +192,16 @@ def _lane(road: Road, k: int, record: LaneRecord, borders: _Borders) -> Lane:
     )
 
 
-def _spans(section: Section, record: LaneRecord) -> list[tuple[float, float, RoadMark]]:
-    starts = [section.start_m + mark.offset_m for mark in record.marks] + [section.end_m]
-    return [
-        (max(start, section.start_m), min(end, section.end_m), RoadMark(mark.kind, mark.colour, mark.width_m))
-        for mark, start, end in zip(record.marks, starts[:-1], starts[1:], strict=True)
-        if min(end, section.end_m) - start > 1e-6
-    ]
-
-
 def _mark_lines(road: Road, section: Section, record: LaneRecord, borders: _Borders) -> Iterable[MarkLine]:
     line = borders.line(borders.centre_m if record.number == 0 else borders.outer[record.number])
-    for start, end, mark in _spans(section, record):
-        if mark.kind in UNPAINTED:
+    starts = [*(section.start_m + mark.offset_m for mark in record.marks), section.end_m]
+    for mark, (start, end) in zip(record.marks, pairwise(starts), strict=True):
+        end = min(end, section.end_m)
+        if mark.kind in UNPAINTED or end - start <= 1e-6:
             continue
+        start = max(start, section.start_m)
         s = np.concatenate([[start], borders.s_m[(borders.s_m > start + 1e-6) & (borders.s_m < end - 1e-6)], [end]])
         yield MarkLine(mark, interpolated(s, borders.s_m, line), start, road.junction)
-
-
-def _linked(drive: OpenDrive, lanes: list[Lane]) -> list[Lane]:
-    by_place = {(lane.road, lane.section, lane.number): lane for lane in lanes}
-    return [replace(lane, successors=_successors(drive, lane, by_place)) for lane in lanes]
 
 
 def _successors(drive: OpenDrive, lane: Lane, by_place: dict[tuple[str, int, int], Lane]) -> tuple[int, ...]:

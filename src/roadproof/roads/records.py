@@ -95,7 +95,14 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True)
 class MarkRecord:
-    """A road mark on the outer border of a lane, from `offset_m` after the start of its section on."""
+    """A line painted on the outer border of a lane, from `offset_m` after the start of its section on.
+
+    Args:
+        offset_m: where it begins, metres along the reference line from the start of the section.
+        kind: "solid", "broken", "solid solid" …
+        colour: "white", "yellow" …
+        width_m: width of one strand, metres.
+    """
 
     offset_m: float
     kind: str

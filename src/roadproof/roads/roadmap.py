@@ -82,18 +82,13 @@ class RoadMap:
         if len(self._driving) == 0:
             raise ScenarioError("the map has no lane of type driving, expected at least one")
         everything = np.concatenate([line[:, :2] for lane in lanes for line in (lane.left, lane.right)])
-        low, high = everything.min(axis=0), everything.max(axis=0)
-        if (high - low).max() > MAX_EXTENT_M:
+        (x0, y0), (x1, y1) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()
+        if max(x1 - x0, y1 - y0) > MAX_EXTENT_M:
             raise ScenarioError(
-                f"the map spans {high[0] - low[0]:.0f} × {high[1] - low[1]:.0f} m, expected at most "
+                f"the map spans {x1 - x0:.0f} × {y1 - y0:.0f} m, expected at most "
                 f"{MAX_EXTENT_M:.0f} m each way; cut out the part to be driven"
             )
-        self.bounds_m: tuple[float, float, float, float] = (
-            float(low[0]),
-            float(low[1]),
-            float(high[0]),
-            float(high[1]),
-        )
+        self.bounds_m: tuple[float, float, float, float] = (x0, y0, x1, y1)
         self._segments = SegmentIndex([lane.centre for lane in lanes if lane.kind == "driving"])
         self._heading = np.arctan2(self._segments.along[:, 1], self._segments.along[:, 0])
         self._surface = _surface_index(lanes, junctions)
