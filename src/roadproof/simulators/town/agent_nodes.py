@@ -132,7 +132,7 @@ class _Figure:
         dress(self._path, Layer.SOLID)
         builder = MeshBuilder()
         builder.quad(np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * np.append(half_m, 1))
-        self._spot = self._path.attach_new_node(mesh_node(builder.build(), np.full((4, 4), 255, np.uint8)))
+        self._spot = self._path.attach_new_node(mesh_node(builder.build()))
         self._spot.set_texture(shade)
         dress(self._spot, Layer.SHADE)
         self._path.hide()

@@ -15,7 +15,7 @@ SKY_M = 640.0
 HAZE_TOP_M = 19.0
 
 
-def dome() -> tuple[Mesh, UInt8[np.ndarray, "n 4"]]:
+def dome() -> Mesh:
     """The sky around the eye: azimuth and elevation are the texture's coordinates."""
     around, up = 24, 6
     azimuth = np.arange(around + 1) / around * 2 * math.pi
@@ -24,8 +24,7 @@ def dome() -> tuple[Mesh, UInt8[np.ndarray, "n 4"]]:
     points = SKY_M * np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1).reshape(-1, 3)
     uv = np.stack([a / (2 * math.pi), 0.002 + 0.996 * np.clip(e, 0, None) / (math.pi / 2)], axis=-1).reshape(-1, 2)
     n = len(points)
-    mesh = Mesh(points.round(4), np.zeros((n, 3)), uv.round(5), np.ones((n, 3)), lofted(up + 1, around))
-    return mesh, np.full((n, 4), 255, np.uint8)
+    return Mesh(points.round(4), np.zeros((n, 3)), uv.round(5), np.ones((n, 3)), lofted(up + 1, around))
 
 
 def haze_cards(sky: Sky, tangent: float, eye_m: float) -> list[tuple[Mesh, UInt8[np.ndarray, "n 4"]]]:
@@ -51,11 +50,11 @@ def haze_cards(sky: Sky, tangent: float, eye_m: float) -> list[tuple[Mesh, UInt8
     return cards
 
 
-def rain_card(tangent: float, variant: int) -> tuple[Mesh, UInt8[np.ndarray, "n 4"]]:
+def rain_card(tangent: float, variant: int) -> Mesh:
     """A card right before the eye that fills the view."""
     d, rng = 1.0, np.random.default_rng(70 + variant)
     x = tangent * d
     builder = MeshBuilder()
     corners = np.array([(-x, d, -x), (x, d, -x), (x, d, x), (-x, d, x)])
     builder.quad(corners, np.array([[0.0, 0], [2.0, 0], [2.0, 2.0], [0, 2.0]]) + rng.random(2))
-    return builder.build(), np.full((4, 4), 255, np.uint8)
+    return builder.build()

@@ -107,7 +107,7 @@ class LabelScene:
             if (mesh := scenery.meshes.get(f"tree{kind}")) is not None:
                 self._add(mesh, Label.VEGETATION, Layer.CUT_OUT, make_texture(_cut_out(textures.tree(kind))))
         self._heaven = self._root.attach_new_node("heaven")
-        sky = self._heaven.attach_new_node(_numbered(dome()[0], 0))
+        sky = self._heaven.attach_new_node(_numbered(dome(), 0))
         dress(sky, Layer.SKY)
         # What lies below the road is hidden by it.
         self._ground = self._root.attach_new_node(_numbered(_around(), 0))

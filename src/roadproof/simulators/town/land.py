@@ -64,7 +64,7 @@ class Land:
             builder = MeshBuilder()
             builder.quad(corners, corners[:, :2] / GRAIN_TILE_M)
             mesh = builder.build()
-            node = mesh_node(mesh, np.full((4, 4), 255, np.uint8), self._uv(mesh.points, cell))
+            node = mesh_node(mesh, ground_uv=self._uv(mesh.points, cell))
             made.append((node, Layer.GROUND, self._grains["asphalt"], picture))
         return made
 
@@ -89,7 +89,7 @@ class Land:
         low, made = self._ground.low_m, list[Placed]()
         for (i, j), part in self._streets.pavement.cells(CELL_M):
             cell = (i - round(low[0] / CELL_M), j - round(low[1] / CELL_M))
-            node = mesh_node(part, np.full((len(part.points), 4), 255, np.uint8), self._uv(part.points, cell))
+            node = mesh_node(part, ground_uv=self._uv(part.points, cell))
             made.append((node, Layer.PAVEMENT, self._grains["slabs"], self._pictures[cell]))
         return made
 

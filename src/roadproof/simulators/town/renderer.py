@@ -74,7 +74,6 @@ class Renderer:
         self._follow = self._root.attach_new_node("follow")
         self._haze = self._root.attach_new_node("haze")
         self._drops: list[Path] = []
-        self._sky_texture: Texture = None
 
     def set_weather(self, weather: Weather) -> None:
         """Bake the light of a weather into everything; nothing happens where it is that weather already."""
@@ -188,10 +187,7 @@ class Renderer:
         self._follow.set_pos(x, y, z)
         self._haze.set_pos_hpr(x, y, z, math.degrees(state.yaw_rad) - 90.0, 0.0, 0.0)
         for k, drop in enumerate(self._drops):
-            if k == tick * 5 % RAIN_VARIANTS:
-                drop.show()
-            else:
-                drop.hide()
+            (drop.show if k == tick * 5 % RAIN_VARIANTS else drop.hide)()
 
     def _build_scenery(self, sky: Sky) -> None:
         for layer, name, mesh in (
@@ -226,28 +222,22 @@ class Renderer:
             dx = max(abs(x_m - (column + 0.5) * CULL_M) - CULL_M / 2, 0)
             dy = max(abs(y_m - (row + 0.5) * CULL_M) - CULL_M / 2, 0)
             reach = min(farthest, NEAR_SEEN_M) if small else farthest
-            if dx * dx + dy * dy < reach * reach:
-                district.show()
-            else:
-                district.hide()
+            (district.show if dx * dx + dy * dy < reach * reach else district.hide)()
 
     def _build_air(self, sky: Sky) -> None:
         for old in (*self._follow.get_children(), *self._haze.get_children()):
             old.remove_node()
-        heaven = self._follow.attach_new_node(mesh_node(*dome()))
-        self._sky_texture = make_texture(sky_picture(sky), repeat=True, mipmaps=False)
-        heaven.set_texture(self._sky_texture)
+        heaven = self._follow.attach_new_node(mesh_node(dome()))
+        heaven.set_texture(make_texture(sky_picture(sky), repeat=True, mipmaps=False))
         dress(heaven, Layer.SKY)
         tangent = 1.3 * math.tan(math.radians(self._camera.fov_deg) / 2)
-        for mesh, colours in haze_cards(sky, tangent, self._camera.up_m):
-            card = self._haze.attach_new_node(mesh_node(mesh, colours))
-            dress(card, Layer.HAZE)
+        for card in haze_cards(sky, tangent, self._camera.up_m):
+            dress(self._haze.attach_new_node(mesh_node(*card)), Layer.HAZE)
         self._drops = []
         if sky.drops:
             texture = make_texture(textures.rain_streaks(sky.drops), repeat=True, mipmaps=False)
             for k in range(RAIN_VARIANTS):
-                mesh, colours = rain_card(tangent, k)
-                drop = self._haze.attach_new_node(mesh_node(mesh, colours))
+                drop = self._haze.attach_new_node(mesh_node(rain_card(tangent, k)))
                 drop.set_texture(texture)
                 dress(drop, Layer.RAIN)
                 self._drops.append(drop)

@@ -65,8 +65,10 @@ def rgba(colour: Float[np.ndarray, "n 3"], alpha: float = 1.0) -> UInt8[np.ndarr
     return (np.clip(levels, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def mesh_node(mesh: Mesh, colours: UInt8[np.ndarray, "n 4"], ground_uv: Float[np.ndarray, "n 2"] | None = None) -> Node:
-    """A node of a mesh with its vertex colours and, on the ground, its place in the picture of the ground."""
+def mesh_node(
+    mesh: Mesh, colours: UInt8[np.ndarray, "n 4"] | int = 255, ground_uv: Float[np.ndarray, "n 2"] | None = None
+) -> Node:
+    """A node of a mesh with its vertex colours, white if none, and, on the ground, its place in the picture."""
     vertices = np.zeros(len(mesh.points), VERTEX)
     vertices["position"], vertices["uv"], vertices["colour"] = mesh.points, mesh.uv, colours
     if ground_uv is not None:
