@@ -8,6 +8,7 @@ Convention:
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
@@ -103,6 +104,14 @@ class RoadMap:
         lanes, marks = build_lanes(read_opendrive(path))
         areas, corners = junction_areas(lanes)
         return cls(tuple(_with_corners(lanes, corners)), tuple(marks), tuple(areas))
+
+    def paved(self) -> Iterator[tuple[Surface, Float[np.ndarray, "_ 3"]]]:
+        """Outlines of what is paved, in the order to draw them in: where strips overlap the largest counts."""
+        lanes = [(SURFACE_OF_KIND[lane.kind], lane) for lane in self.lanes if lane.kind in SURFACE_OF_KIND]
+        for surface, lane in sorted(lanes, key=lambda pair: pair[0]):
+            yield surface, np.concatenate([lane.left, lane.right[::-1]])
+        for area in self.junctions:
+            yield Surface.DRIVING, area.outline
 
     def surface_at(self, points_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
         """Code of `Surface` at each point."""

@@ -73,13 +73,13 @@ class AgentNodes:
                 continue
             points = np.stack([agents.x_m[chosen], agents.y_m[chosen]], axis=1)
             raised = self._roads.surface_at(points) == Surface.SIDEWALK if on_foot else np.zeros(len(chosen), bool)
-            shaded_m = self._lit.shaded_at(points)
+            dark = self._lit.sunlit_at(points) < 0.5
             for k, i in enumerate(chosen.tolist()):
                 yaw = float(agents.yaw_rad[i])
                 stride = stride_at(float(agents.travelled_m[i])) if on_foot else None
                 models = self._lit_models(int(agents.look[i]), stride)
                 heading = round(yaw / (2 * math.pi / HEADINGS)) % HEADINGS
-                model = models[heading + (HEADINGS if shaded_m[k] else 0)]
+                model = models[heading + (HEADINGS if dark[k] else 0)]
                 figures[i].show(model, float(points[k, 0]), float(points[k, 1]), yaw, raised=bool(raised[k]))
 
     def _lit_models(self, look: int, stride: float | None) -> list[Node]:

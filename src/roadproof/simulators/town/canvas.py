@@ -24,7 +24,7 @@ from PIL import Image, ImageDraw
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.homographies import Homography
-from roadproof.simulators.town.ground import COARSE_M, FINE_M, LitGround, paved_damp
+from roadproof.simulators.town.ground import COARSE_M, FINE_M, LitGround, paved_damp, turned_square
 from roadproof.simulators.town.meshes import Mesh
 from roadproof.simulators.town.textures import GRAIN_MEAN
 
@@ -86,7 +86,7 @@ def road_patch(lit: LitGround, placement: CanvasPlacement, grain: UInt8[np.ndarr
     columns, rows = to_world[:, 0] * step, to_world[:, 1] * step
 
     def seen(plane: Image.Image, pixel_m: float) -> Float[np.ndarray, "p p c"]:
-        return lit.patch(plane, pixel_m, corner, columns, rows, PATCH_PX)
+        return turned_square(plane, pixel_m, corner - np.array(lit.ground.low_m), columns, rows, PATCH_PX)
 
     light = seen(lit.light, COARSE_M) / 255
     water = seen(lit.water, COARSE_M) / 255
@@ -115,11 +115,7 @@ def _turned_grain(
     first = np.floor(outline.min(axis=0) / GRAIN_TILE_M) * GRAIN_TILE_M
     repeats = np.ceil((outline.max(axis=0) - first) / GRAIN_TILE_M).astype(int)
     mosaic = Image.fromarray(np.tile(fine, (repeats[1], repeats[0])))
-    x0, y0 = (corner - first) / pixel_m
-    (ax, ay), (bx, by) = columns / pixel_m, rows / pixel_m
-    size, mode = (PATCH_PX, PATCH_PX), Image.Transform.AFFINE
-    turned = mosaic.transform(size, mode, (ax, bx, x0, ay, by, y0), Image.Resampling.BILINEAR)
-    return np.asarray(turned, np.float32)[..., None] / GRAIN_MEAN
+    return turned_square(mosaic, pixel_m, corner - first, columns, rows, PATCH_PX) / GRAIN_MEAN
 
 
 def _lane_marks(placement: CanvasPlacement, paint: Mesh) -> tuple[Levels, Float[np.ndarray, "p p 1"]]:

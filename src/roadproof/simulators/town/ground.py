@@ -8,17 +8,16 @@ Convention:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageChops, ImageDraw, ImageFilter
 from scipy.spatial import ConvexHull
 
-from roadproof.roads.lanes import Lane
-from roadproof.roads.roadmap import SURFACE_OF_KIND, RoadMap, Surface
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.scenery import Scenery, Tree
 from roadproof.simulators.town.textures import fractal_noise
 from roadproof.simulators.town.weather import Sky
@@ -71,8 +70,10 @@ def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50
     )
     fine, coarse = _Canvas(low, size, FINE_M), _Canvas(low, size, COARSE_M)
     surface = _surfaces(fine, roads, scenery)
-    tracks = _tyre_tracks(coarse, roads)
-    edges = coarse.outlines([lane for lane in roads.lanes if lane.kind == "sidewalk"], 1.0)
+    driving = [lane for lane in roads.lanes if lane.kind == "driving"]
+    wheels = [lane.left * (1 - share) + lane.right * share for lane in driving for share in (0.27, 0.73)]
+    tracks = coarse.lines(wheels, 2, 0.22)
+    edges = coarse.lines([lane.left for lane in roads.lanes if lane.kind == "sidewalk"], round(1.0 / COARSE_M), 0.3)
     hollows = _hollows(coarse, tracks, edges, seed)
     albedo = _albedo(coarse, surface, tracks, edges, seed)
     hard = surface.point([0] + [255] * 255)
@@ -92,13 +93,17 @@ class _Canvas:
     def points(self, world: np.ndarray) -> list[tuple[float, float]]:
         return [(x, y) for x, y in ((world[:, :2] - self.low) / self.pixel_m - 0.5).tolist()]
 
-    def outlines(self, lanes: list[Lane], width_m: float) -> Plane:
-        """The inner borders of lanes as soft lines, in [0, 1]."""
+    def soft(self, image: Image.Image, blur_m: float) -> Plane:
+        """A blurred plane, in [0, 1]."""
+        return np.asarray(image.filter(ImageFilter.GaussianBlur(blur_m / self.pixel_m)), np.float32) / 255
+
+    def lines(self, lines: Iterable[np.ndarray], width_px: int, blur_m: float) -> Plane:
+        """Soft lines, in [0, 1]."""
         image = self.blank()
         pen = ImageDraw.Draw(image)
-        for lane in lanes:
-            pen.line(self.points(lane.left), fill=255, width=max(1, round(width_m / self.pixel_m)))
-        return np.asarray(image.filter(ImageFilter.GaussianBlur(0.3 / self.pixel_m)), np.float32) / 255
+        for line in lines:
+            pen.line(self.points(line), fill=255, width=width_px)
+        return self.soft(image, blur_m)
 
     def noise(self, seed: int, cells: int, octaves: int) -> Plane:
         """Noise that repeats every `NOISE_M`."""
@@ -114,27 +119,13 @@ def _surfaces(canvas: _Canvas, roads: RoadMap, scenery: Scenery) -> Image.Image:
     pen = ImageDraw.Draw(image)
     for outline in scenery.paved:
         pen.polygon(canvas.points(outline), fill=1)
-    paved = [(SURFACE_OF_KIND[lane.kind], lane) for lane in roads.lanes if lane.kind in SURFACE_OF_KIND]
-    for surface, lane in sorted(paved, key=lambda pair: pair[0]):
-        pen.polygon(canvas.points(np.concatenate([lane.left, lane.right[::-1]])), fill=int(surface))
-    for area in roads.junctions:
-        pen.polygon(canvas.points(area.outline), fill=int(Surface.DRIVING))
+    for surface, outline in roads.paved():
+        pen.polygon(canvas.points(outline), fill=int(surface))
     # Sidewalks get an edge of stone, which also fills the chinks where strips meet at an angle.
     near = image.point([0, 255, 0, 0] + [0] * 252).filter(ImageFilter.BoxBlur(EDGE_M / canvas.pixel_m))
     bare = image.point([255] + [0] * 255)
     image.paste(1, mask=ImageChops.multiply(near.point([0] + [255] * 255), bare))
     return image
-
-
-def _tyre_tracks(canvas: _Canvas, roads: RoadMap) -> Plane:
-    """Where wheels run, in [0, 1]."""
-    image = canvas.blank()
-    pen = ImageDraw.Draw(image)
-    for lane in roads.lanes:
-        if lane.kind == "driving":
-            for share in (0.27, 0.73):
-                pen.line(canvas.points(lane.left * (1 - share) + lane.right * share), fill=255, width=2)
-    return np.asarray(image.filter(ImageFilter.GaussianBlur(0.22 / canvas.pixel_m)), np.float32) / 255
 
 
 def _hollows(canvas: _Canvas, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
@@ -189,14 +180,9 @@ def _open_sky(canvas: _Canvas, scenery: Scenery) -> UInt8[np.ndarray, "h w"]:
     for tree in scenery.trees:
         (x, y), r = canvas.points(np.array([[tree.x_m, tree.y_m]]))[0], 0.34 * tree.height_m / canvas.pixel_m
         flat.ellipse((x - r, y - r, x + r, y + r), fill=90)
-    near = np.asarray(walls.filter(ImageFilter.GaussianBlur(1.5 / canvas.pixel_m)), np.float32) / 255
-    broad = (
-        np.asarray(
-            walls.reduce(4).filter(ImageFilter.GaussianBlur(1.5 / canvas.pixel_m)).resize(walls.size), np.float32
-        )
-        / 255
-    )
-    under = np.asarray(low.filter(ImageFilter.GaussianBlur(0.4 / canvas.pixel_m)), np.float32) / 255
+    far = walls.reduce(4).filter(ImageFilter.GaussianBlur(1.5 / canvas.pixel_m)).resize(walls.size)
+    broad = np.asarray(far, np.float32) / 255
+    near, under = canvas.soft(walls, 1.5), canvas.soft(low, 0.4)
     share = 1 - np.clip(0.36 * near + 0.40 * broad + 0.5 * under, 0, 0.7)
     return (share * 255).astype(np.uint8)
 
@@ -226,10 +212,6 @@ class LitGround:
     def sunlit_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """1 in the sun, 0 in full shadow."""
         return self._at(self.sunlit, points_m)
-
-    def shaded_at(self, points_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Whether the sun is hidden."""
-        return self.sunlit_at(points_m) < 0.5
 
     def open_sky_at(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Share of the sky that is seen."""
@@ -263,26 +245,26 @@ class LitGround:
         x, y = (round(float(v) / pixel_m) for v in low)
         return (x, y, x + n, y + n)
 
-    def patch(
-        self, plane: Image.Image, pixel_m: float, corner: Vector, per_column: Vector, per_row: Vector, pixels: int
-    ) -> Float[np.ndarray, "p p c"]:
-        """A plane seen in a turned square of pixels.
 
-        Args:
-            plane: one of this ground's planes.
-            pixel_m: the plane's resolution, metres a pixel.
-            corner: world x, y of the square's upper left corner.
-            per_column: world step from a column to the next, metres.
-            per_row: world step from a row to the next, metres.
-            pixels: how many rows and columns the square has.
-        """
-        x0, y0 = (corner - np.array(self.ground.low_m)) / pixel_m
-        (ax, ay), (bx, by) = per_column / pixel_m, per_row / pixel_m
-        turned = plane.transform(
-            (pixels, pixels), Image.Transform.AFFINE, (ax, bx, x0, ay, by, y0), Image.Resampling.BILINEAR
-        )
-        array = np.asarray(turned, np.float32)
-        return array if array.ndim == 3 else array[..., None]
+def turned_square(
+    plane: Image.Image, pixel_m: float, corner: Vector, per_column: Vector, per_row: Vector, pixels: int
+) -> Float[np.ndarray, "p p c"]:
+    """A plane seen in a turned square of pixels.
+
+    Args:
+        plane: the plane, of one or three channels.
+        pixel_m: the plane's resolution, metres a pixel.
+        corner: x, y of the square's upper left corner from the plane's lower corner, metres.
+        per_column: world step from a column to the next, metres.
+        per_row: world step from a row to the next, metres.
+        pixels: how many rows and columns the square has.
+    """
+    (x0, y0), (ax, ay), (bx, by) = corner / pixel_m, per_column / pixel_m, per_row / pixel_m
+    turned = plane.transform(
+        (pixels, pixels), Image.Transform.AFFINE, (ax, bx, x0, ay, by, y0), Image.Resampling.BILINEAR
+    )
+    array = np.asarray(turned, np.float32)
+    return array if array.ndim == 3 else array[..., None]
 
 
 def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> LitGround:

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CameraModel
-from roadproof.roads.roadmap import SURFACE_OF_KIND, RoadMap, Surface
+from roadproof.roads.roadmap import RoadMap, Surface
 from roadproof.simulators.town import textures
 from roadproof.simulators.town.agent_nodes import figure, stride_at
 from roadproof.simulators.town.air import dome
@@ -196,11 +196,9 @@ class _Plan:
         size = (math.ceil((x1 - x0) / self._pixel_m) + 1, math.ceil((y1 - y0) / self._pixel_m) + 1)
         plan = Image.new("L", size, Surface.OTHER)
         pen = ImageDraw.Draw(plan)
-        paved = [(SURFACE_OF_KIND[lane.kind], lane) for lane in roads.lanes if lane.kind in SURFACE_OF_KIND]
-        for surface, lane in sorted(paved, key=lambda pair: pair[0]):
-            self._fill(pen, np.concatenate([lane.left, lane.right[::-1]]), surface)
-        for area in roads.junctions:
-            self._fill(pen, area.outline, Surface.DRIVING)
+        for surface, outline in roads.paved():
+            points = ((outline[:, :2] - self._low) / self._pixel_m).tolist()
+            pen.polygon([(x, y) for x, y in points], fill=int(surface))
         self._labels = np.array([_OF_SURFACE[surface] for surface in Surface], np.uint8)[np.asarray(plan)]
 
     def __call__(self, points_m: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, " n"]:
@@ -209,9 +207,6 @@ class _Plan:
         inside: Bool[np.ndarray, " n"] = np.all((at >= 0) & (at < self._labels.shape[::-1]), axis=1)
         column, row = np.where(inside, at.T, 0)
         return np.where(inside, self._labels[row, column], np.uint8(Label.TERRAIN))
-
-    def _fill(self, pen: ImageDraw.ImageDraw, outline: Float[np.ndarray, "n _"], surface: Surface) -> None:
-        pen.polygon([(float(x), float(y)) for x, y in (outline[:, :2] - self._low) / self._pixel_m], fill=int(surface))
 
 
 def _around() -> Mesh:
