@@ -105,53 +105,31 @@ CAMERAS = {
 COLLISION_SENSOR, LANE_SENSOR = "sensor.other.collision", "sensor.other.lane_invasion"
 
 
-def _role(default: str) -> Attribute:
-    return Attribute("role_name", Kind.TEXT, default)
-
-
-def _vehicle(name: str) -> Blueprint:
-    return Blueprint(
-        name,
-        (
-            _role("autopilot"),
-            Attribute("color", Kind.COLOUR, COLOURS[0], COLOURS),
-            Attribute("number_of_wheels", Kind.INT, "4", settable=False),
-            Attribute("base_type", Kind.TEXT, "car", settable=False),
-            Attribute("generation", Kind.INT, "1", settable=False),
-        ),
-    )
-
-
-def _walker(number: int) -> Blueprint:
-    return Blueprint(
-        f"walker.pedestrian.{number:04}",
-        (
-            _role("pedestrian"),
-            Attribute("is_invincible", Kind.BOOL, "false"),
-            Attribute("speed", Kind.FLOAT, "1.4", ("0.0", "1.4", "2.8")),
-        ),
-    )
-
-
-def _camera(name: str) -> Blueprint:
-    return Blueprint(
-        name,
-        (
-            _role("front"),
-            Attribute("image_size_x", Kind.INT, "800"),
-            Attribute("image_size_y", Kind.INT, "600"),
-            Attribute("fov", Kind.FLOAT, "90.0"),
-            Attribute("sensor_tick", Kind.FLOAT, "0.0"),
-        ),
-    )
-
-
+_FRONT = Attribute("role_name", Kind.TEXT, "front")
+_VEHICLE = (
+    Attribute("role_name", Kind.TEXT, "autopilot"),
+    Attribute("color", Kind.COLOUR, COLOURS[0], COLOURS),
+    Attribute("number_of_wheels", Kind.INT, "4", settable=False),
+    Attribute("base_type", Kind.TEXT, "car", settable=False),
+    Attribute("generation", Kind.INT, "1", settable=False),
+)
+_WALKER = (
+    Attribute("role_name", Kind.TEXT, "pedestrian"),
+    Attribute("is_invincible", Kind.BOOL, "false"),
+    Attribute("speed", Kind.FLOAT, "1.4", ("0.0", "1.4", "2.8")),
+)
+_CAMERA = (
+    _FRONT,
+    Attribute("image_size_x", Kind.INT, "800"),
+    Attribute("image_size_y", Kind.INT, "600"),
+    Attribute("fov", Kind.FLOAT, "90.0"),
+    Attribute("sensor_tick", Kind.FLOAT, "0.0"),
+)
 LIBRARY = (
-    *(_vehicle(name) for name in VEHICLES),
-    *(_walker(number) for number in range(1, WALKERS + 1)),
-    *(_camera(name) for name in CAMERAS),
-    Blueprint(COLLISION_SENSOR, (_role("front"),)),
-    Blueprint(LANE_SENSOR, (_role("front"),)),
+    *(Blueprint(name, _VEHICLE) for name in VEHICLES),
+    *(Blueprint(f"walker.pedestrian.{number:04}", _WALKER) for number in range(1, WALKERS + 1)),
+    *(Blueprint(name, _CAMERA) for name in CAMERAS),
+    *(Blueprint(name, (_FRONT,)) for name in (COLLISION_SENSOR, LANE_SENSOR)),
 )
 
 NUMBERS = {blueprint.name: number for number, blueprint in enumerate(LIBRARY, 1)}
