@@ -12,30 +12,10 @@ from msgspec import Raw
 from msgspec.msgpack import Decoder
 
 from roadproof.errors import RoadproofError, SimulatorError
+from roadproof.simulators.carla_server import arguments as sent
 from roadproof.simulators.carla_server import blueprints, wire
 from roadproof.simulators.carla_server.actors import LABELS, Actor
-from roadproof.simulators.carla_server.arguments import (
-    Byte,
-    Commands,
-    Description,
-    Id,
-    Ids,
-    Mps,
-    Place,
-    Port,
-    Settings,
-    Signature,
-    SpawnCommand,
-    Text,
-    Texts,
-    Texture,
-    VehicleControl,
-    Velocity,
-    WalkerControl,
-    Weather,
-    WirePose,
-    read,
-)
+from roadproof.simulators.carla_server.arguments import Signature, read
 from roadproof.simulators.carla_server.pieces import ANY_LABEL, level_boxes, spawn_points
 from roadproof.simulators.carla_server.requests import Request
 from roadproof.simulators.carla_server.sensors import check_camera
@@ -57,24 +37,24 @@ COMMANDS = {
 DIFFUSE = 2
 
 NOT_THERE: dict[str, tuple[Signature, Value]] = {
-    "freeze_all_traffic_lights": (Signature.taking(frozen=bool), DONE),
-    "get_environment_objects": (Signature.taking(label=Byte), granted([])),
-    "get_navigation_mesh": (Signature.taking(), granted(b"")),
-    "get_required_files": (Signature.taking(folder=Text), granted([])),
-    "get_vehicle_light_states": (Signature.taking(), granted([])),
-    "query_lights_state": (Signature.taking(client=Text), granted([])),
-    "reset_all_traffic_lights": (Signature.taking(), DONE),
-    "update_lights_state": (Signature.taking(client=Text, lights=Raw, discard=bool), DONE),
+    "freeze_all_traffic_lights": (Signature.taking(frozen=bool), None),
+    "get_environment_objects": (Signature.taking(label=sent.Byte), []),
+    "get_navigation_mesh": (Signature.taking(), b""),
+    "get_required_files": (Signature.taking(folder=sent.Text), []),
+    "get_vehicle_light_states": (Signature.taking(), []),
+    "query_lights_state": (Signature.taking(client=sent.Text), []),
+    "reset_all_traffic_lights": (Signature.taking(), None),
+    "update_lights_state": (Signature.taking(client=sent.Text, lights=Raw, discard=bool), None),
 }
 """What clients call though there is nothing of the kind here, and what they are told."""
 
 _FIELDS: Decoder[list[Raw]] = Decoder(list[Raw])
-_ID: Decoder[int] = Decoder(Id)
-_SPAWN: Decoder[SpawnCommand] = Decoder(SpawnCommand)
+_ID: Decoder[int] = Decoder(sent.Id)
+_SPAWN: Decoder[sent.SpawnCommand] = Decoder(sent.SpawnCommand)
 
 
 class Calls:
-    """Answers calls on one world.
+    """Answers calls on one world: what the method of a call returns, where None is nothing.
 
     Args:
         world: the world that is served.
@@ -93,14 +73,17 @@ class Calls:
     def answer(self, request: Request) -> bytes:
         """The answer to a call on the wire."""
         try:
-            return wire.request_answer(request.id, self._result(request.name, request.arguments))
+            result = self._result(request.name, request.arguments)
+            if request.name != "apply_batch":  # whose result is a list of answers
+                result = DONE if result is None else granted(result)
+            return wire.request_answer(request.id, result)
         except RoadproofError as error:
             text = f"{error!s:.1000}"
         except Exception as error:
             # A mistake of this server; the other clients are not to suffer for it.
             logging.getLogger(__name__).exception("%s failed", request.name)
             text = f"{request.name} failed in the server: {type(error).__name__}"
-        if request.name == "apply_batch":  # a list of answers, which would hide the error
+        if request.name == "apply_batch":  # in whose list of answers the error would be hidden
             return wire.request_error(request.id, text)
         return wire.request_answer(request.id, refused(text))
 
@@ -117,96 +100,95 @@ class Calls:
     # The session
 
     def call_version(self) -> Value:
-        return granted(wire.VERSION)
+        return wire.VERSION
 
     def call_get_available_maps(self) -> Value:
-        return granted([f"/Game/Carla/Maps/{name}" for name in self._world.maps])
+        return [f"/Game/Carla/Maps/{name}" for name in self._world.maps]
 
     def call_get_episode_info(self) -> Value:
-        return granted([self._world.episode, [wire.token(WORLD_STREAM, self._port + 1)]])
+        return [self._world.episode, [wire.token(WORLD_STREAM, self._port + 1)]]
 
-    def call_get_sensor_token(self, stream: Id) -> Value:
+    def call_get_sensor_token(self, stream: sent.Id) -> Value:
         if not self._world.has_stream(stream):
             raise SimulatorError(f"there is no stream {stream}")
-        return granted([wire.token(stream, self._port + 1)])
+        return [wire.token(stream, self._port + 1)]
 
     def call_get_episode_settings(self) -> Value:
-        return granted(self._world.settings)
+        return self._world.settings
 
-    def call_set_episode_settings(self, settings: Settings) -> Value:
+    def call_set_episode_settings(self, settings: sent.Settings) -> Value:
         self._world.set_settings(settings)
-        return granted(self._world.frame)
+        return self._world.frame
 
-    def call_load_new_episode(self, name: Text, reset_settings: bool, layers: Id) -> Value:
+    def call_load_new_episode(self, name: sent.Text, reset_settings: bool, layers: sent.Id) -> None:
         del layers
         here = self._world.town.name if self._world.town is not None else ""
         self._world.load(name.rsplit("/", 1)[-1] or here)
         if reset_settings:
             self._world.set_settings(SETTINGS)
-        return DONE
 
     def call_get_map_info(self) -> Value:
         assert self._world.town is not None
         places = [wire.transform(pose) for pose in spawn_points(self._world.town.roads)]
-        return granted([f"Carla/Maps/{self._world.town.name}", places])
+        return [f"Carla/Maps/{self._world.town.name}", places]
 
     def call_get_map_data(self) -> Value:
         assert self._world.town is not None
-        return granted(self._world.town.file.read_text(encoding="utf-8"))
+        return self._world.town.file.read_text(encoding="utf-8")
 
     def call_tick_cue(self) -> Value:
         self._advance()
-        return granted(self._world.frame)
+        return self._world.frame
 
     # The world
 
     def call_get_weather_parameters(self) -> Value:
-        return granted(list(self._world.weather))
+        return list(self._world.weather)
 
-    def call_set_weather_parameters(self, parameters: Weather) -> Value:
+    def call_set_weather_parameters(self, parameters: sent.Weather) -> None:
         self._world.set_weather(parameters)
-        return DONE
 
     def call_get_actor_definitions(self) -> Value:
-        return granted([blueprint.wire(i + 1) for i, blueprint in enumerate(blueprints.LIBRARY)])
+        return [blueprint.wire(i + 1) for i, blueprint in enumerate(blueprints.LIBRARY)]
 
     def call_get_spectator(self) -> Value:
-        return granted(Actor(1, 0, "spectator", [], ORIGIN).wire(self._port + 1))
+        return Actor(1, 0, "spectator", [], ORIGIN).wire(self._port + 1)
 
-    def call_get_actors_by_id(self, ids: Ids) -> Value:
+    def call_get_actors_by_id(self, ids: sent.Ids) -> Value:
         actors = self._world.actors
-        return granted([actors[i].wire(self._port + 1) for i in ids if i in actors])
+        return [actors[i].wire(self._port + 1) for i in ids if i in actors]
 
-    def call_get_all_level_BBs(self, label: Byte) -> Value:  # noqa: N802
+    def call_get_all_level_BBs(self, label: sent.Byte) -> Value:  # noqa: N802
         assert self._world.town is not None
         actors = [actor for actor in self._world.actors.values() if actor.kind in LABELS]
         boxes = [actor.world_box for actor in actors if label in (LABELS[actor.kind], ANY_LABEL)]
-        return granted(level_boxes(self._world.town.scenery, label) + boxes)
+        return level_boxes(self._world.town.scenery, label) + boxes
 
     def call_get_names_of_all_objects(self) -> Value:
         assert self._world.town is not None
-        return granted(list(self._world.town.pieces))
+        return list(self._world.town.pieces)
 
-    def call_apply_color_texture_to_objects(self, names: Texts, material: Byte, texture: Texture) -> Value:
+    def call_apply_color_texture_to_objects(
+        self, names: sent.Texts, material: sent.Byte, texture: sent.Texture
+    ) -> None:
         width, height, colours = texture
         # As in CARLA, what cannot be painted is no error.
         if material == DIFFUSE and width * height == len(colours) > 0:
             levels = np.array(colours, np.uint8).reshape(height, width, 4)
             self._world.paint(names, levels[..., :3])
-        return DONE
 
     # Actors
 
-    def call_spawn_actor(self, description: Description, pose: WirePose) -> Value:
-        return granted(self._spawned(description, pose).wire(self._port + 1))
+    def call_spawn_actor(self, description: sent.Description, pose: sent.WirePose) -> Value:
+        return self._spawned(description, pose).wire(self._port + 1)
 
     def call_spawn_actor_with_parent(
-        self, description: Description, pose: WirePose, parent: Id, attachment: int, bone: Text
+        self, description: sent.Description, pose: sent.WirePose, parent: sent.Id, attachment: int, bone: sent.Text
     ) -> Value:
         del attachment, bone
-        return granted(self._spawned(description, pose, parent).wire(self._port + 1))
+        return self._spawned(description, pose, parent).wire(self._port + 1)
 
-    def _spawned(self, description: Description, pose: WirePose, parent: int | None = None) -> Actor:
+    def _spawned(self, description: sent.Description, pose: sent.WirePose, parent: int | None = None) -> Actor:
         _, name, attributes = description
         actor = self._world.spawn(name, attributes, wire.pose_of(pose), parent)
         if actor.name in blueprints.CAMERAS:
@@ -217,22 +199,22 @@ class Calls:
                 raise
         return actor
 
-    def call_destroy_actor(self, key: Id) -> Value:
-        return granted(True) if self._world.destroy(key) else refused(f"there is no actor {key}")
+    def call_destroy_actor(self, key: sent.Id) -> Value:
+        if not self._world.destroy(key):
+            raise SimulatorError(f"there is no actor {key}")
+        return True
 
-    def call_get_actor_bounding_box(self, key: Id) -> Value:
-        return granted([*self._world.actor(key).box, [0.0, 0.0, 0.0]])
+    def call_get_actor_bounding_box(self, key: sent.Id) -> Value:
+        return [*self._world.actor(key).box, [0.0, 0.0, 0.0]]
 
-    def call_apply_control_to_vehicle(self, key: Id, control: VehicleControl) -> Value:
+    def call_apply_control_to_vehicle(self, key: sent.Id, control: sent.VehicleControl) -> None:
         self._world.actor(key, "vehicle").control = control
-        return DONE
 
-    def call_apply_control_to_walker(self, key: Id, control: WalkerControl) -> Value:
+    def call_apply_control_to_walker(self, key: sent.Id, control: sent.WalkerControl) -> None:
         (x, y, z), speed, _ = control
         self._world.actor(key, "walker").walk = (x, y, z, speed)
-        return DONE
 
-    def call_set_actor_transform(self, key: Id, pose: WirePose) -> Value:
+    def call_set_actor_transform(self, key: sent.Id, pose: sent.WirePose) -> None:
         actor = self._world.actor(key)
         before = actor.pose
         self._world.move(key, wire.pose_of(pose))
@@ -242,37 +224,31 @@ class Calls:
             except SimulatorError:
                 actor.pose = before
                 raise
-        return DONE
 
-    def call_set_walker_state(self, key: Id, pose: WirePose, speed: Mps) -> Value:
+    def call_set_walker_state(self, key: sent.Id, pose: sent.WirePose, speed: sent.Mps) -> None:
         del speed
-        return self.call_set_actor_transform(key, pose)
+        self.call_set_actor_transform(key, pose)
 
-    def call_set_actor_location(self, key: Id, place: Place) -> Value:
+    def call_set_actor_location(self, key: sent.Id, place: sent.Place) -> None:
         self._world.move(key, (*place, *self._world.actor(key).pose[3:]))
-        return DONE
 
-    def call_set_actor_target_velocity(self, key: Id, velocity: Velocity) -> Value:
+    def call_set_actor_target_velocity(self, key: sent.Id, velocity: sent.Velocity) -> None:
         self._world.push(key, velocity)
-        return DONE
 
-    def call_set_actor_simulate_physics(self, key: Id, enabled: bool) -> Value:
+    def call_set_actor_simulate_physics(self, key: sent.Id, enabled: bool) -> None:
         self._world.set_physics(key, enabled)
-        return DONE
 
-    def call_set_actor_autopilot(self, key: Id, enabled: bool) -> Value:
+    def call_set_actor_autopilot(self, key: sent.Id, enabled: bool) -> None:
         del enabled  # the client's own traffic manager drives
         self._world.actor(key, "vehicle")
-        return DONE
 
-    def call_set_actor_collisions(self, key: Id, enabled: bool) -> Value:
+    def call_set_actor_collisions(self, key: sent.Id, enabled: bool) -> None:
         del enabled  # all actors always collide
         self._world.actor(key)
-        return DONE
 
     # Batches, and the registry of traffic managers
 
-    def call_apply_batch(self, commands: Commands, then_tick: bool) -> Value:
+    def call_apply_batch(self, commands: sent.Commands, then_tick: bool) -> Value:
         results: list[Value] = []
         for ((which, fields),) in commands:
             try:
@@ -296,23 +272,22 @@ class Calls:
             self._result(COMMANDS[which], [Raw(msgspec.msgpack.encode(key)), *arguments])
         return key
 
-    def _spawn_command(self, command: SpawnCommand) -> int:
+    def _spawn_command(self, command: sent.SpawnCommand) -> int:
         description, pose, parent, _, _, afterwards = command
         key = self._spawned(description, pose, parent[1] if len(parent) == 2 else None).id
         for ((which, fields),) in afterwards:
             self._command(which, fields, key)
         return key
 
-    def call_is_traffic_manager_running(self, port: Port) -> Value:
-        return granted(port in self._managers)
+    def call_is_traffic_manager_running(self, port: sent.Port) -> Value:
+        return port in self._managers
 
-    def call_get_traffic_manager_running(self, port: Port) -> Value:
-        return granted(list(self._managers.get(port, ("", 0))))
+    def call_get_traffic_manager_running(self, port: sent.Port) -> Value:
+        return list(self._managers.get(port, ("", 0)))
 
-    def call_add_traffic_manager_running(self, manager: tuple[Text, Port]) -> Value:
+    def call_add_traffic_manager_running(self, manager: tuple[sent.Text, sent.Port]) -> Value:
         self._managers[manager[1]] = manager
-        return granted(True)
+        return True
 
-    def call_destroy_traffic_manager(self, port: Port) -> Value:
+    def call_destroy_traffic_manager(self, port: sent.Port) -> None:
         self._managers.pop(port, None)
-        return DONE
