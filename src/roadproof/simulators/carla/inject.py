@@ -13,9 +13,11 @@ of level p is seen as p · (road seen there) / (level of asphalt in full light).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy import ndimage
 
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.homographies import Homography
@@ -143,18 +145,10 @@ def _framed(canvas_px: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
 def _light(picture: UInt8[np.ndarray, "h w 3"], asphalt: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """How bright white paint would be: the asphalt around each pixel over asphalt in full light, at most 1."""
     weight = asphalt[..., None].astype(np.float64)
-    total = _boxed(np.concatenate([picture * weight, weight], axis=-1))
+    total: Float[np.ndarray, "h w 4"] = np.concatenate([picture * weight, weight], axis=-1)
+    square = np.ones(2 * LIGHT_RADIUS_PX + 1)
+    for axis in (0, 1):
+        total = cast("Any", ndimage).correlate1d(total, square, axis=axis, mode="constant")
     everywhere = total[..., :3].sum((0, 1)) / max(float(total[..., 3].sum()), 1e-9)
     seen = np.where(total[..., 3:] > 1e-9, total[..., :3] / np.maximum(total[..., 3:], 1e-9), everywhere)
     return np.clip(seen / (255 * ASPHALT_LEVEL), 0.0, 1.0)
-
-
-def _boxed(planes: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
-    """Sums over a square around each pixel."""
-    side = 2 * LIGHT_RADIUS_PX + 1
-    sums = planes
-    for axis in (0, 1):
-        pads = [(LIGHT_RADIUS_PX + 1, LIGHT_RADIUS_PX) if k == axis else (0, 0) for k in range(3)]
-        run = np.cumsum(np.pad(sums, pads), axis=axis)
-        sums = run[side:] - run[:-side] if axis == 0 else run[:, side:] - run[:, :-side]
-    return sums
