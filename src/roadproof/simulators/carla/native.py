@@ -89,7 +89,9 @@ def find_ground(session: Session, canvas: CanvasPlacement) -> Ground:
 
 
 def _found(session: Session, canvas: CanvasPlacement) -> Ground:
-    names = sorted(name for name in session.object_names() if ROAD in name.lower())
+    names = sorted(
+        name for name in session.ask("its objects", session.world.get_names_of_all_objects) if ROAD in name.lower()
+    )
     if not names:
         raise SimulatorError(f"the CARLA server at {session.where} has no object with {ROAD!r} in its name; {ELSE}")
     watch = _Watch(session, canvas)
@@ -122,7 +124,8 @@ def _found(session: Session, canvas: CanvasPlacement) -> Ground:
         count, valid = watch.counted(looks)
         places.append((count + 0.5) / 2**BITS)
         seen &= valid
-    watch.close()
+    # The camera goes, and the piece gets back what it had.
+    session.reload()
     _check_share(session, seen, f"the texture of {name} does not change all over the canvas")
     return _fitted(session, name, watch.points[seen], np.stack(places, axis=1)[seen])
 
@@ -142,9 +145,7 @@ def texture_of(ground: Ground, pattern: PatternImage | None) -> UInt8[np.ndarray
     u, v = np.meshgrid(side, side)
     canvas_from_texture = np.linalg.inv(np.vstack([ground.texture_from_canvas, [0.0, 0.0, 1.0]]))
     x, y = (a * u + b * v + c for a, b, c in canvas_from_texture[:2])
-    inside = (np.abs(x - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2) & (
-        np.abs(y - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2
-    )
+    inside = (np.abs(np.stack([x, y]) - (CANVAS_SIZE_PX - 1) / 2) < CANVAS_SIZE_PX / 2).all(axis=0)
     rgba = np.zeros((*u.shape, 4), np.float32)
     column, row = (np.rint(each[inside]).astype(int).clip(0, CANVAS_SIZE_PX - 1) for each in (x, y))
     chosen = pattern[row, column].astype(np.float32)
@@ -187,10 +188,6 @@ class _Watch:
             number = 2 * number + before
         return number, clear
 
-    def close(self) -> None:
-        """Take the camera away, and paint back what there was."""
-        self._session.reload()
-
     def _look(self, paints: list[tuple[list[str], BlackWhite]]) -> Float[np.ndarray, " p"]:
         """Levels at the places with objects painted black and white."""
         for names, white in paints:
@@ -214,12 +211,12 @@ def _fitted(
     places: Float[np.ndarray, "p 2"],
 ) -> Ground:
     known = np.column_stack([points, np.ones(len(points))])
-    fit = _least_squares(known, places)
-    for _ in range(2):
+    fit, keep = np.zeros((3, 2)), np.ones(len(points), bool)
+    for _ in range(3):
+        fit = np.linalg.lstsq(known[keep], places[keep], rcond=None)[0]
         error = np.abs(known @ fit - places).max(axis=1)
         # A place on the border of two stripes may be told wrong by one.
         keep = error < max(1.0 / 2**BITS, float(np.median(error)) * 2)
-        fit = _least_squares(known[keep], places[keep])
     rms = 2**BITS * float(np.sqrt(np.mean((known @ fit - places) ** 2)))
     if rms > WORST_STRIPES or abs(float(np.linalg.det(fit[:2]))) < 1e-9:
         raise SimulatorError(
@@ -227,10 +224,6 @@ def _fitted(
             f"expected at most {WORST_STRIPES}, on the CARLA server at {session.where}; {ELSE}"
         )
     return Ground(name, fit.T, rms)
-
-
-def _least_squares(known: Float[np.ndarray, "p 3"], places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "3 2"]:
-    return np.linalg.lstsq(known, places, rcond=None)[0]
 
 
 def _check_share(session: Session, valid: Bool[np.ndarray, " p"], what: str) -> None:

@@ -41,6 +41,7 @@ class Session:
 
     Attributes:
         where: HOST:PORT of the server.
+        lost: whether a call found no answer, or the session is closed.
         painted: whether objects have textures that are not the map's own.
 
     Raises:
@@ -49,7 +50,7 @@ class Session:
 
     def __init__(self, host: str, port: int, *, dt_s: float, patience_s: float, loading_s: float) -> None:
         self.where, self.patience_s, self._loading_s = f"{host}:{port}", patience_s, loading_s
-        self._lost = False
+        self.lost = False
         self.painted = False
         self._last_paint: tuple[list[str], UInt8[np.ndarray, "h w 3"]] | None = None
         self._texture: tuple[carla.TextureColor, UInt8[np.ndarray, "h w 3"]] | None = None
@@ -73,7 +74,7 @@ class Session:
         Raises:
             SimulatorError: no answer came in time, or the server refused.
         """
-        if self._lost:
+        if self.lost:
             raise SimulatorError(f"the connection to the CARLA server at {self.where} is lost; open it again")
         try:
             return call()
@@ -81,16 +82,11 @@ class Session:
             text = " ".join(str(error).split())
             if "time-out" not in text:
                 raise SimulatorError(f"the CARLA server at {self.where} refused {what}: {text}") from None
-            self._lost = True
+            self.lost = True
             raise SimulatorError(
                 f"the CARLA server at {self.where} did not answer for {what} in time; check that it runs, that host "
                 "and port are right, and that no other client holds it in synchronous mode"
             ) from None
-
-    @property
-    def lost(self) -> bool:
-        """Whether a call found no answer, or the session is closed."""
-        return self._lost
 
     def patiently(self, what: str, call: Callable[[], Result]) -> Result:
         """The answer to a call that may take as long as loading a map, of a server that is there now."""
@@ -135,10 +131,6 @@ class Session:
     def library(self) -> carla.BlueprintLibrary:
         """The blueprints of everything that can be spawned."""
         return self.ask("its blueprints", self.world.get_blueprint_library)
-
-    def object_names(self) -> list[str]:
-        """The names of all objects that a texture can be put on."""
-        return list(self.ask("its objects", self.world.get_names_of_all_objects))
 
     def paint(self, names: Sequence[str], picture: UInt8[np.ndarray, "h w 3"]) -> None:
         """Put a picture on objects until the map is loaded anew; the server says nothing of what it cannot paint."""
@@ -205,7 +197,7 @@ class Session:
 
         A server that does not answer is told so too, without a wait: it does as told if it ever goes on.
         """
-        self._lost, lost = False, self._lost
+        self.lost, lost = False, self.lost
         commands = self._farewells()
         with contextlib.suppress(SimulatorError):
             if lost:
@@ -218,7 +210,7 @@ class Session:
                 self.reload()
         with contextlib.suppress(SimulatorError):
             self.ask("its settings", lambda: self.world.apply_settings(self._found))
-        self._lost = True
+        self.lost = True
 
     def _farewells(self) -> list[carla.command.Command]:
         """Commands that destroy all actors; sensors no longer listen."""
