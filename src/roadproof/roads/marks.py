@@ -76,7 +76,12 @@ class Mapped(Protocol):
     """What can show the map of a scenario, such as a simulator."""
 
     def road_map(self, name: str) -> RoadMap:
-        """The map that a scenario names."""
+        """The map that a scenario names.
+
+        Raises:
+            SimulatorError: the simulator does not answer.
+            ScenarioError: the simulator has no such map.
+        """
         ...
 
 

@@ -7,28 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Protocol, get_args
 from urllib.parse import urlsplit
 
 from roadproof.errors import SimulatorError
-from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.marks import Mapped
 from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
 SPECS = "town or carla://HOST:PORT"
 CARLA_PORT, LAST_PORT = 2000, 65534  # sensor data goes through the next
+_PAINTS: dict[str, PaintChoice] = {"": "inject", **{f"paint={choice}": choice for choice in get_args(PaintChoice)}}
 
 
-class MappedSimulator(Simulator, OpenWorld, Protocol):
+class MappedSimulator(Simulator, OpenWorld, Mapped, Protocol):
     """A simulator that hides nothing of its drives, and also shows the map."""
-
-    def road_map(self, name: str) -> RoadMap:
-        """The map a scenario names.
-
-        Raises:
-            SimulatorError: the simulator does not answer.
-            ScenarioError: the simulator has no such map.
-        """
-        ...
 
 
 def is_server(spec: str) -> bool:
@@ -93,15 +85,8 @@ def _address(spec: str) -> tuple[str, int, PaintChoice]:
         raise SimulatorError(f"simulator {spec!r} has port {port}, expected 1 to {LAST_PORT:,}")
     if not host or parts.path or parts.fragment or parts.username:
         raise SimulatorError(f"simulator {spec!r} is no address, expected carla://HOST:PORT")
-    match parts.query:
-        case "" | "paint=inject":
-            paint: PaintChoice = "inject"
-        case "paint=native":
-            paint = "native"
-        case "paint=auto":
-            paint = "auto"
-        case other:
-            raise SimulatorError(
-                f"simulator {spec!r} asks for {other!r}, expected nothing or paint= and one of inject, native, auto"
-            )
-    return host, CARLA_PORT if port is None else port, paint
+    if parts.query not in _PAINTS:
+        raise SimulatorError(
+            f"simulator {spec!r} asks for {parts.query!r}, expected nothing or paint= and one of inject, native, auto"
+        )
+    return host, CARLA_PORT if port is None else port, _PAINTS[parts.query]
