@@ -35,7 +35,7 @@ SEARCH = dataclasses.replace(
 TINY = HardeningBudget(
     attack=SEARCH,
     judge=dataclasses.replace(SEARCH, starts=2),
-    tuning=Tuning(steps=2, batch=8),
+    tuning=Tuning(steps=2, repeats=2, batch=8),
     town_drives=0,
     unseen=RandomSearch(calls=2),
     clean_weathers=(Weather.CLEAR_NOON,),
@@ -102,7 +102,7 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     with pytest.raises(RoadproofError, match="holds a hardening with seed 0, now it is 1"):
         run(town, out, seed=1)
     with pytest.raises(RoadproofError, match="holds a hardening with budget"):
-        run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, batch=8)))
+        run(town, out, budget=dataclasses.replace(TINY, tuning=Tuning(steps=3, repeats=2, batch=8)))
 
 
 @pytest.mark.slow

@@ -6,9 +6,10 @@ import torch
 from hardening_road import SPACE, RampNet
 from painted_ground import RampFollower
 from roadproof.errors import ControllerError, TrainingError
-from roadproof.hardening.tuning import Tuning, TuningBatch, training_step, tune
+from roadproof.hardening import Tuning, TuningBatch
+from roadproof.hardening.tuning import training_step, tune
 
-TUNING = Tuning(steps=60, batch=16, learning_rate=0.3)
+TUNING = Tuning(steps=20, repeats=3, batch=16, learning_rate=0.3)
 
 
 def tuned(street, *, tuning=TUNING, seed=0, **options):
@@ -38,7 +39,7 @@ def test_paint_moves_a_tuned_controller_less_and_the_bare_road_as_before(street)
 
 
 def test_the_same_seed_learns_the_same_and_buffers_stay(street):
-    one, same, other = (tuned(street, tuning=Tuning(steps=5, batch=8), seed=seed) for seed in (0, 0, 1))
+    one, same, other = (tuned(street, tuning=Tuning(steps=5, repeats=2, batch=8), seed=seed) for seed in (0, 0, 1))
     assert torch.equal(one.weight, same.weight)
     assert not torch.equal(one.weight, other.weight)
     assert not one.training
@@ -55,7 +56,7 @@ def test_an_interrupted_tuning_goes_on_to_the_same_weights(street, tmp_path, fro
         if done == 20:
             raise KeyboardInterrupt
 
-    tuning, seen = Tuning(steps=25, batch=4), []
+    tuning, seen = Tuning(steps=25, repeats=2, batch=4), []
     whole = tuned(street, tuning=tuning, step=step)
     with pytest.raises(KeyboardInterrupt):
         tuned(street, tuning=tuning, step=step, checkpoint=tmp_path / "learning.safetensors", on_step=stop)
@@ -78,7 +79,7 @@ def test_a_training_step_of_ones_own_is_given_the_batch_and_its_loss_is_made_sma
         seen.append(batch)
         return (model.bias - 3.0).square()
 
-    network = tuned(street, tuning=Tuning(steps=20, batch=4, learning_rate=0.5), step=step)
+    network = tuned(street, tuning=Tuning(steps=10, repeats=2, batch=4, learning_rate=0.5), step=step)
     assert network.bias.item() == pytest.approx(3.0, abs=0.5)
     assert torch.equal(network.weight, RampNet().weight)
     assert len(seen) == 20
@@ -103,22 +104,37 @@ def test_training_steps_that_give_no_loss_are_one_line(street, step, error, mess
         tuned(street, step=step)
 
 
-def test_climbing_patterns_move_the_controller_more(street):
-    from roadproof.hardening.tuning import _Paint
+def test_a_batch_is_learnt_from_again_while_its_patterns_climb(street):
+    seen, losses = [], []
 
-    views, network = street.draw(16, torch.Generator().manual_seed(3)), RampFollower()
-    target = network.steer(views.frames, None, None)
-    paint = _Paint(SPACE, torch.empty(0, 1, 4), Tuning(climbs=3))
-    unit = paint.draw(len(views.frames), torch.Generator().manual_seed(4))
-    shift = [
-        float((network.steer(paint.on(points, views), None, None) - target).abs().mean())
-        for points in (unit, paint.climbed(unit, views, network, target))
-    ]
-    assert shift[1] > 1.1 * shift[0]
+    def step(model, batch):
+        loss = training_step(model, batch)
+        seen.append(batch)
+        losses.append(loss.item())
+        return loss
+
+    # So slow that the controller stays what it was.
+    tuned(street, tuning=Tuning(steps=10, repeats=4, batch=16, learning_rate=1e-9), step=step)
+    first, last = losses[::4], losses[3::4]
+    assert sum(last) > 1.1 * sum(first)
+    pairs = list(zip(seen[::4], seen[3::4], strict=True))
+    assert all(torch.equal(one.target, again.target) for one, again in pairs)
+    changed = torch.cat([(one.frames != again.frames).flatten(1).any(1) for one, again in pairs])
+    assert changed.any(), "patterns climb"
+    assert not changed.all(), "what is bare stays bare"
 
 
 @pytest.mark.parametrize(
-    "changes", [{"steps": 0}, {"batch": 2}, {"learning_rate": 0.0}, {"climbs": -1}, {"bare": 1.5}, {"found": -0.1}]
+    "changes",
+    [
+        {"steps": 0},
+        {"batch": 2},
+        {"learning_rate": 0.0},
+        {"repeats": 0},
+        {"climb": -0.1},
+        {"bare": 1.5},
+        {"found": -0.1},
+    ],
 )
 def test_tunings_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError, match="expected"):

@@ -55,7 +55,7 @@ ONE_STEP = replace(
 HARDENING = HardeningBudget(
     attack=ONE_STEP,
     judge=replace(ONE_STEP, starts=2),
-    tuning=Tuning(steps=2, batch=8),
+    tuning=Tuning(steps=2, repeats=2, batch=8),
     town_drives=0,
     unseen=RandomSearch(calls=2),
     clean_weathers=CLEAR,

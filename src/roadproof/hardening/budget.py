@@ -91,7 +91,7 @@ HARDENING_BUDGETS = {
     "quick": HardeningBudget(),
     "full": HardeningBudget(
         attack=replace(ALONE, method=GradOpt(restarts=6), select=3),
-        tuning=Tuning(steps=20_000),
+        tuning=Tuning(steps=10_000),
         town_drives=80,
         judge=replace(QUICK, select=4, starts=2),
         unseen=TPE(calls=400),

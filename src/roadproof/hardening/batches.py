@@ -1,0 +1,121 @@
+"""What a controller is tuned on: batches of bare and painted pictures, with what a teacher answers to the bare ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import next_controls_of
+from roadproof.controllers.conditional import ConditionalNetwork
+from roadproof.controllers.precision import multiplies_bfloat16
+from roadproof.hardening.views import Street, Views
+from roadproof.patterns import Pattern
+from roadproof.search_space import SearchSpace
+from roadproof.training.dataset import Dataset
+from roadproof.training.pasting import PastedPaint
+
+
+class TuningBatch(NamedTuple):
+    """What a training step is given.
+
+    Args:
+        frames: RGB in [0, 1], painted or bare.
+        speed_mps: speed of the car at each picture.
+        command: command at each picture, in CARLA's codes.
+        target: what the controller should answer: steer alone, or steer, throttle and brake where it answers with them.
+    """
+
+    frames: Float[Tensor, "b 3 h w"]
+    speed_mps: Float[Tensor, " b"]
+    command: Int[Tensor, " b"]
+    target: Float[Tensor, "b c"]
+
+
+def answers(
+    controller: Controller, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
+) -> Float[Tensor, "b c"]:
+    """Steer, throttle and brake where a controller says them for batches, else steer alone.
+
+    Those of a conditional network are its linear ones: the rules of its agent have no gradient where they cut. A
+    temporal controller is asked about frames as the first ones of a drive.
+
+    Raises:
+        ControllerError: the controller raises, or answers wrongly.
+    """
+    with mixed_precision(frames.device):
+        if isinstance(controller, ConditionalNetwork):
+            return controller(frames, speed_mps, command).controls.float()
+        return next_controls_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
+
+
+def mixed_precision(place: torch.device) -> torch.autocast:
+    """For networks alone: geometry and colours need all their digits."""
+    return torch.autocast(place.type, torch.bfloat16, enabled=multiplies_bfloat16(place))
+
+
+class Shown(NamedTuple):
+    """Pictures of a street, what should be answered to them, and a pattern for each of those that are painted."""
+
+    views: Views
+    target: Float[Tensor, "b c"]
+    bare: Bool[Tensor, " b"]
+    unit: Float[Tensor, "b k n"]
+
+    def painted(self, pattern: Pattern) -> TuningBatch:
+        """What is learnt from, differentiable in the patterns."""
+        views = self.views
+        frames = torch.where(self.bare[:, None, None, None], views.frames, views.painted(pattern))
+        return TuningBatch(frames, views.speed_mps, views.command, self.target)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pictures:
+    """Draws pictures of streets and of drives through the town, and asks the teacher about them.
+
+    Args:
+        teacher: the controller whose answers to bare pictures are the targets.
+        space: the search space of the patterns.
+        found: patterns that attacks found, as points of the search space; on the device of all that is drawn.
+        known: share of the painted patterns that are found ones, slightly moved; the others are random.
+        bare: share of a street's pictures that stay without paint.
+    """
+
+    teacher: Controller
+    space: SearchSpace
+    found: Float[Tensor, "p k n"]
+    known: float
+    bare: float
+
+    def of_street(self, street: Street, count: int, draw: torch.Generator) -> Shown:
+        """Pictures of a street, most of them to be painted."""
+        views = street.draw(count, draw)
+        with torch.no_grad():
+            target = answers(self.teacher, views.frames, views.speed_mps, views.command)
+            target[:, 0] = street.returning(views.place, target[:, 0])
+        unit = self._drawn(len(views.frames), draw)
+        bare = (torch.rand(len(unit), generator=draw) < self.bare).to(unit.device)
+        return Shown(views, target, bare, unit)
+
+    def of_town(self, town: Dataset, count: int, draw: torch.Generator) -> TuningBatch:
+        """Pictures of drives through the town, half of them with rectangles pasted on the road."""
+        chosen = torch.multinomial(town.weights(), count, replacement=True, generator=draw)
+        seen = town.batch(chosen, self.found.device)
+        with torch.no_grad():
+            target = answers(self.teacher, seen.frames, seen.speed_mps, seen.command)
+        return TuningBatch(PastedPaint(0.5)(seen.frames, draw), seen.speed_mps, seen.command, target)
+
+    def _drawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
+        """Points of the search space: some found ones, slightly moved, some random ones."""
+        unit = self.space.random((count,), generator).to(self.found)
+        known = torch.rand(count, generator=generator) < (self.known if len(self.found) else 0.0)
+        moved = 0.02 * torch.randn(unit.shape, generator=generator)
+        if bool(known.any()):
+            picked = torch.randint(len(self.found), (count,), generator=generator)
+            near = self.space.project(self.found[picked.to(unit.device)] + moved.to(unit))
+            unit = torch.where(known.to(unit.device)[:, None, None], near, unit)
+        return unit
