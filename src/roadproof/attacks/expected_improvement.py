@@ -38,8 +38,9 @@ def most_promising(
     points = random.uniform(size=(drawn, len(ranges))) * ranges
     expected = improvement.at(points)
     best, most = points[expected.argmax()], float(expected.max())
+    bounds = [(0.0, high) for high in ranges]
     for start in random.uniform(size=(climbs, len(ranges))) * ranges:
-        found = climb(improvement.negative, start, jac=True, method="L-BFGS-B", bounds=[(0.0, high) for high in ranges])
+        found = climb(improvement.negative, start, jac=True, method="L-BFGS-B", bounds=bounds)
         if found.success and -found.fun >= most:
             best, most = found.x, -float(found.fun)
     return best

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -78,6 +78,7 @@ class Pictures:
     """Draws pictures of streets and of drives through the town, and asks the teacher about them.
 
     Args:
+        town: frames of clean drives through the town; None for none.
         teacher: the controller whose answers to bare pictures are the targets.
         space: the search space of the patterns.
         found: patterns that attacks found, as points of the search space; on the device of all that is drawn.
@@ -85,11 +86,17 @@ class Pictures:
         bare: share of a street's pictures that stay without paint.
     """
 
+    town: Dataset | None
     teacher: Controller
     space: SearchSpace
     found: Float[Tensor, "p k n"]
     known: float
     bare: float
+    _weights: Float[Tensor, " n"] | None = field(init=False)
+    _paste: PastedPaint = field(init=False, default_factory=lambda: PastedPaint(0.5))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_weights", None if self.town is None else self.town.weights())
 
     def of_street(self, street: Street, count: int, draw: torch.Generator) -> Shown:
         """Pictures of a street, most of them to be painted."""
@@ -101,13 +108,15 @@ class Pictures:
         bare = (torch.rand(len(unit), generator=draw) < self.bare).to(unit.device)
         return Shown(views, target, bare, unit)
 
-    def of_town(self, town: Dataset, count: int, draw: torch.Generator) -> TuningBatch:
-        """Pictures of drives through the town, half of them with rectangles pasted on the road."""
-        chosen = torch.multinomial(town.weights(), count, replacement=True, generator=draw)
-        seen = town.batch(chosen, self.found.device)
+    def of_town(self, count: int, draw: torch.Generator) -> TuningBatch | None:
+        """Pictures of drives through the town, half of them with rectangles pasted on the road; None without a town."""
+        if self.town is None or self._weights is None:
+            return None
+        chosen = torch.multinomial(self._weights, count, replacement=True, generator=draw)
+        seen = self.town.batch(chosen, self.found.device)
         with torch.no_grad():
             target = answers(self.teacher, seen.frames, seen.speed_mps, seen.command)
-        return TuningBatch(PastedPaint(0.5)(seen.frames, draw), seen.speed_mps, seen.command, target)
+        return TuningBatch(self._paste(seen.frames, draw), seen.speed_mps, seen.command, target)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
         """Points of the search space: some found ones, slightly moved, some random ones."""

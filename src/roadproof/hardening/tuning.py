@@ -145,13 +145,13 @@ def tune(
     network.to(device=place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
     parameters = [each for each in network.parameters() if each.requires_grad]
     optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
-    pictures = Pictures(teacher, space, found.to(device), tuning.found, tuning.bare)
+    pictures = Pictures(town, teacher, space, found.to(device), tuning.found, tuning.bare)
     count = tuning.batch if town is None else tuning.batch // 2
     total, begun = 0.0, 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
     for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
         shown = pictures.of_street(streets[number % len(streets)], count, draw)
-        driven = None if town is None else pictures.of_town(town, count, draw)
+        driven = pictures.of_town(count, draw)
         for again in range(tuning.repeats):
             unit = shown.unit.detach().requires_grad_()
             batch = shown.painted(space.pattern(unit))
