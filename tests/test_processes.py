@@ -6,12 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from roadproof.errors import TrainingError
-from roadproof.processes import processes_beside, spread, stopping
+from roadproof.errors import ControllerError, TrainingError
+from roadproof.processes import Opened, Pool, processes_beside, spread, stopping
 
 SCRIPT = """
 import os, time
@@ -96,3 +98,54 @@ def test_what_a_piece_raises_comes_through_and_ends_the_others():
     with pytest.raises(TrainingError, match="is refused"):
         list(spread(refused_or_endless, [1, 2], Hand(), processes=2))
     assert time.monotonic() < begun + 45
+
+
+@contextmanager
+def place(folder):
+    """A simulator that takes note of who opens it."""
+    (folder / f"{os.getpid()}").touch()
+    yield folder
+
+
+class Tally:
+    """A controller that counts how often it was asked, and how often it travelled."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def __call__(self, opened, number):
+        assert opened.inside.exists()
+        self.asked += 1
+        return self.asked, os.getpid()
+
+
+class Lost:
+    """A controller that cannot be read where it arrives."""
+
+    def __call__(self, opened, number):
+        raise AssertionError
+
+    def __reduce__(self):
+        return int, ("none",)
+
+
+def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
+    with Pool(Opened(partial(place, tmp_path)), 2) as pool:
+        pool.begin(Opened.open)
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert list(tmp_path.iterdir()), "opened before there is any work"
+        first, second = ([result for _, result in pool.each(Tally(), range(8))] for _ in range(2))
+        assert {process for _, process in first + second} <= {
+            process.pid for process in multiprocessing.active_children()
+        }
+        for process in {process for _, process in first + second}:
+            counts = sorted(asked for asked, there in first + second if there == process)
+            assert counts == list(range(1, len(counts) + 1)), "it travels to a process once"
+        with pytest.raises(ControllerError, match="a controller that travelled"):
+            list(pool.each(Lost(), [1]))
+    opened = {int(each.name) for each in tmp_path.iterdir()}
+    assert 1 <= len(opened) <= 2
+    assert os.getpid() not in opened
+    assert multiprocessing.active_children() == []

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
-from functools import cached_property
+from functools import cached_property, lru_cache
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 
@@ -50,6 +50,10 @@ class Opened(Generic[Result]):
     def __init__(self, factory: Callable[[], AbstractContextManager[Result]]) -> None:
         self._factory, self._stack = factory, ExitStack()
 
+    def open(self) -> None:
+        """Enter the context now."""
+        _ = self.inside
+
     @cached_property
     def inside(self) -> Result:
         """What the context gives; it is left in `close`."""
@@ -60,46 +64,85 @@ class Opened(Generic[Result]):
         self._stack.close()
 
 
+class Pool(Generic[AnyWorker]):
+    """Processes that stay open while they are wanted, each with a worker of its own; one process means this one.
+
+    Use it in a with-block. A piece of work that fails, or an interruption, ends the others, and then the pool.
+
+    Args:
+        worker: what every process gets a copy of; must be unused so far.
+        processes: how many processes work at once, at least 1; they share out the machine's cores.
+    """
+
+    def __init__(self, worker: AnyWorker, processes: int) -> None:
+        self.processes = processes
+        self._worker, self._stack = worker, ExitStack()
+
+    def __enter__(self) -> Pool[AnyWorker]:
+        if self.processes == 1:
+            self._stack.callback(self._worker.close)
+            return self
+        threads = max(1, (os.cpu_count() or 1) // self.processes)
+        self._stop = multiprocessing.get_context("spawn").Event()
+        self._beside = self._stack.enter_context(
+            processes_beside(self.processes, _begin_work, self._worker, self._stop, threads)
+        )
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and self.processes > 1:
+            self._stop.set()
+            # Not where all went well: processes that are not waited for may complain when Python ends.
+            self._beside.shutdown(wait=False, cancel_futures=True)
+            return
+        self._stack.close()
+
+    def begin(self, function: Callable[[AnyWorker], object]) -> None:
+        """Let every process beside this one call a function of its worker, such as `Opened.open`, and do not wait."""
+        if self.processes > 1:
+            for _ in range(self.processes):
+                self._beside.submit(_call_worker, function)
+
+    def each(
+        self, function: Callable[[AnyWorker, Work], Result], works: Sequence[Work]
+    ) -> Iterator[tuple[Work, Result]]:
+        """Call a function for every piece of work.
+
+        Args:
+            function: a module's own function, or a `partial` of one; it gets the worker of its process and a piece of
+                work, and is sent to a process once for all pieces. Long ones look now and then whether they are
+                `stopping`.
+            works: the pieces; they travel between processes.
+
+        Yields:
+            Each piece of work with its result, in the order in which they are finished.
+
+        Raises:
+            SimulatorError: a process died.
+        """
+        if self.processes == 1:
+            for work in works:
+                yield work, function(self._worker, work)
+            return
+        travels = pickle.dumps(function)
+        try:
+            # A process that dies at once breaks the pool before all is handed to it.
+            waiting = {self._beside.submit(_call, travels, work): work for work in works}
+            for future in as_completed(waiting):
+                yield waiting[future], cast("Result", future.result())
+        except BrokenProcessPool:
+            raise SimulatorError(DIED) from None
+
+
 def spread(
     function: Callable[[AnyWorker, Work], Result], works: Sequence[Work], worker: AnyWorker, *, processes: int
 ) -> Iterator[tuple[Work, Result]]:
-    """Call a function for every piece of work, in as many processes as asked for; one means this one.
+    """Call a function for every piece of work, in as many processes as asked for, which are there for this alone.
 
-    Args:
-        function: a module's own function; it gets the worker of its process and a piece of work. Long ones look now
-            and then whether they are `stopping`.
-        works: the pieces; they travel between processes.
-        worker: what every process gets a copy of; must be unused so far.
-        processes: how many processes work at once; they share out the machine's cores.
-
-    Yields:
-        Each piece of work with its result, in the order in which they are finished.
-
-    Raises:
-        SimulatorError: a process died.
+    The arguments, what is yielded and what is raised are those of `Pool.each`.
     """
-    count = min(processes, len(works))
-    if count <= 1:
-        try:
-            for work in works:
-                yield work, function(worker, work)
-        finally:
-            worker.close()
-        return
-    stop = multiprocessing.get_context("spawn").Event()
-    with processes_beside(count, _begin_work, worker, stop, max(1, (os.cpu_count() or 1) // count)) as pool:
-        try:
-            # A process that dies at once breaks the pool before all is handed to it.
-            waiting = {pool.submit(_call, function, work): work for work in works}
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-        except BrokenProcessPool:
-            raise SimulatorError(DIED) from None
-        except BaseException:
-            # Not where all went well: a pool that is not waited for may complain when Python ends.
-            stop.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with Pool(worker, max(1, min(processes, len(works)))) as pool:
+        yield from pool.each(function, works)
 
 
 def stopping() -> bool:
@@ -150,8 +193,18 @@ def _begin_work(worker: Worker, stop: Event, threads: int) -> None:
     torch.set_num_threads(threads)
 
 
-def _call(function: Callable[[Any, Work], Result], work: Work) -> Result:
-    return function(_worker, work)
+def _call(travelled: bytes, work: object) -> object:
+    return _function(travelled)(_worker, work)
+
+
+def _call_worker(function: Callable[[Any], object]) -> None:
+    function(_worker)
+
+
+@lru_cache(maxsize=1)
+def _function(travelled: bytes) -> Callable[[object, object], object]:
+    """What a process is to call; a controller that came with it stays as the pieces before left it."""
+    return foreign.call("a controller that travelled to another process", pickle.loads, travelled)
 
 
 def _begin(limit_s: float, begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:

@@ -15,6 +15,7 @@ from roadproof.drives import Swerve, Trajectories, Window, record
 from roadproof.driving.rollout import drive_again, replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.patterns import Pattern, raster
+from roadproof.processes import Opened, Pool
 from roadproof.recordings import load_recordings, save_recordings
 from roadproof.training.expert import expert
 
@@ -112,6 +113,20 @@ def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, d
         np.testing.assert_array_equal(one.image_from_canvas, two.image_from_canvas)
         assert torch.equal(one.maps.gain, two.maps.gain)
     assert step.__self__ is town
+
+
+def test_two_processes_calibrate_as_this_one_does(town, drives, two_paint, tmp_path):
+    shown = []
+    with Pool(Opened(TownSimulator), 2) as pool:
+        again = calibrate(town, drives, folder=tmp_path, pool=pool, on_call=shown.append)
+    assert shown == list(range(7))
+    assert again.report.calls == two_paint.report.calls
+    assert again.report.drives == two_paint.report.drives
+    for one, two in zip(two_paint.recordings.recordings, again.recordings.recordings, strict=True):
+        np.testing.assert_array_equal(one.frames, two.frames)
+        np.testing.assert_array_equal(one.image_from_canvas, two.image_from_canvas)
+        for name in ("gain", "offset", "visible"):
+            assert torch.equal(getattr(one.maps, name), getattr(two.maps, name))
 
 
 def test_the_set_and_its_report_survive_their_files(two_paint, tmp_path):

@@ -264,7 +264,7 @@ def test_what_fails_in_one_process_stops_the_others(street, tmp_path):
             TownSimulator, driver, street, MAGENTA, folder=tmp_path / "drives", weathers=WEATHERS, starts=20, runs=0,
             processes=2,
         )  # fmt: skip
-    assert len(list((tmp_path / "drives" / "episodes").iterdir())) < 20
+    assert len(list((tmp_path / "drives").glob("episodes/*"))) < 20
 
 
 def test_a_function_with_arguments_is_known_by_them():

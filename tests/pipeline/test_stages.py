@@ -6,6 +6,7 @@ import needs
 from roadproof.attacks import AttackResult
 from roadproof.controllers import load_controller
 from roadproof.drives import load_drives
+from roadproof.driving.evaluate import drivers
 from roadproof.pipeline import stages
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.stages import Stages
@@ -23,7 +24,7 @@ def test_a_search_for_less_paint_that_found_none_is_not_repeated(tmp_path, monke
     monkeypatch.setattr(stages, "cheapest", lambda *given, **_: asked.append(given[3]))
     scenario = find_scenario("left-03")
     run = Stages(
-        simulator=TownSimulator(),
+        simulator=(town := TownSimulator()),
         controller=load_controller("pilotnet"),
         scenario=scenario,
         folder=tmp_path,
@@ -32,8 +33,7 @@ def test_a_search_for_less_paint_that_found_none_is_not_repeated(tmp_path, monke
         seed=0,
         controller_name="pilotnet",
         device="cpu",
-        factory=None,
-        processes=1,
+        pool=drivers(town, None, 1),
         on_progress=lambda *_: None,
     )
     write_attack(tmp_path)

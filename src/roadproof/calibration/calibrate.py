@@ -14,7 +14,7 @@ from jaxtyping import Float
 from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
 from roadproof.calibration.replays import Replays, drive_digest
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
-from roadproof.calibration.two_paint import Paints, look_at_paints
+from roadproof.calibration.two_paint import Paints, look_at_paints, replay_in
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
@@ -23,6 +23,7 @@ from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
+from roadproof.processes import Opened, Pool
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
 from roadproof.roads.marks import marks_of
 from roadproof.simulators.protocol import Simulator, obstacles_of
@@ -132,6 +133,7 @@ def calibrate(
     method: Method = Method.TWO_PAINT,
     *,
     folder: AnyPath | None = None,
+    pool: Pool[Opened[Simulator]] | None = None,
     on_call: Callable[[int], object] = lambda _done: None,
 ) -> Calibrated:
     """Find out where the canvas is in every frame of recorded drives, and how paint looks there.
@@ -141,6 +143,7 @@ def calibrate(
         drives: what `drives.record` made.
         method: calibration method, two-paint by default.
         folder: folder that keeps every replay; those it holds already are not driven again. None keeps nothing.
+        pool: processes that are open already and make the replays over two paints, where a folder keeps them.
         on_call: called with the number of replays so far, at first 0.
 
     Raises:
@@ -155,9 +158,13 @@ def calibrate(
             "the simulator has another camera, crop or time step than when the drives were recorded; set it up as it "
             "was then"
         )
-    replays = Replays(simulator, drives, folder, on_call)
     on_call(0)
     began = time.perf_counter()
+    if pool is not None and pool.processes > 1 and folder is not None and method is not Method.PUBLISHED:
+        replay_in(pool, drives, folder, on_call)
+        replays = Replays(simulator, drives, folder)
+    else:
+        replays = Replays(simulator, drives, folder, on_call)
     if method is Method.PUBLISHED:
         geometry = [_Geometry(*homographies_from_points(replays, drive, settings.camera)) for drive in drives.drives]
         maps: list[PixelMaps | None] = [None] * len(geometry)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,12 +13,13 @@ from jaxtyping import Float
 
 from roadproof.calibration.outline import GREY, SQUARES, fit_outline, outline_errors_px, predicted_contrast
 from roadproof.calibration.replays import Replays, uniform
-from roadproof.drives import Drive
+from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError, ColourError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
-from roadproof.simulators.protocol import PatternImage
+from roadproof.processes import Opened, Pool
+from roadproof.simulators.protocol import PatternImage, Simulator
 
 LEAST_PX = 20
 
@@ -45,6 +49,34 @@ def dark_target() -> PatternImage:
     return target
 
 
+TARGETS = {"light": uniform(255, 255, 255), "dark": dark_target()}
+"""The two paints by the names that kept replays have."""
+
+
+def replay_in(pool: Pool[Opened[Simulator]], drives: Drives, folder: Path, on_call: Callable[[int], object]) -> None:
+    """Make all replays in other processes; a folder keeps them.
+
+    Args:
+        pool: the processes.
+        drives: the recorded drives.
+        folder: folder that gets the replays; what it holds is not driven again.
+        on_call: called with the number of replays so far.
+
+    Raises:
+        CalibrationError: a replay goes astray.
+        SimulatorError: a process died.
+    """
+    wanted = [(drive.name, paint) for drive in drives.drives for paint in TARGETS]
+    for done, _ in enumerate(pool.each(partial(_replay, drives, folder), wanted), 1):
+        on_call(done)
+
+
+def _replay(drives: Drives, folder: Path, driving: Opened[Simulator], wanted: tuple[str, str]) -> None:
+    name, paint = wanted
+    drive = next(each for each in drives.drives if each.name == name)
+    Replays(driving.inside, drives, folder).frames(drive, paint, TARGETS[paint])
+
+
 def look_at_paints(
     replays: Replays, drive: Drive, prior: Homographies, camera: CameraModel, view: CropResize, *, refine: bool
 ) -> Paints:
@@ -61,8 +93,7 @@ def look_at_paints(
     Raises:
         CalibrationError: the two paints look alike or saturate, or a replay goes astray.
     """
-    light = replays.frames(drive, "light", uniform(255, 255, 255))
-    dark = replays.frames(drive, "dark", dark_target())
+    light, dark = (replays.frames(drive, name, target) for name, target in TARGETS.items())
     difference = light.astype(np.float64) - dark
     contrast = difference.mean(-1) / 255
     if refine:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
+from functools import partial
 from itertools import cycle
 
 import torch
@@ -20,7 +21,7 @@ from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRa
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import Opened, require_picklable, spread
+from roadproof.processes import Opened, Pool, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
@@ -45,6 +46,7 @@ def evaluate(
     seed: int = 0,
     baseline: Sequence[Pattern] = (),
     processes: int = 1,
+    pool: Pool[Opened[Simulator]] | None = None,
     on_drive: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Evaluation:
     """Drive a scenario with and without a pattern, from several starts alone, and with cars and people.
@@ -68,6 +70,7 @@ def evaluate(
         seed: seed of the first run with traffic, from which the others count on, and of the starts.
         baseline: other patterns to compare with, driven alone from the starts in turn, and in turn with traffic.
         processes: number of drives made at once, each in a process with a simulator of its own.
+        pool: processes that are open already and drive instead.
         on_drive: called after each drive with the number of drives done and of all drives.
 
     Raises:
@@ -97,10 +100,9 @@ def evaluate(
         episodes = Episodes.of(world, driver, scenario, paints, folder)
         planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
         drives = list(dict.fromkeys(drive for pair in planned for drive in pair))
-        factory = simulator if callable(simulator) else None
-        make_missing(
-            world, episodes, drives, lambda done: on_drive(done, len(drives)), factory=factory, processes=processes
-        )
+        if pool is None:
+            pool = stack.enter_context(drivers(world, simulator if callable(simulator) else None, processes))
+        make_missing(pool, episodes, drives, lambda done: on_drive(done, len(drives)))
     evaluation = Evaluation(
         scenario=scenario,
         controller=driver_name or driver_in_words(driver),
@@ -157,24 +159,27 @@ def _planned(
     return pairs
 
 
-def make_missing(
-    world: Simulator,
-    episodes: Episodes,
-    drives: Sequence[Conditions],
-    on_done: Callable[[int], object],
-    *,
-    factory: SimulatorFactory | None = None,
-    processes: int = 1,
-) -> None:
-    """Make the drives that a store lacks, one by one or shared out among processes.
+def drivers(world: Simulator, factory: SimulatorFactory | None, processes: int) -> Pool[Opened[Simulator]]:
+    """Processes that drive, each in a simulator of its own; one process drives in the open one.
 
     Args:
         world: open simulator that drives where one process does.
+        factory: function that makes a simulator of the same kind; needed for several processes.
+        processes: how many processes drive at once.
+    """
+    return Pool(Opened(partial(nullcontext, world) if factory is None or processes == 1 else factory), processes)
+
+
+def make_missing(
+    pool: Pool[Opened[Simulator]], episodes: Episodes, drives: Sequence[Conditions], on_done: Callable[[int], object]
+) -> None:
+    """Make the drives that a store lacks.
+
+    Args:
+        pool: what drives.
         episodes: store of the drives.
         drives: drives that are wanted.
         on_done: called with the number of these drives that are done.
-        factory: function that makes a simulator, called in each of several processes.
-        processes: largest number of processes; without a factory only one is used.
 
     Raises:
         SimulatorError: a process died, or the simulator refuses the conditions.
@@ -184,23 +189,9 @@ def make_missing(
     missing = [drive for drive in drives if not episodes.has(drive)]
     made = len(drives) - len(missing)
     on_done(made)
-    if factory is not None and processes > 1 and len(missing) > 1:
-        drives_made = spread(_make, missing, _Driving(factory, episodes), processes=processes)
-        for done, _ in enumerate(drives_made, made + 1):
-            on_done(done)
-        return
-    for done, drive in enumerate(missing, made + 1):
-        episodes.make(world, drive)
+    for done, _ in enumerate(pool.each(partial(_make, episodes), missing), made + 1):
         on_done(done)
 
 
-class _Driving(Opened[Simulator]):
-    """What a process makes drives with: a simulator, and the store with the driver, which travel there once."""
-
-    def __init__(self, factory: SimulatorFactory, episodes: Episodes) -> None:
-        super().__init__(factory)
-        self.episodes = episodes
-
-
-def _make(driving: _Driving, drive: Conditions) -> None:
-    driving.episodes.make(driving.inside, drive)
+def _make(episodes: Episodes, driving: Opened[Simulator], drive: Conditions) -> None:
+    episodes.make(driving.inside, drive)

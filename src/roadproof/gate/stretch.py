@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from roadproof.datatypes import Ending, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import make_missing
+from roadproof.driving.evaluate import drivers, make_missing
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
@@ -108,11 +107,11 @@ class Stretch:
         """
         alone = [each for weather in self.weathers for each in self._alone(weather).values()]
         total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
-        make = partial(make_missing, self.world, self.episodes, factory=factory, processes=processes)
-        make(alone, lambda done: on_drive(done, total))
-        painted = [each for weather in self.weathers for _, _, each in self._pairs(weather, self.paints)]
-        total = len(alone) + len(painted)
-        make(painted, lambda done: on_drive(len(alone) + done, total))
+        with drivers(self.world, factory, processes) as pool:
+            make_missing(pool, self.episodes, alone, lambda done: on_drive(done, total))
+            painted = [each for weather in self.weathers for _, _, each in self._pairs(weather, self.paints)]
+            total = len(alone) + len(painted)
+            make_missing(pool, self.episodes, painted, lambda done: on_drive(len(alone) + done, total))
 
     def _pairs(self, weather: Weather, paints: Iterable[Paint]) -> list[tuple[Paint, Conditions, Conditions]]:
         """Patterns, with each drive over them after the one that it is compared with, where that went well."""

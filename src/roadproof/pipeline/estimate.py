@@ -163,13 +163,15 @@ def of_run(budget: Budget, controller: Controller, *, film: bool = True, process
         budget: budget of the stress test.
         controller: controller that is timed.
         film: whether the film of two drives is made.
-        processes: number of drives of the evaluation made at once.
+        processes: number of replays over two paints and of drives of the evaluation made at once.
     """
     count, weathers = budget.trajectories.count, len(budget.recorded_in)
-    replays = RUNS * count + len(PAINTS) if budget.calibration is Calibration.PUBLISHED else 2 * count
+    published = budget.calibration is Calibration.PUBLISHED
+    replays = RUNS * count + len(PAINTS) if published else 2 * count
     frames = budget.window.frames * (1 + count // 2) * weathers
     searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
-    recorded = RECORDED_DRIVE.times(weathers * (count + replays))
+    recorded = RECORDED_DRIVE.times(weathers * count)
+    calibrated = RECORDED_DRIVE.times(weathers * replays, at_once=1 if published else processes)
     chosen = of_drives(budget.select + budget.rounds * (1 + budget.select))
     judged = of_evaluation(len(budget.weathers), budget.starts, budget.runs, film=film, processes=processes)
-    return searched + recorded + chosen + judged
+    return searched + recorded + calibrated + chosen + judged

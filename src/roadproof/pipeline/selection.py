@@ -8,6 +8,7 @@ SELECTION/episodes/*.npz      the drives: clean, and one for each candidate (`dr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,12 +19,14 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
+from roadproof.driving.evaluate import drivers, make_missing
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.io.records import RecordFile, plain
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
+from roadproof.processes import Opened, Pool
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
@@ -151,6 +154,7 @@ def select_by_driving(
     weather: Weather = Weather.CLEAR_NOON,
     folder: Path,
     clean: Episode | None = None,
+    pool: Pool[Opened[Simulator]] | None = None,
     on_drive: Callable[[int, float], object] = lambda _done, _effect: None,
 ) -> Selection:
     """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.
@@ -167,6 +171,7 @@ def select_by_driving(
         weather: weather of the drives, clear noon by default.
         folder: folder that keeps every drive and the choice; what it holds is not done again.
         clean: drive over the bare road; None to make it here.
+        pool: processes that are open already and drive over the candidates instead.
         on_drive: called after each drive with the number done, the clean one included, and the largest deviation, m,
             or change of the speed, m/s.
 
@@ -200,12 +205,22 @@ def select_by_driving(
     if clean is not None and not episodes.has(bare):
         episodes.put(bare, clean)
     episodes.make(simulator, bare)
-    on_drive(1, 0.0)
-    driven: list[Driven] = []
-    for (rank, candidate), drive in zip(chosen, over, strict=True):
-        episodes.make(simulator, drive)
-        driven.append(Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, drive)))
-        on_drive(1 + len(driven), max(each.effect(by) for each in driven))
+
+    def judged() -> list[Driven]:
+        return [
+            Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, drive))
+            for (rank, candidate), drive in zip(chosen, over, strict=True)
+            if episodes.has(drive)
+        ]
+
+    with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
+        make_missing(
+            driving,
+            episodes,
+            over,
+            lambda done: on_drive(1 + done, max((each.effect(by) for each in judged()), default=0.0)),
+        )
+    driven = judged()
     winner = max(range(len(driven)), key=lambda index: driven[index].effect(by))
     selection = Selection(
         pattern=chosen[winner][1].pattern,

@@ -27,11 +27,12 @@ from roadproof.pipeline.film import film_drives
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
+from roadproof.processes import Opened, Pool
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Simulator, SimulatorFactory
+from roadproof.simulators.protocol import Simulator
 
 CHEAPEST = "cheapest"
 """The folder of a run with the least paint for a deviation."""
@@ -55,8 +56,7 @@ class Stages:
     seed: int
     controller_name: str
     device: str
-    factory: SimulatorFactory | None
-    processes: int
+    pool: Pool[Opened[Simulator]]
     on_progress: OnProgress
 
     @property
@@ -101,6 +101,7 @@ class Stages:
                 drives,
                 self.budget.calibration,
                 folder=place / "calibration",
+                pool=self.pool,
                 on_call=lambda made: self.on_progress("Calibrating", number * each + made, total, ""),
             )
             done.save(place)
@@ -156,6 +157,7 @@ class Stages:
             folder=self.folder / "selection",
             # The simulator repeats itself, so the recorded clean drive is the one to compare with.
             clean=drives.drives[0].episode,
+            pool=self.pool,
             on_drive=lambda done, best: self.on_progress("Verifying by driving", done, total, f"{best:.2f} {unit}"),
         )
 
@@ -239,7 +241,7 @@ class Stages:
     def evaluate(self, pattern: Pattern) -> Evaluation:
         """Drive over the chosen pattern in many conditions, to measure how bad it is."""
         return evaluate(
-            self.factory if self.factory and self.processes > 1 else self.simulator,
+            self.simulator,
             self.controller,
             self.scenario,
             pattern,
@@ -250,7 +252,7 @@ class Stages:
             start_range=self.budget.start_range,
             runs=self.budget.runs,
             seed=self.seed,
-            processes=self.processes,
+            pool=self.pool,
             on_drive=lambda done, total: self.on_progress("Evaluating", done, total, ""),
         )
 

@@ -27,6 +27,7 @@ from roadproof.attacks.speed import require_pedals
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
+from roadproof.driving.evaluate import drivers
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
@@ -40,7 +41,7 @@ from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost
 from roadproof.pipeline.stages import OnProgress, Stages
-from roadproof.processes import require_picklable
+from roadproof.processes import Opened, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -119,7 +120,8 @@ def stress_test(
         controller_name: name of the controller in reports.
         device: torch device on which the search computes, "cpu" or "cuda:0".
         factory: opens one more simulator of the same kind; needed for several processes.
-        processes: how many drives of the evaluation are made at once; the controller must be picklable for several.
+        processes: how many replays of the calibration, drives over candidates and drives of the evaluation are made at
+            once; the controller must be picklable for several.
         film: whether to film the two drives that the report shows, and to render the recorded frames over the paint,
             which takes three drives more.
         cheapest_m: the deviation, in metres, for which the least paint is looked for and driven over once; None for
@@ -146,8 +148,7 @@ def stress_test(
         seed=seed,
         controller_name=controller_name,
         device=device,
-        factory=factory,
-        processes=processes,
+        pool=drivers(simulator, factory, processes),
         on_progress=on_progress,
     )
     stages.check_paint()
@@ -161,7 +162,10 @@ def stress_test(
     require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
     if isinstance(budget.objective, SpeedChange):
         require_pedals(controller)
-    with working_in(folder):
+    with working_in(folder), stages.pool as pool:
+        if not (folder / "recordings").exists():
+            # They open their simulators while this one records.
+            pool.begin(Opened[Simulator].open)
         return _all_of(stages, film=film, cheapest_m=cheapest_m)
 
 
