@@ -14,7 +14,7 @@ from bad_inputs import GATES, NOWHERE
 from command import answered
 from roadproof.cli import app
 from roadproof.cli.output import answer, in_json, say, stored
-from roadproof.hardening.harden import Hardened, Round
+from roadproof.hardening.result import Hardened, Round
 
 NOISY = textwrap.dedent(
     """

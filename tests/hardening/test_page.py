@@ -3,9 +3,9 @@
 import pytest
 
 from browser import hindrances
-from roadproof.hardening.harden import Hardened, Round
 from roadproof.hardening.judgement import Clean, Judged, Judgement
 from roadproof.hardening.page import write_hardening
+from roadproof.hardening.result import Hardened, Round
 from roadproof.patterns import save_pattern
 from roadproof.pipeline.stage_costs import StageCost
 from runs import PATTERN

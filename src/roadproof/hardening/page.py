@@ -6,8 +6,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from roadproof.hardening.harden import Hardened
 from roadproof.hardening.judgement import Judged
+from roadproof.hardening.result import Hardened
 from roadproof.io.files import write_text
 from roadproof.io.html import encoded
 from roadproof.patterns import load_pattern, raster

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from roadproof.attacks.objective import variation_of
 from roadproof.controllers import Controller, load_controller
+from roadproof.controllers.identity import identity_of
 from roadproof.controllers.loading import runs_code
 from roadproof.hardening.budget import HardeningBudget
+from roadproof.hardening.tuning import TrainingStep
+from roadproof.io.identity import ANSWERS
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
-from roadproof.scenarios import Scenario
+from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace, derived_seed
 from roadproof.simulators.protocol import Simulator
 
@@ -76,6 +80,20 @@ class Run:
     def judging_seed(self) -> int:
         """The seed of all judging, which no round has."""
         return self.seed + _FRESH
+
+    def made_of(self, simulator: Simulator, teacher: Controller, step: TrainingStep) -> dict[str, object]:
+        """What identifies the hardening; judging may be asked for later."""
+        view = simulator.input
+        return {
+            "controller": self.spec,
+            ANSWERS: identity_of(teacher, (view.height_px, view.width_px)),
+            "scenarios": [identity(each) for each in self.scenarios],
+            "budget": repr(replace(self.budget, judge=self.budget.attack)),
+            "space": repr(self.space),
+            "variation": repr(variation_of(self.budget.attack.objective)),
+            "seed": self.seed,
+            "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
+        }
 
     def attack(
         self, simulator: Simulator, number: int, scenario: Scenario, on_progress: OnProgress, *, judging: bool = False

@@ -1,0 +1,78 @@
+"""What came of a hardening, as hardening.json keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from roadproof.driving.evaluation import ATTACK
+from roadproof.hardening.judgement import Judgement
+from roadproof.io.files import write_json
+from roadproof.pipeline.stage_costs import StageCost
+from roadproof.pipeline.stress_test import StressTest
+
+FORMAT = "roadproof-hardening"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """What an attack afresh reached on the streets for training, driven.
+
+    Args:
+        number: the round's number; 0 is the round before anything was learnt.
+        deviation_m: mean deviation over the drives of each scenario's evaluation, metres, by the scenario's name.
+        left_lane: share of all the evaluations' drives that leave their lane, 0 to 1.
+    """
+
+    number: int
+    deviation_m: dict[str, float]
+    left_lane: float
+
+    @property
+    def mean_m(self) -> float:
+        """The mean deviation over the scenarios, metres."""
+        return float(np.mean(list(self.deviation_m.values())))
+
+    @staticmethod
+    def of(number: int, tests: Sequence[StressTest]) -> Round:
+        """The round of this number, of its stress tests on the streets for training."""
+        trials = {test.evaluation.scenario.name: test.evaluation.of(ATTACK, traffic=False) for test in tests}
+        left = [trial.leaves_lane for each in trials.values() for trial in each]
+        deviations = {name: float(np.mean([trial.deviation_m for trial in each])) for name, each in trials.items()}
+        return Round(number, deviations, float(np.mean(left)))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Hardened:
+    """What came of a hardening.
+
+    Args:
+        controller: the spec of the controller that it began with.
+        hardened: the spec of the hardened controller, for `load_controller` and every verb.
+        rounds: the re-tests on the streets for training, round 0 first.
+        best: number of the round whose controller is kept: the one after a tuning with the least mean deviation.
+        judgement: before and after on other streets; None where none were given.
+        cost: cost of each stage since the hardening began, by its name.
+    """
+
+    controller: str
+    hardened: str
+    rounds: tuple[Round, ...]
+    best: int
+    judgement: Judgement | None
+    cost: dict[str, StageCost]
+
+    def save(self, folder: Path) -> None:
+        """Write hardening.json.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(self)
+        if self.judgement is not None:
+            content["verdict"] = asdict(self.judgement.verdict())
+        write_json(folder / "hardening.json", content)

@@ -1,0 +1,176 @@
+"""The stages of a hardening, each of which goes on from what the folder holds (`hardening.harden`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import nn
+
+from roadproof.controllers import CIL, ConditionalPilotNet, Controller
+from roadproof.controllers.loading import load_trainable, runs_code, save_controller
+from roadproof.controllers.steering import NetworkController
+from roadproof.hardening.judgement import Clean, Judge, Judged, clean_drives
+from roadproof.hardening.result import Round
+from roadproof.hardening.run import Run
+from roadproof.hardening.together import StreetWork, attack_street, judge_street
+from roadproof.hardening.tuning import TrainingStep, tune
+from roadproof.hardening.views import Street
+from roadproof.io.files import write_tensors
+from roadproof.pipeline.stage_costs import Ledger
+from roadproof.pipeline.stress_test import OnProgress, StressTest
+from roadproof.processes import Opened, spread
+from roadproof.recordings import load_recordings
+from roadproof.scenarios import Scenario
+from roadproof.simulators.protocol import Simulator, SimulatorFactory
+from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.training.collection import CollectionPlan, record_drive
+from roadproof.training.dataset import Dataset
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stages:
+    """The stages of one run; its other fields are arguments of `harden`, and the controller before."""
+
+    run: Run
+    simulator: Simulator
+    teacher: Controller
+    step: TrainingStep
+    factory: SimulatorFactory | None
+    processes: int
+    ledger: Ledger
+    on_progress: OnProgress
+
+    def tell(self, title: str, done: int, total: int, word: str) -> None:
+        """Note the time, and tell the caller how far it is."""
+        self.ledger.step()
+        self.on_progress(title, done, total, word)
+
+    def rounds(self, count: int) -> tuple[Round, ...]:
+        """Attack, then tune and attack afresh for so many rounds."""
+        tests, town = list[list[StressTest]](), self.town()
+        for number in range(count + 1):
+            if number:
+                self.tune(number, tests, town)
+            tests.append(self.attack(number))
+        costs = [cost for each in tests for test in each for cost in test.cost.values()]
+        self.ledger.calls("attack", sum(cost.simulator_calls for cost in costs))
+        return tuple(Round.of(number, each) for number, each in enumerate(tests))
+
+    def attack(self, number: int) -> list[StressTest]:
+        """Attack the controller of a round afresh on every street for training."""
+        with self.ledger.stage("attack"):
+            self._together(f"Round {number}", attack_street, number, self.run.scenarios)
+            return [
+                self.run.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
+                for each in self.run.scenarios
+            ]
+
+    def tune(self, number: int, tests: Sequence[Sequence[StressTest]], town: Dataset | None) -> None:
+        """Tune on what all attacks so far found, from the weights of the round before."""
+        run, tuning = self.run, self.run.budget.tuning
+        if run.weights(number).exists():
+            return
+        network = load_trainable(run.spec_of(number - 1))
+        # It learns from paint of all kinds, also where attacks are limited.
+        space = run.space.unlimited
+        streets: list[Street] = []
+        found: list[torch.Tensor] = []
+        for past, attacked in enumerate(tests):
+            driver = run.controller(past)
+            for scenario, test in zip(run.scenarios, attacked, strict=True):
+                recordings = load_recordings(run.round(past) / scenario.name / "recordings")
+                points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
+                street = Street(recordings, self.teacher, device=run.device)
+                street.add_ways(driver, space.pattern(points.to(run.device)))
+                streets.append(street)
+                found.append(points)
+        title, checkpoint = f"Round {number}: learning", run.round(number) / "learning.safetensors"
+        with self.ledger.stage("learn"):
+            tune(
+                network,
+                self.teacher,
+                streets,
+                space,
+                torch.cat(found),
+                town,
+                tuning,
+                seed=run.seed_of(number),
+                device=run.device,
+                step=self.step,
+                checkpoint=checkpoint,
+                on_step=lambda step, loss: self.tell(title, step, tuning.steps, f"loss {loss:.4f}"),
+            )
+        _save(network, run, number)
+        checkpoint.unlink(missing_ok=True)
+
+    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
+        """Judge the controllers before and after on other streets."""
+        judged: list[Judged] = []
+        with self.ledger.stage("judge"):
+            # All before come first: the one after also drives over what was found against the one before.
+            for number, when in ((0, "before"), (best, "after")):
+                self._together(f"Judging {when}", judge_street, number, judge_on)
+            for scenario in judge_on:
+                for number, when in ((0, "before"), (best, "after")):
+                    told = self._under(f"Judging {when}, {scenario.name}")
+                    judged += Judge(self.run, self.simulator, number, scenario, told).judge()
+            self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
+        return tuple(judged)
+
+    def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, Clean]:
+        """Drive over the bare road with the controllers before and after."""
+        with self.ledger.stage("bare road"):
+            before, after = (
+                clean_drives(
+                    self.simulator,
+                    self.run.controller(number),
+                    scenarios,
+                    self.run.budget.clean_weathers,
+                    self.run.round(number) / "clean",
+                    on_drive=lambda done, total, when=when: self.tell(f"Bare road, {when}", done, total, "drives"),
+                )
+                for number, when in ((0, "before"), (best, "after"))
+            )
+            self.ledger.calls("bare road", before.drives + after.drives)
+        return before, after
+
+    def town(self) -> Dataset | None:
+        """Frames of the controller's clean drives through the town, where there is one."""
+        drives = self.run.budget.town_drives
+        if not drives or not isinstance(self.simulator, TownSimulator):
+            return None
+        plan = CollectionPlan(drives=drives, seed=self.run.seed, controller=self.run.spec)
+        paths = [self.run.folder / "town" / f"drive-{number:05d}.npz" for number in range(drives)]
+        with self.ledger.stage("town"):
+            for number, path in enumerate(paths):
+                if not path.exists():
+                    record_drive(self.simulator, plan, number, self.teacher).save(path)
+                self.tell("Driving through the town", number + 1, drives, "drives")
+            self.ledger.calls("town", drives)
+        return Dataset.load(paths)
+
+    def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
+        """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
+        if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
+            self.tell(title, 0, len(scenarios), "streets")
+            on_street = partial(work, self.run, number)
+            done = spread(on_street, scenarios, Opened(self.factory), processes=self.processes)
+            for count, (scenario, _) in enumerate(done, 1):
+                self.tell(title, count, len(scenarios), f"streets, {scenario.name} is done")
+
+    def _under(self, title: str) -> OnProgress:
+        """Progress of the stages of one attack, told under one title."""
+        return lambda stage, done, total, word: self.tell(title, done, total, f"{stage.lower()} {word}".strip())
+
+
+def _save(network: nn.Module, run: Run, number: int) -> None:
+    path = run.weights(number)
+    origin = f"{run.spec}, hardened for {number} rounds on {', '.join(each.name for each in run.scenarios)}"
+    if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(run.spec):
+        save_controller(network, path, origin=origin)
+        return
+    tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}
+    write_tensors(path, tensors, {"roadproof-origin": origin})
