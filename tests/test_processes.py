@@ -6,14 +6,14 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 from roadproof.errors import ControllerError, TrainingError
-from roadproof.processes import Opened, Pool, processes_beside, spread, stopping
+from roadproof.processes import Pool, processes_beside, spread, stopping
 
 SCRIPT = """
 import os, time
@@ -58,21 +58,14 @@ def test_each_begins_as_told():
         assert pool.submit(os.getpid).result() != os.getpid()
 
 
-class Hand:
-    """A worker with nothing to close."""
-
-    def close(self):
-        pass
-
-
-def squared(hand, number):
-    del hand
+def squared(inside, number):
+    del inside
     return number**2, os.getpid()
 
 
-def refused_or_endless(hand, number):
+def refused_or_endless(inside, number):
     """The second of two is at work for a minute unless it hears that the first one failed."""
-    del hand
+    del inside
     if number == 1:
         raise TrainingError(f"{number} is refused")
     begun = time.monotonic()
@@ -81,7 +74,7 @@ def refused_or_endless(hand, number):
 
 
 def test_pieces_are_spread_and_nobody_is_left():
-    done = dict(spread(squared, [1, 2, 3, 4], Hand(), processes=2))
+    done = dict(spread(squared, [1, 2, 3, 4], nullcontext, processes=2))
     assert {work: result for work, (result, _) in done.items()} == {1: 1, 2: 4, 3: 9, 4: 16}
     assert os.getpid() not in {process for _, process in done.values()}
     # Waited for: a pool that is not may complain when Python ends.
@@ -89,14 +82,14 @@ def test_pieces_are_spread_and_nobody_is_left():
 
 
 def test_one_process_is_this_one():
-    assert dict(spread(squared, [3], Hand(), processes=4)) == {3: (9, os.getpid())}
+    assert dict(spread(squared, [3], nullcontext, processes=4)) == {3: (9, os.getpid())}
     assert not stopping()
 
 
 def test_what_a_piece_raises_comes_through_and_ends_the_others():
     begun = time.monotonic()
     with pytest.raises(TrainingError, match="is refused"):
-        list(spread(refused_or_endless, [1, 2], Hand(), processes=2))
+        list(spread(refused_or_endless, [1, 2], nullcontext, processes=2))
     assert time.monotonic() < begun + 45
 
 
@@ -113,8 +106,8 @@ class Tally:
     def __init__(self):
         self.asked = 0
 
-    def __call__(self, opened, number):
-        assert opened.inside.exists()
+    def __call__(self, inside, number):
+        assert inside.exists()
         self.asked += 1
         return self.asked, os.getpid()
 
@@ -122,7 +115,7 @@ class Tally:
 class Lost:
     """A controller that cannot be read where it arrives."""
 
-    def __call__(self, opened, number):
+    def __call__(self, inside, number):
         raise AssertionError
 
     def __reduce__(self):
@@ -130,8 +123,8 @@ class Lost:
 
 
 def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
-    with Pool(Opened(partial(place, tmp_path)), 2) as pool:
-        pool.begin(Opened.open)
+    with Pool(partial(place, tmp_path), 2) as pool:
+        pool.begin()
         deadline = time.monotonic() + 60
         while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
             time.sleep(0.05)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import pickle
@@ -11,10 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, Generic, TypeAlias, TypeVar, cast
 
 import torch
 
@@ -26,67 +27,34 @@ DIED = "a driving process died; is there memory for all of them? try with fewer 
 """What is said of one that did not even raise an exception."""
 
 
-@runtime_checkable
-class Worker(Protocol):
-    """What pieces of work are done with, such as an open simulator; one a process."""
-
-    def close(self) -> None:
-        """Give back what it holds."""
-        ...
-
-
-AnyWorker = TypeVar("AnyWorker", bound=Worker)
+Inside = TypeVar("Inside")
 Work = TypeVar("Work")
 Result = TypeVar("Result")
+Opens: TypeAlias = Callable[[], AbstractContextManager[Inside]]
+"""Makes the context in which a process works, such as a simulator."""
 
 
-class Opened(Generic[Result]):
-    """A worker that enters a context, such as a simulator, when it is first wanted.
-
-    Args:
-        factory: makes the context; it travels between processes.
-    """
-
-    def __init__(self, factory: Callable[[], AbstractContextManager[Result]]) -> None:
-        self._factory, self._stack = factory, ExitStack()
-
-    def open(self) -> None:
-        """Enter the context now."""
-        _ = self.inside
-
-    @cached_property
-    def inside(self) -> Result:
-        """What the context gives; it is left in `close`."""
-        return self._stack.enter_context(self._factory())
-
-    def close(self) -> None:
-        """Leave the context, if it was entered."""
-        self._stack.close()
-
-
-class Pool(Generic[AnyWorker]):
-    """Processes that stay open while they are wanted, each with a worker of its own; one process means this one.
+class Pool(Generic[Inside]):
+    """Processes that stay open while they are wanted, each in a context of its own; one process means this one.
 
     Use it in a with-block. A piece of work that fails, or an interruption, ends the others, and then the pool.
 
     Args:
-        worker: what every process gets a copy of; must be unused so far.
+        opens: makes the context in which a process works, entered for its first piece; it travels there once.
         processes: how many processes work at once, at least 1; they share out the machine's cores.
     """
 
-    def __init__(self, worker: AnyWorker, processes: int) -> None:
+    def __init__(self, opens: Opens[Inside], processes: int) -> None:
         self.processes = processes
-        self._worker, self._stack = worker, ExitStack()
+        self._opens, self._stack = opens, ExitStack()
 
-    def __enter__(self) -> Pool[AnyWorker]:
-        if self.processes == 1:
-            self._stack.callback(self._worker.close)
-            return self
-        threads = max(1, (os.cpu_count() or 1) // self.processes)
-        self._stop = multiprocessing.get_context("spawn").Event()
-        self._beside = self._stack.enter_context(
-            processes_beside(self.processes, _begin_work, self._worker, self._stop, threads)
-        )
+    def __enter__(self) -> Pool[Inside]:
+        if self.processes > 1:
+            threads = max(1, (os.cpu_count() or 1) // self.processes)
+            self._stop = multiprocessing.get_context("spawn").Event()
+            self._beside = self._stack.enter_context(
+                processes_beside(self.processes, _begin_work, self._opens, self._stop, threads)
+            )
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -97,20 +65,23 @@ class Pool(Generic[AnyWorker]):
             return
         self._stack.close()
 
-    def begin(self, function: Callable[[AnyWorker], object]) -> None:
-        """Let every process beside this one call a function of its worker, such as `Opened.open`, and do not wait."""
+    @cached_property
+    def _here(self) -> Inside:
+        """What this process works in, where it is the only one."""
+        return self._stack.enter_context(self._opens())
+
+    def begin(self) -> None:
+        """Let every process beside this one enter its context now, and do not wait for it."""
         if self.processes > 1:
             for _ in range(self.processes):
-                self._beside.submit(_call_worker, function)
+                self._beside.submit(_inside)
 
-    def each(
-        self, function: Callable[[AnyWorker, Work], Result], works: Sequence[Work]
-    ) -> Iterator[tuple[Work, Result]]:
+    def each(self, function: Callable[[Inside, Work], Result], works: Sequence[Work]) -> Iterator[tuple[Work, Result]]:
         """Call a function for every piece of work.
 
         Args:
-            function: a module's own function, or a `partial` of one; it gets the worker of its process and a piece of
-                work, and is sent to a process once for all pieces. Long ones look now and then whether they are
+            function: a module's own function, or a `partial` of one; it gets what its process has opened and a piece of
+                work, and travels to a process once for all pieces. Long ones look now and then whether they are
                 `stopping`.
             works: the pieces; they travel between processes.
 
@@ -122,7 +93,7 @@ class Pool(Generic[AnyWorker]):
         """
         if self.processes == 1:
             for work in works:
-                yield work, function(self._worker, work)
+                yield work, function(self._here, work)
             return
         travels = pickle.dumps(function)
         try:
@@ -135,13 +106,13 @@ class Pool(Generic[AnyWorker]):
 
 
 def spread(
-    function: Callable[[AnyWorker, Work], Result], works: Sequence[Work], worker: AnyWorker, *, processes: int
+    function: Callable[[Inside, Work], Result], works: Sequence[Work], opens: Opens[Inside], *, processes: int
 ) -> Iterator[tuple[Work, Result]]:
     """Call a function for every piece of work, in as many processes as asked for, which are there for this alone.
 
-    The arguments, what is yielded and what is raised are those of `Pool.each`.
+    The arguments, what is yielded and what is raised are those of `Pool` and `Pool.each`.
     """
-    with Pool(worker, max(1, min(processes, len(works)))) as pool:
+    with Pool(opens, max(1, min(processes, len(works)))) as pool:
         yield from pool.each(function, works)
 
 
@@ -183,22 +154,26 @@ def require_picklable(driver: object) -> None:
         ) from error.__cause__
 
 
-_worker: Worker | None = None
+_opens: Opens[Any] | None = None
+_opened = ExitStack()
 _stop: Event | None = None
 
 
-def _begin_work(worker: Worker, stop: Event, threads: int) -> None:
-    global _worker, _stop  # one of each a process, made by its initialiser
-    _worker, _stop = worker, stop
+def _begin_work(opens: Opens[Any], stop: Event, threads: int) -> None:
+    global _opens, _stop  # one of each a process, made by its initialiser
+    _opens, _stop = opens, stop
+    atexit.register(_opened.close)
     torch.set_num_threads(threads)
 
 
+@cache
+def _inside() -> Any:  # noqa: ANN401  # whatever the process works in
+    assert _opens is not None
+    return _opened.enter_context(_opens())
+
+
 def _call(travelled: bytes, work: object) -> object:
-    return _function(travelled)(_worker, work)
-
-
-def _call_worker(function: Callable[[Any], object]) -> None:
-    function(_worker)
+    return _function(travelled)(_inside(), work)
 
 
 @lru_cache(maxsize=1)

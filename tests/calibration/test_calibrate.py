@@ -15,7 +15,7 @@ from roadproof.drives import Swerve, Trajectories, Window, record
 from roadproof.driving.rollout import drive_again, replay, rollout
 from roadproof.errors import CalibrationError
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import Opened, Pool
+from roadproof.processes import Pool
 from roadproof.recordings import load_recordings, save_recordings
 from roadproof.training.expert import expert
 
@@ -117,7 +117,7 @@ def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, d
 
 def test_two_processes_calibrate_as_this_one_does(town, drives, two_paint, tmp_path):
     shown = []
-    with Pool(Opened(TownSimulator), 2) as pool:
+    with Pool(TownSimulator, 2) as pool:
         again = calibrate(town, drives, folder=tmp_path, pool=pool, on_call=shown.append)
     assert shown == list(range(7))
     assert again.report.calls == two_paint.report.calls

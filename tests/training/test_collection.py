@@ -11,16 +11,15 @@ from roadproof.scenarios import builtin_scenarios
 from roadproof.training.collection import CollectionPlan, collect, record_drive
 from roadproof.training.random_scenarios import Disturbance
 from roadproof.training.shards import Shard
-from roadproof.training.workers import Worker
+from roadproof.training.workers import driving
 
 needs.town()
 
 
 @pytest.fixture(scope="module")
 def worker():
-    worker = Worker(None, 0.1)
-    yield worker
-    worker.close()
+    with driving(None, 0.1) as worker:
+        yield worker
 
 
 def test_a_quiet_drive_follows_the_route_and_a_disturbed_one_leaves_it(worker):
@@ -126,9 +125,8 @@ def test_a_disturbance_lasts_as_long_in_a_simulator_with_shorter_steps(monkeypat
     plan = CollectionPlan(drives=1, seed=3, disturbed=1.0, traffic=0.0)
     lengths = []
     for dt_s in (0.1, 0.05):
-        worker = Worker(None, dt_s)
-        lengths.append(len(record_drive(worker.town, plan, 0, None)) * dt_s)
-        worker.close()
+        with driving(None, dt_s) as worker:
+            lengths.append(len(record_drive(worker.town, plan, 0, None)) * dt_s)
     (long_s, long), (short_s, short) = made
     assert long_s == pytest.approx(short_s, abs=0.25)
     assert lengths[0] == pytest.approx(lengths[1], rel=0.2)

@@ -8,7 +8,7 @@ import needs
 from roadproof.datatypes import Control, Weather
 from roadproof.scenarios import builtin_scenarios, find_scenario
 from roadproof.training.scores import Trial, score_drive, score_drives
-from roadproof.training.workers import Worker
+from roadproof.training.workers import driving
 
 needs.town()
 
@@ -32,9 +32,8 @@ class Held:
 
 @pytest.fixture(scope="module")
 def town():
-    worker = Worker(None, 0.05)
-    yield worker.town
-    worker.close()
+    with driving(None, 0.05) as worker:
+        yield worker.town
 
 
 def test_the_expert_drives_a_turn_clean(town):

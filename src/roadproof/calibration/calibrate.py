@@ -23,7 +23,7 @@ from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
-from roadproof.processes import Opened, Pool
+from roadproof.processes import Pool
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
 from roadproof.roads.marks import marks_of
 from roadproof.simulators.protocol import Simulator, obstacles_of
@@ -133,7 +133,7 @@ def calibrate(
     method: Method = Method.TWO_PAINT,
     *,
     folder: AnyPath | None = None,
-    pool: Pool[Opened[Simulator]] | None = None,
+    pool: Pool[Simulator] | None = None,
     on_call: Callable[[int], object] = lambda _done: None,
 ) -> Calibrated:
     """Find out where the canvas is in every frame of recorded drives, and how paint looks there.

@@ -18,7 +18,7 @@ from roadproof.errors import CalibrationError, ColourError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
-from roadproof.processes import Opened, Pool
+from roadproof.processes import Pool
 from roadproof.simulators.protocol import PatternImage, Simulator
 
 LEAST_PX = 20
@@ -53,7 +53,7 @@ TARGETS = {"light": uniform(255, 255, 255), "dark": dark_target()}
 """The two paints by the names that kept replays have."""
 
 
-def replay_in(pool: Pool[Opened[Simulator]], drives: Drives, folder: Path, on_call: Callable[[int], object]) -> None:
+def replay_in(pool: Pool[Simulator], drives: Drives, folder: Path, on_call: Callable[[int], object]) -> None:
     """Make all replays in other processes; a folder keeps them.
 
     Args:
@@ -71,10 +71,10 @@ def replay_in(pool: Pool[Opened[Simulator]], drives: Drives, folder: Path, on_ca
         on_call(done)
 
 
-def _replay(drives: Drives, folder: Path, driving: Opened[Simulator], wanted: tuple[str, str]) -> None:
+def _replay(drives: Drives, folder: Path, simulator: Simulator, wanted: tuple[str, str]) -> None:
     name, paint = wanted
     drive = next(each for each in drives.drives if each.name == name)
-    Replays(driving.inside, drives, folder).frames(drive, paint, TARGETS[paint])
+    Replays(simulator, drives, folder).frames(drive, paint, TARGETS[paint])
 
 
 def look_at_paints(

@@ -21,7 +21,7 @@ from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRa
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import Opened, Pool, require_picklable
+from roadproof.processes import Pool, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
@@ -46,7 +46,7 @@ def evaluate(
     seed: int = 0,
     baseline: Sequence[Pattern] = (),
     processes: int = 1,
-    pool: Pool[Opened[Simulator]] | None = None,
+    pool: Pool[Simulator] | None = None,
     on_drive: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Evaluation:
     """Drive a scenario with and without a pattern, from several starts alone, and with cars and people.
@@ -159,7 +159,7 @@ def _planned(
     return pairs
 
 
-def drivers(world: Simulator, factory: SimulatorFactory | None, processes: int) -> Pool[Opened[Simulator]]:
+def drivers(world: Simulator, factory: SimulatorFactory | None, processes: int) -> Pool[Simulator]:
     """Processes that drive, each in a simulator of its own; one process drives in the open one.
 
     Args:
@@ -167,11 +167,11 @@ def drivers(world: Simulator, factory: SimulatorFactory | None, processes: int) 
         factory: function that makes a simulator of the same kind; needed for several processes.
         processes: how many processes drive at once.
     """
-    return Pool(Opened(partial(nullcontext, world) if factory is None or processes == 1 else factory), processes)
+    return Pool(partial(nullcontext, world) if factory is None or processes == 1 else factory, processes)
 
 
 def make_missing(
-    pool: Pool[Opened[Simulator]], episodes: Episodes, drives: Sequence[Conditions], on_done: Callable[[int], object]
+    pool: Pool[Simulator], episodes: Episodes, drives: Sequence[Conditions], on_done: Callable[[int], object]
 ) -> None:
     """Make the drives that a store lacks.
 
@@ -193,5 +193,5 @@ def make_missing(
         on_done(done)
 
 
-def _make(episodes: Episodes, driving: Opened[Simulator], drive: Conditions) -> None:
-    episodes.make(driving.inside, drive)
+def _make(episodes: Episodes, simulator: Simulator, drive: Conditions) -> None:
+    episodes.make(simulator, drive)

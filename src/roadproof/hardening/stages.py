@@ -21,7 +21,7 @@ from roadproof.hardening.views import Street
 from roadproof.io.files import write_tensors
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stress_test import OnProgress, StressTest
-from roadproof.processes import Opened, spread
+from roadproof.processes import spread
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
@@ -157,7 +157,7 @@ class Stages:
         if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
             self.tell(title, 0, len(scenarios), "streets")
             on_street = partial(work, self.run, number)
-            done = spread(on_street, scenarios, Opened(self.factory), processes=self.processes)
+            done = spread(on_street, scenarios, self.factory, processes=self.processes)
             for count, (scenario, _) in enumerate(done, 1):
                 self.tell(title, count, len(scenarios), f"streets, {scenario.name} is done")
 

@@ -26,7 +26,7 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.io.records import RecordFile, plain
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
-from roadproof.processes import Opened, Pool
+from roadproof.processes import Pool
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
@@ -154,7 +154,7 @@ def select_by_driving(
     weather: Weather = Weather.CLEAR_NOON,
     folder: Path,
     clean: Episode | None = None,
-    pool: Pool[Opened[Simulator]] | None = None,
+    pool: Pool[Simulator] | None = None,
     on_drive: Callable[[int, float], object] = lambda _done, _effect: None,
 ) -> Selection:
     """Drive over the strongest candidates of every group, once each, and keep the one that deviates most.

@@ -27,7 +27,7 @@ from roadproof.pipeline.film import film_drives
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
-from roadproof.processes import Opened, Pool
+from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
@@ -56,7 +56,7 @@ class Stages:
     seed: int
     controller_name: str
     device: str
-    pool: Pool[Opened[Simulator]]
+    pool: Pool[Simulator]
     on_progress: OnProgress
 
     @property

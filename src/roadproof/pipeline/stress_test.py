@@ -41,7 +41,7 @@ from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost
 from roadproof.pipeline.stages import OnProgress, Stages
-from roadproof.processes import Opened, require_picklable
+from roadproof.processes import require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -165,7 +165,7 @@ def stress_test(
     with working_in(folder), stages.pool as pool:
         if not (folder / "recordings").exists():
             # They open their simulators while this one records.
-            pool.begin(Opened[Simulator].open)
+            pool.begin()
         return _all_of(stages, film=film, cheapest_m=cheapest_m)
 
 

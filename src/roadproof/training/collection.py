@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,7 +33,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
 from roadproof.training.random_scenarios import Disturbance, random_scenario
 from roadproof.training.shards import Shard
-from roadproof.training.workers import Worker
+from roadproof.training.workers import Driving, driving
 
 STEP_S = 0.1
 FURTHEST_M = 2.6
@@ -120,7 +121,7 @@ def collect(
     paths = tuple(folder / f"drive-{number:05d}.npz" for number in range(plan.drives))
     missing = [(plan, number, path) for number, path in enumerate(paths) if not path.exists()]
     done = plan.drives - len(missing)
-    for _ in spread(_record, missing, Worker(plan.controller, STEP_S), processes=processes):
+    for _ in spread(_record, missing, partial(driving, plan.controller, STEP_S), processes=processes):
         done += 1
         if on_drive is not None:
             on_drive(done)
@@ -175,9 +176,9 @@ def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, control
     return _shard(rows, plan, number, given)
 
 
-def _record(worker: Worker, work: tuple[CollectionPlan, int, Path]) -> None:
+def _record(inside: Driving, work: tuple[CollectionPlan, int, Path]) -> None:
     plan, number, path = work
-    record_drive(worker.town, plan, number, worker.controller).save(path)
+    record_drive(inside.town, plan, number, inside.controller).save(path)
 
 
 def _conditions(plan: CollectionPlan, number: int, dt_s: float) -> _Conditions:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from roadproof.roads.routes import Crossing
 from roadproof.scenarios import Scenario
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.expert import expert
-from roadproof.training.workers import Worker
+from roadproof.training.workers import Driving, driving
 
 STEP_S = 0.05
 ASTRAY_M = 6.0
@@ -91,7 +92,7 @@ def score_drives(
     Raises:
         ControllerError: the controller cannot be loaded, or does not fit the simulator.
     """
-    return spread(_score, trials, Worker(spec, STEP_S), processes=processes)
+    return spread(_score, trials, partial(driving, spec, STEP_S), processes=processes)
 
 
 def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial) -> DrivingScore:
@@ -140,8 +141,8 @@ def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial
     )
 
 
-def _score(worker: Worker, trial: Trial) -> DrivingScore:
-    return score_drive(worker.town, worker.controller, trial)
+def _score(inside: Driving, trial: Trial) -> DrivingScore:
+    return score_drive(inside.town, inside.controller, trial)
 
 
 def _taken(crossing: Crossing, at: np.ndarray, aside: np.ndarray, arrived: bool) -> bool:
