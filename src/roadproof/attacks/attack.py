@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import cast
 
@@ -110,29 +111,21 @@ def attack(
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
     told, groups = groups, measure.groups
     candidates = _candidates(measure, search, space, groups)
+    first = candidates[0]
     cost = Cost(
         controller_frames=frames,
         seconds=time.perf_counter() - start,
         simulator_calls=measure.calls if isinstance(measure, DrivenMeasure) else 0,
     )
-    checks = _checks(measure, method, space, search, candidates[0], random_patterns, seed)
-    checks += (*check_groups(told, search), *check_steps(search))
-    first = candidates[0]
+    checks = _checks(measure, method, space, search, first, random_patterns, seed)
     return AttackResult(
-        pattern=first.pattern,
-        group=first.group,
+        **{each.name: getattr(first, each.name) for each in fields(first)},
         objective=objective.name,
-        surrogate_shift=first.surrogate_shift,
-        predicted_m=first.predicted_m,
-        predicted_range_m=first.predicted_range_m,
-        predicted_mps=first.predicted_mps,
-        predicted_range_mps=first.predicted_range_mps,
-        driven=first.driven,
         by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
         candidates=candidates,
         history=search.history.double().numpy(),
         cost=cost,
-        checks=checks,
+        checks=(*checks, *check_groups(told, search), *check_steps(search)),
         space=space,
         method=method,
         seed=seed,
