@@ -98,11 +98,6 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         return self._paint
 
     @property
-    def where(self) -> str:
-        """HOST:PORT of the server."""
-        return f"{self._host}:{self._port}"
-
-    @property
     def session(self) -> Session:
         """The connection.
 
