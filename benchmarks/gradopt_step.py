@@ -189,7 +189,7 @@ def measure_path(recordings: RecordingSet, name: str, repeats: int, patterns: in
                 cpu_times[key].append(processor)
     many = space.pattern(space.random((patterns,), torch.Generator().manual_seed(1)))
     began = time.perf_counter()
-    rolled.deviations_m(controller, many)
+    rolled.foretold(controller, many)
     return {
         "controller": name,
         "figures": 5,

@@ -47,14 +47,14 @@ def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, who
     world = RecordedWorld(road)
     world.fit(RampFollower())
     by_chance = SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9)))
-    assert result.predicted_m > 1.2 * np.mean(world.deviations_m(RampFollower(), by_chance))
+    assert result.predicted_m > 1.2 * np.mean(world.foretold(RampFollower(), by_chance).deviation_m)
     assert (result.history[-1] >= result.history[0] - 1e-3).all()
     found = [candidate.predicted_m for candidate in result.candidates]
     least = [candidate.predicted_range_m[0] for candidate in result.candidates]
     assert least == sorted(least, reverse=True)
     assert all(each.predicted_range_m[0] <= each.predicted_m <= each.predicted_range_m[1] for each in result.candidates)
     assert result.predicted_m == found[0]
-    again = world.deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)[0]
+    again = world.foretold(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE).deviation_m[0]
     assert again.mean() == pytest.approx(found[0], abs=0.02)
     assert result.predicted_range_m == pytest.approx((again.min(), again.max()), abs=0.02)
     result.save(tmp_path)
@@ -77,7 +77,9 @@ def test_a_search_drives_in_every_weather_that_was_recorded(road):
     assert torch.allclose(values[2], (values[0] + values[1]) / 2, atol=1e-5)
     result = attack(both, RampFollower(), SPACE, objective=PathDeviation(), method=SHORT)
     apart = [
-        RecordedWorld(each).deviations_m(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)
+        RecordedWorld(each)
+        .foretold(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)
+        .deviation_m
         for each in both.by_weather()
     ]
     assert result.predicted_range_m == pytest.approx((np.min(apart), np.max(apart)), abs=0.05)

@@ -58,9 +58,9 @@ def test_a_car_whose_steering_is_off_goes_its_way_and_no_further(world):
 
 
 def test_a_prediction_has_a_value_for_every_start(world):
-    found = world.deviations_m(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)), UNSURE)
+    found = world.foretold(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)), UNSURE).deviation_m
     assert found.shape == (2, len(UNSURE))
-    alone = world.deviations_m(RampFollower(), painted((200, 300, 1.0)))
+    alone = world.foretold(RampFollower(), painted((200, 300, 1.0))).deviation_m
     assert found[0, UNSURE.index(Start())] == pytest.approx(alone[0, 0], abs=1e-6)
     # Against the bare road with the same error: thin grey paint does next to nothing.
     assert found[1].max() < 0.1
@@ -82,7 +82,7 @@ def test_bright_paint_pulls_to_the_right_and_dark_paint_to_the_left(world):
     bright, dark = world.roll(RampFollower(), painted((200, 300, 1.0), (200, 300, 0.0))).right_m
     assert bright.max() > 0.3
     assert dark.min() < -0.1
-    deviations = world.deviations_m(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)))[:, 0]
+    deviations = world.foretold(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43))).deviation_m[:, 0]
     assert deviations[0] > 5 * deviations[1]
 
 

@@ -58,7 +58,7 @@ class DeviationMeasure(ClosedLoopMeasure):
 
     def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The paper's deviation, metres, 0 or more, of R patterns in each of S drives."""
-        return world.deviations_m(self.controller, patterns, UNSURE, looks)
+        return world.foretold(self.controller, patterns, UNSURE, looks).deviation_m
 
     def told(self) -> tuple[object, ...]:
         """What tells this measure from others on the same drives."""

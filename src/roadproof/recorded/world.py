@@ -227,16 +227,6 @@ class RecordedWorld:
         clean = np.stack([x + course.canvas.x_m, y + course.canvas.y_m], 1)
         return np.concatenate([clean, rolled.path(index)])
 
-    def deviations_m(
-        self,
-        controller: Controller,
-        patterns: Pattern,
-        starts: tuple[Start, ...] = (Start(),),
-        looks: Looks | None = None,
-    ) -> Float[np.ndarray, "r s"]:
-        """The paper's deviation that each pattern of a batch is predicted to cause, from each start; see `foretold`."""
-        return self.foretold(controller, patterns, starts, looks).deviation_m
-
     def foretold(
         self,
         controller: Controller,
