@@ -18,8 +18,9 @@ from typing import Any, Literal, cast, get_args
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.io.files import AnyPath, as_path, check_name, inside, read_toml, write_text
+from roadproof.io.files import AnyPath, as_path, check_name, inside, write_text
 from roadproof.io.tables import build, first_twice
+from roadproof.io.text import read_toml
 
 Kind = Literal["straight", "left", "right"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

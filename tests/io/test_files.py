@@ -9,18 +9,10 @@ import torch
 import roadproof
 from roadproof.coverage import Shape
 from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
-from roadproof.io.files import (
-    as_path,
-    check_closed,
-    inside,
-    is_plain_name,
-    read_json,
-    read_toml,
-    write_atomically,
-    write_folder_atomically,
-)
+from roadproof.io.files import as_path, check_closed, inside, is_plain_name, write_atomically, write_folder_atomically
 from roadproof.io.locks import working_in
 from roadproof.io.tables import first_twice
+from roadproof.io.text import read_json, read_toml
 from roadproof.patterns import Pattern
 from roadproof.scenarios import builtin_scenarios, load_scenarios, save_scenarios
 from scenes import recording_set

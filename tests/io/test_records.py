@@ -13,8 +13,8 @@ from jaxtyping import Float, Int, UInt8
 
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.io.arrays import write_archive
-from roadproof.io.files import read_json
 from roadproof.io.records import RecordFile
+from roadproof.io.text import read_json
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,8 +108,8 @@ def _read(path: Path) -> tuple[PaintLimits | None, Variation | None]:
     """Limits on paint and a variation from the tables [paint] and [variation], each None where it is not there."""
     from roadproof.compositing import Variation
     from roadproof.errors import PatternError, StudyError
-    from roadproof.io.files import read_toml
     from roadproof.io.tables import build
+    from roadproof.io.text import read_toml
     from roadproof.paint import PaintLimits
 
     content = read_toml(path, PatternError)

@@ -12,8 +12,9 @@ from roadproof.datatypes import Weather
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
-from roadproof.io.files import AnyPath, as_path, read_toml
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import build, check_range, each_once
+from roadproof.io.text import read_toml
 from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, load_scenarios

@@ -21,7 +21,8 @@ from typing import Any, cast
 import numpy as np
 
 from roadproof.errors import RoadproofError
-from roadproof.io.files import check_format, one_line, open_file, parse_json, write_atomically
+from roadproof.io.files import one_line, open_file, write_atomically
+from roadproof.io.text import check_format, parse_json
 
 MOST_BYTES = 4 * 2**30
 """An archive, or an array, that would take more memory is not read."""

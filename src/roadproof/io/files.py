@@ -1,18 +1,16 @@
-"""Files that are never half written, and JSON that says what it is."""
+"""Files and folders: names that stay inside, and what is never half written."""
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
 import stat
 import tempfile
-import tomllib
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
 
 from roadproof.errors import OutputError, RoadproofError
 
@@ -23,13 +21,8 @@ if TYPE_CHECKING:
 AnyPath: TypeAlias = str | os.PathLike[str]
 """What public functions take as a path."""
 
-MOST_TEXT_BYTES = 32 * 2**20
-"""A longer JSON or TOML file is not read."""
-
 _MARKS = frozenset(" ._+-=,()[]")
 _LONGEST_NAME = 100
-_LONGEST_TEXT = 1000
-_MOST_DIGITS = 20
 _DEVICES = frozenset({"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in "0123456789¹²³")})
 
 _kept_inside: list[Path] = []
@@ -145,14 +138,6 @@ def open_file(path: Path) -> BinaryIO:
     return path.open("rb")
 
 
-def _text_of(path: Path, most_bytes: int) -> str:
-    with open_file(path) as file:
-        content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:
-        raise ValueError(f"it is larger than {most_bytes:,} bytes")
-    return content.decode("utf-8")
-
-
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then move it into place.
 
@@ -260,117 +245,3 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
         OutputError: the file cannot be written.
     """
     write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-
-
-def _whole(text: str) -> int:
-    if len(text) > _MOST_DIGITS:
-        raise ValueError(f"an integer has {len(text)} digits")
-    return int(text)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text:.20} is no finite number")
-    return value
-
-
-def parse_json(text: str) -> dict[str, Any]:
-    """Read a JSON object from a text.
-
-    Raises:
-        TypeError: the text is something else than an object.
-        ValueError, RecursionError: the text is not JSON, is too deep, or has a number that is none (NaN, infinity,
-            hundreds of digits).
-    """
-    content: object = json.loads(text, parse_int=_whole, parse_float=_finite, parse_constant=_finite)
-    if not isinstance(content, dict):
-        raise TypeError("it holds no JSON object")
-    return cast("dict[str, Any]", content)
-
-
-def check_format(
-    fields: Mapping[str, object], path: Path, file_format: str, version: int, error: type[RoadproofError]
-) -> None:
-    """See that a file says the format that is expected, in a version that is understood.
-
-    Args:
-        fields: what the file says, by name.
-        path: the path of the file, for the message.
-        file_format: the "format" that the file must name.
-        version: the newest "version" that is understood.
-        error: the type of error to raise.
-
-    Raises:
-        error: the file is of another format, or of a newer version.
-    """
-    if fields.get("format") != file_format:
-        raise error(f"{path} has format {fields.get('format')!r:.60}, expected {file_format!r}")
-    known = fields.get("version")
-    if not isinstance(known, int) or isinstance(known, bool) or known < 1:
-        raise error(f"{path} has version {known!r:.40}, expected a whole number from 1")
-    if known > version:
-        raise error(f"{path} has version {known!r:.40}, this roadproof reads up to {version}; update it")
-
-
-def read_toml(path: Path, error: type[RoadproofError]) -> dict[str, Any]:
-    """Read a TOML file of the user's, such as a plan.
-
-    Args:
-        path: the TOML file to read.
-        error: the type of error to raise.
-
-    Raises:
-        error: the file cannot be read, is not valid TOML, or has a text that can name nothing: of more than 1,000
-            characters, or with a NUL; the message names it.
-    """
-    try:
-        content = tomllib.loads(_text_of(path, MOST_TEXT_BYTES))
-        odd = next((text for text in _texts(content) if len(text) > _LONGEST_TEXT or "\0" in text), None)
-    except OSError as reason:
-        raise error(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
-    except (MemoryError, ValueError, RecursionError) as reason:
-        raise error(f"{path} is not valid TOML ({one_line(reason)})") from None
-    if odd is not None:
-        told = f"{odd!r:.40} of {len(odd)} characters"
-        raise error(f"{path} has the text {told}, expected at most {_LONGEST_TEXT} and no NUL")
-    return content
-
-
-def _texts(value: object) -> Generator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict):
-        for key, each in cast("dict[str, object]", value).items():
-            yield key
-            yield from _texts(each)
-    elif isinstance(value, list):
-        for each in cast("list[object]", value):
-            yield from _texts(each)
-
-
-def read_json(
-    path: Path, file_format: str, version: int, error: type[RoadproofError], *, most_bytes: int = MOST_TEXT_BYTES
-) -> dict[str, Any]:
-    """Read a JSON file that names its format and version.
-
-    Args:
-        path: the JSON file to read.
-        file_format: the "format" that the file must name.
-        version: the newest "version" that is understood.
-        error: the type of error to raise.
-        most_bytes: how long the file may be.
-
-    Raises:
-        error: the file is missing, is no JSON object (`parse_json`), or is of another format or a newer version.
-    """
-    try:
-        content = parse_json(_text_of(path, most_bytes))
-    except OSError as reason:
-        raise error(f"cannot read {path}: {reason.strerror or reason}") from None
-    except (MemoryError, ValueError, RecursionError) as reason:
-        raise error(f"{path} is not valid JSON ({one_line(reason)})") from None
-    except TypeError:
-        raise error(f"{path} holds no JSON object, expected a {file_format} file") from None
-    check_format(content, path, file_format, version, error)
-    return content

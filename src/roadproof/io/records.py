@@ -25,8 +25,9 @@ from jaxtyping import AbstractArray, Float, Int
 
 from roadproof.errors import RoadproofError
 from roadproof.io.arrays import HEADER, MOST_BYTES, read_record, write_archive
-from roadproof.io.files import MOST_TEXT_BYTES, AnyPath, as_path, one_line, read_json, write_json
+from roadproof.io.files import AnyPath, as_path, one_line, write_json
 from roadproof.io.tables import declared_types, unknown_keys
+from roadproof.io.text import MOST_TEXT_BYTES, read_json
 
 T = TypeVar("T")
 SavedT = TypeVar("SavedT", bound="Saved")

@@ -18,8 +18,9 @@ from roadproof.drives import Drives, record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.io.files import read_json, write_json
+from roadproof.io.files import write_json
 from roadproof.io.identity import ANSWERS, digest, require_same
+from roadproof.io.text import read_json
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from roadproof.errors import StudyError
-from roadproof.io.files import check_closed, read_json, write_atomically, write_text
+from roadproof.io.files import check_closed, write_atomically, write_text
+from roadproof.io.text import read_json
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, Row
 

@@ -14,9 +14,10 @@ from roadproof.controllers.loading import files_of
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import RoadproofError, StudyError
-from roadproof.io.files import AnyPath, as_path, read_toml
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
 from roadproof.io.tables import build, check_range, each_once
+from roadproof.io.text import read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios

@@ -28,7 +28,8 @@ from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, tem
 from roadproof.controllers.loading import load_network
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.errors import TrainingError
-from roadproof.io.files import read_json, write_text
+from roadproof.io.files import write_text
+from roadproof.io.text import read_json
 from roadproof.training.collection import CollectionPlan, collect
 from roadproof.training.dataset import Dataset
 from roadproof.training.imitation import Learner, TrainingPlan, imitate

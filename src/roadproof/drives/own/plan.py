@@ -7,8 +7,8 @@ from pathlib import Path
 
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
-from roadproof.io.files import read_toml
 from roadproof.io.tables import build
+from roadproof.io.text import read_toml
 from roadproof.lens import LensModel
 from roadproof.recordings import Side
 
