@@ -1,7 +1,8 @@
 """The command line: thin verbs over the public functions, one file a verb.
 
 Verbs import what they work with when they are called: torch takes seconds, which `--help` and mistakes in the options
-should not. A `RoadproofError` is one line on standard error and exit code 2, a traceback only with `--debug`.
+should not. Where a verb is long, its options are many: each is read, checked and handed on. A `RoadproofError` is one
+line on standard error and exit code 2, a traceback only with `--debug`.
 """
 
 from __future__ import annotations
