@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import torch
 from torch import nn
@@ -12,22 +13,25 @@ from torch import nn
 from roadproof.controllers import CIL, ConditionalPilotNet, Controller
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
 from roadproof.controllers.steering import NetworkController
+from roadproof.errors import TrainingError
 from roadproof.hardening.judgement import Clean, Judge, Judged, clean_drives
 from roadproof.hardening.result import Round
 from roadproof.hardening.run import Run
-from roadproof.hardening.together import StreetWork, attack_street, judge_street
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.views import Street
 from roadproof.io.files import write_tensors
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stress_test import OnProgress, StressTest
-from roadproof.processes import spread
+from roadproof.processes import spread, stopping
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.collection import CollectionPlan, record_drive
 from roadproof.training.dataset import Dataset
+
+StreetWork: TypeAlias = Callable[[Run, int, Simulator, Scenario], object]
+"""What is done on a street with a round's controller, in a process with a simulator of its own; the folder keeps it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +66,7 @@ class Stages:
     def attack(self, number: int) -> list[StressTest]:
         """Attack the controller of a round afresh on every street for training."""
         with self.ledger.stage("attack"):
-            self._together(f"Round {number}", attack_street, number, self.run.scenarios)
+            self._together(f"Round {number}", _attack_street, number, self.run.scenarios)
             return [
                 self.run.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
                 for each in self.run.scenarios
@@ -112,7 +116,7 @@ class Stages:
         with self.ledger.stage("judge"):
             # All before come first: the one after also drives over what was found against the one before.
             for number, when in ((0, "before"), (best, "after")):
-                self._together(f"Judging {when}", judge_street, number, judge_on)
+                self._together(f"Judging {when}", _judge_street, number, judge_on)
             for scenario in judge_on:
                 for number, when in ((0, "before"), (best, "after")):
                     told = self._under(f"Judging {when}, {scenario.name}")
@@ -164,6 +168,19 @@ class Stages:
     def _under(self, title: str) -> OnProgress:
         """Progress of the stages of one attack, told under one title."""
         return lambda stage, done, total, word: self.tell(title, done, total, f"{stage.lower()} {word}".strip())
+
+
+def _attack_street(run: Run, number: int, simulator: Simulator, scenario: Scenario) -> None:
+    run.attack(simulator, number, scenario, _go_on)
+
+
+def _judge_street(run: Run, number: int, simulator: Simulator, scenario: Scenario) -> None:
+    Judge(run, simulator, number, scenario, _go_on).judge()
+
+
+def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
+    if stopping():
+        raise TrainingError("another street failed")
 
 
 def _save(network: nn.Module, run: Run, number: int) -> None:
