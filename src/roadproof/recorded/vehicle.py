@@ -108,14 +108,13 @@ class Vehicle:
         return Vehicle(dt_s=dt_s, curving=(kept, (1 - kept) * gain, 0.0, 0.0), pulling=_PULLING, slipping=(behind, 0.0))
 
     @staticmethod
-    def identified(tracks: Sequence[Track], *, prior: Vehicle | None = None) -> Vehicle:
+    def identified(tracks: Sequence[Track]) -> Vehicle:
         """The response that explains recorded drives.
 
-        What the drives do not show, such as a brake never used, stays with the prior.
+        What the drives do not show, such as a brake never used, stays with an ordinary car.
 
         Args:
             tracks: tracks of drives with one time step; perturbed drives show more than clean ones.
-            prior: response that holds where the drives say nothing; an ordinary car by default.
 
         Raises:
             RecordingError: time steps differ, too few steps follow each other, or the steering does not explain the
@@ -125,7 +124,7 @@ class Vehicle:
         if len(steps) != 1:
             raise RecordingError(f"the drives have time steps {sorted(steps)} s, expected one and the same")
         dt_s = steps.pop()
-        prior = prior or Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=dt_s)
+        prior = Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=dt_s)
         stretches = [(track, part) for track in tracks for part in track.stretches()]
         rate = _steer_rate(stretches)
         parts = [_Rows.of(track, part, rate) for track, part in stretches]

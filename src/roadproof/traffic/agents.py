@@ -15,6 +15,8 @@ CAR_DISC_M = 1.0
 CAR_DISCS_M = (-1.6, 0.0, 1.6)
 PERSON_M = 0.35
 FORESIGHT_S = 1.0
+COMFORT_MPS2, HEADWAY_S, STANDSTILL_M = 2.5, 1.2, 2.0
+"""Of a driver: the deceleration aimed at, the time kept to the car ahead, and the distance kept to it at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,9 +134,6 @@ def idm_acceleration(
     leader: Float[np.ndarray, " n"],
     *,
     gain: float = 1.8,
-    comfort: float = 2.5,
-    headway_s: float = 1.2,
-    standstill_m: float = 2.0,
 ) -> Float[np.ndarray, " n"]:
     """Acceleration of the intelligent driver model, m/s², not below −8.
 
@@ -144,13 +143,11 @@ def idm_acceleration(
         gap_m: free distance to the leader; inf where there is none.
         leader: speed of the leader, m/s.
         gain: acceleration on a free road from rest, m/s².
-        comfort: deceleration aimed at, m/s².
-        headway_s: time that is kept to the leader.
-        standstill_m: distance that is kept to the leader at rest.
 
     References:
         Treiber, Hennecke, Helbing (2000), Congested traffic states in empirical observations, eqs. 2 and 3.
     """
-    wish = standstill_m + np.maximum(speed * headway_s + speed * (speed - leader) / (2 * np.sqrt(gain * comfort)), 0.0)
+    closing = speed * (speed - leader) / (2 * np.sqrt(gain * COMFORT_MPS2))
+    wish = STANDSTILL_M + np.maximum(speed * HEADWAY_S + closing, 0.0)
     closeness = wish / np.maximum(gap_m, 0.1)
     return np.maximum(gain * (1.0 - (speed / np.maximum(wanted, 0.1)) ** 4 - closeness * closeness), -8.0)
