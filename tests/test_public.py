@@ -1,5 +1,6 @@
 """The public names: all there, all typed, few enough for one screen."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -50,6 +51,8 @@ def test_readme_docs_and_examples_use_public_names_and_documented_rooms_alone(pa
     assert "roadproof.geometry" in rooms
     text = path.read_text()
     assert set(re.findall(r"^(?:from|import) (roadproof[\w.]*)", text, re.M)) <= rooms | {"roadproof"}
+    for room, names in re.findall(r"^from (roadproof[\w.]*) import ([\w, ]+)$", text, re.M):
+        assert [name for name in names.split(", ") if not hasattr(importlib.import_module(room), name)] == []
     for name in re.findall(r"\broadproof\.(\w[\w.]*\w)", text):
         room = f"roadproof.{name}" in rooms or f"roadproof.{name}".rpartition(".")[0] in rooms
         assert room or name.split(".")[0] in TYPED, f"roadproof.{name}"
