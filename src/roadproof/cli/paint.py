@@ -53,7 +53,7 @@ _OPTIONS: dict[str, Any] = {
         _grouped(typer.Option("--robust", help="Search the mean over camera noise, light, blur, placement and wear.")),
     ],
     "paint": Annotated[
-        Path | None, _grouped(unset("TOML file with the same in tables named paint and variation; options come first."))
+        Path | None, _grouped(unset("TOML file with the same in tables named paint and variation; options win."))
     ],
 }
 _FIELDS = {"max_area": "max_area_m2", "keep_out": "keep_out_m"}
