@@ -212,8 +212,9 @@ def test_a_job_that_failed_has_a_folder_without_files(finished):
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        # The surrogate's own values are never taken for driven ones.
+        # What is shown on composited frames or predicted is never taken for driven.
         ({"kind": "surrogate", "calls": [9, 9], "seconds": [1, 2], "best": [5.0, 7.0]}, None),
+        ({"kind": "predicted", "calls": [9, 9], "seconds": [1, 2], "best": [0.5, 0.7]}, None),
         (
             {"kind": "surrogate", "calls": [9], "seconds": [1], "best": [7.0],
              "driven": {"calls": [15], "seconds": [60.0], "best": [1.5]}},

@@ -90,6 +90,16 @@ def test_the_ablation_compares_variants_over_what_all_have():
     assert results(rows, [*variants, BO], "BO").reference.name == "BO", "what the plan names"
 
 
+def test_the_reference_is_compared_with_all_but_its_own_ablation():
+    ours, others = (
+        StatedMethod(name=name, search="gradopt", scheme="group", trajectories=t) for name, t in (("A", 3), ("B", 1))
+    )
+    alike = dataclasses.replace(ours, name="two weathers")
+    rows = [row(method=each.name) for each in (ours, others, alike, BO)]
+    assert results(rows, [ours, others, alike, BO], "A").compared == ["A", "two weathers", "BO"]
+    assert results(rows, [ours, others, alike, BO], "BO").compared == ["BO", "A", "B", "two weathers"]
+
+
 def test_variants_that_differ_otherwise_go_by_their_names():
     variants = [dataclasses.replace(GRADOPT, name=name) for name in ("short", "long")]
     rows = [row(method=method.name) for method in variants]

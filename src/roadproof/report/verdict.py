@@ -48,7 +48,9 @@ def verdict(run: Run) -> Verdict:
         evaluation = run.judged.evaluation
         return _foreseen(evaluation) if evaluation.predicted else _driven(evaluation)
     if run.attack is not None:
-        return Verdict("predicted", "Predicted, not driven", _predicted(run.attack))
+        driven = run.attack.predicted_m is not None or run.attack.predicted_mps is not None
+        title = "Predicted, not driven" if driven else "Seen on composited frames, not driven"
+        return Verdict("predicted", title, _predicted(run.attack))
     drives = len(run.drives.drives if run.drives else run.recordings.recordings if run.recordings else ())
     return Verdict("recorded", "Not attacked yet", f"{drives} drives are recorded; no pattern was searched yet.")
 

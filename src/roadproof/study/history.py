@@ -35,23 +35,23 @@ class History(Course):
     """The course of a search in its own measure, and what is known of it in metres.
 
     Args:
-        kind: whether the values come from drives, or from composited frames.
+        kind: whether the values come from drives, from drives in the recorded world, or from composited frames.
         measure: name of the objective that the search maximises; empty where nobody said.
         deviation_m: deviation of the pattern that was best by then in the search's own measure, metres; None where the
             search does not drive.
-        driven: deviation of the pattern that was driven after a search on composited frames, metres; its lists are
-            empty where none was driven, and it is None for a search that drives.
+        driven: deviation of the pattern that was driven after a search that does not drive, metres; its lists are empty
+            where none was driven, and it is None for a search that drives.
     """
 
-    kind: Literal["closed loop", "surrogate"]
+    kind: Literal["closed loop", "predicted", "surrogate"]
     measure: str = ""
     deviation_m: tuple[float, ...] | None = None
     driven: Course | None = None
 
     @property
     def deviation(self) -> Course | None:
-        """The metres that the best patterns reached when driven, never a value of the surrogate; None where unknown."""
-        if self.kind == "surrogate":
+        """The metres that the best patterns reached when driven, never a stand-in for them; None where unknown."""
+        if self.kind != "closed loop":
             return self.driven if self.driven is not None and self.driven.best else None
         return Course(calls=self.calls, seconds=self.seconds, best=self.deviation_m) if self.deviation_m else None
 

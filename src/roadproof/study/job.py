@@ -110,7 +110,7 @@ def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: P
     steps = found.cost["attack"].seconds * np.arange(1, len(strongest) + 1) / len(strongest)
     chosen = found.selection if found.rounds is None else found.rounds.best
     history = History(
-        kind="surrogate",
+        kind="predicted" if budget.is_predicted else "surrogate",
         calls=(sum(cost.simulator_calls for cost in before),) * len(strongest),
         seconds=tuple((sum(cost.seconds for cost in before) + steps).tolist()),
         best=tuple(np.maximum.accumulate(strongest).tolist()),

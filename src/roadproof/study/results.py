@@ -107,9 +107,15 @@ class Results:
 
     @property
     def rivals(self) -> tuple[StatedMethod, ...]:
-        """The methods that the reference is compared with; other variants of GradOpt have the ablation."""
+        """The methods that the reference is compared with; GradOpt with other recordings has the ablation."""
         ours = self.reference
-        return tuple(method for method in self.methods if method.search != "gradopt" and method != ours)
+        ablated = {
+            method.name
+            for method in self.methods
+            if method.search == ours.search == "gradopt"
+            and (method.scheme, method.trajectories) != (ours.scheme, ours.trajectories)
+        }
+        return tuple(method for method in self.methods if method != ours and method.name not in ablated)
 
     @property
     def compared(self) -> list[str]:
