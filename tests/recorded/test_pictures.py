@@ -45,6 +45,9 @@ def patterns(count, family="published", shape=Shape.RECTANGLE):
 def test_at_a_recorded_pose_the_picture_is_the_frame_bit_for_bit(bank):
     shown = bank.show(bank.poses, bank.nearest(bank.poses))
     assert torch.equal(shown.frames.mul(255).round(), bank.levels)
+    bare = bank.show(bank.poses, bank.nearest(bank.poses), to_paint=False)
+    assert torch.equal(bare.frames, shown.frames)
+    assert shown.canvas is not None and bare.canvas is None
 
 
 @pytest.mark.parametrize(

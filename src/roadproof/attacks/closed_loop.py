@@ -25,7 +25,7 @@ from roadproof.attacks.surrogate import FIXED, Surrogate
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled, Start
+from roadproof.recorded.world import UNSURE, Foretold, RecordedWorld, Rolled, Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -83,6 +83,7 @@ class ClosedLoopMeasure(ABC):
         self._starts, self.every = rolling.get("starts", (Start(),)), rolling.get("every", 2)
         self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
         self._bare: dict[tuple[int, int], Rolled] = {}
+        self._unsure: dict[int, Rolled] = {}
 
     def steered(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """The groups whose steering shift stands beside a prediction: by default the same."""
@@ -153,6 +154,14 @@ class ClosedLoopMeasure(ABC):
         self._steering.redraw(FIXED)
         predicted = np.concatenate([self.predicted(world, patterns, looks) for world in self.worlds], 1)
         return self._steering.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
+
+    def foretold(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Foretold:
+        """What is predicted in one world with small errors; the drives over the bare road are made once."""
+        # `readings` draws the same looks each time.
+        if id(world) not in self._unsure:
+            with torch.no_grad():
+                self._unsure[id(world)] = world.roll(self.controller, starts=UNSURE, looks=looks)
+        return world.foretold(self.controller, patterns, UNSURE, looks, self._unsure[id(world)])
 
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""

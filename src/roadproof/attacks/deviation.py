@@ -24,7 +24,7 @@ from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled
+from roadproof.recorded.world import RecordedWorld, Rolled
 from roadproof.recordings import RecordingSet
 
 
@@ -58,7 +58,7 @@ class DeviationMeasure(ClosedLoopMeasure):
 
     def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The paper's deviation, metres, 0 or more, of R patterns in each of S drives."""
-        return world.foretold(self.controller, patterns, UNSURE, looks).deviation_m
+        return self.foretold(world, patterns, looks).deviation_m
 
     def told(self) -> tuple[object, ...]:
         """What tells this measure from others on the same drives."""

@@ -26,7 +26,7 @@ from roadproof.compositing.variation import Looks
 from roadproof.controllers import Controller, PedalController
 from roadproof.errors import ControllerError
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld, Rolled
+from roadproof.recorded.world import RecordedWorld, Rolled
 
 
 class SpeedMeasure(ClosedLoopMeasure):
@@ -52,7 +52,7 @@ class SpeedMeasure(ClosedLoopMeasure):
 
     def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The mean change of the speed, m/s, negative where the car is slower, of R patterns in each of S drives."""
-        return world.foretold(self.controller, patterns, UNSURE, looks).speed_change_mps
+        return self.foretold(world, patterns, looks).speed_change_mps
 
     def rank(self, predicted: Float[Tensor, "g r s"]) -> Values:
         """The least change over small errors in each group's direction, m/s."""

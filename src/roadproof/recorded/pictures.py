@@ -201,12 +201,13 @@ class FrameBank:
         at = index[:, None]
         return Gap(index, ahead.gather(1, at)[:, 0], left.gather(1, at)[:, 0], turned.gather(1, at)[:, 0])
 
-    def show(self, poses: Poses, gap: Gap) -> Views:
+    def show(self, poses: Poses, gap: Gap, *, to_paint: bool = True) -> Views:
         """The bare pictures at some poses, and what is needed to paint them.
 
         Args:
             poses: the R poses, without a gradient.
             gap: the recorded frames for these poses, from `nearest`.
+            to_paint: False leaves out what is needed to paint them, which takes nearly as long as the pictures.
         """
         input_from_ground, ground_from_input, source = self._sources(poses, gap)
         shown, beyond = self._sampled(gap, source)
@@ -219,6 +220,8 @@ class FrameBank:
             better = (short > 0) & (further < short)
             shown = shown.index_copy_(0, missed, torch.where(better[:, None], second, first))
         frames = shown.round_().div_(255)
+        if not to_paint:
+            return Views(frames, None)
         return Views(frames, self._canvas_views(frames, input_from_ground, ground_from_input, source, gap))
 
     def _sources(self, poses: Poses, gap: Gap) -> tuple[Tensor, Tensor, Float[Tensor, "r 2 n"]]:
@@ -352,7 +355,7 @@ class Views(NamedTuple):
 
     Args:
         frames: pictures of the bare road in [0, 1], (R, 3, H, W).
-        canvas: the canvas' pixels of the pictures; None if no picture shows the canvas.
+        canvas: the canvas' pixels of the pictures; None if no picture shows the canvas, or none is to be painted.
     """
 
     frames: Float[Tensor, "r 3 h w"]

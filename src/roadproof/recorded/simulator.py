@@ -231,7 +231,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
 
     def _frame(self, poses: Poses, nearest: Gap, pattern: PatternImage | None) -> UInt8[np.ndarray, "h w 3"]:
         with torch.no_grad():
-            views = self._world.bank.show(poses, nearest)
+            views = self._world.bank.show(poses, nearest, to_paint=pattern is not None)
             frames = views.frames
             if pattern is not None and views.canvas is not None:
                 frames = composite_raster(pattern, frames, views.canvas)

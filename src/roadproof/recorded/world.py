@@ -233,6 +233,7 @@ class RecordedWorld:
         patterns: Pattern,
         starts: tuple[Start, ...] = (Start(),),
         looks: Looks | None = None,
+        bare: Rolled | None = None,
     ) -> Foretold:
         """What each pattern of a batch is predicted to do to the path and to the speed, from each start.
 
@@ -241,6 +242,7 @@ class RecordedWorld:
             patterns: batch of R patterns.
             starts: S offsets from the clean drive, from each of which every pattern is driven over.
             looks: one look per start, for the bare and the painted drive alike; None for paint and camera as recorded.
+            bare: what `roll` gave for the bare road from these starts in these looks; None drives there now.
         """
         at_once = max(1, AT_ONCE // len(starts))
         # Before the first recorded frame the two drives are one.
@@ -248,7 +250,7 @@ class RecordedWorld:
         deviations: list[float] = []
         changes: list[Tensor] = []
         with torch.no_grad():
-            bare = self.roll(controller, starts=starts, looks=looks)
+            bare = bare or self.roll(controller, starts=starts, looks=looks)
             paths = [self.whole_path(bare, k) for k in range(len(starts))]
             for first in range(0, len(patterns.boxes), at_once):
                 rolled = self.roll(controller, patterns[first : first + at_once], starts=starts, looks=looks)
@@ -282,7 +284,7 @@ class RecordedWorld:
     ) -> Float[Tensor, "r 3 h w"]:
         """What R cars see."""
         with torch.no_grad():
-            views = self.bank.show(poses.detached(), gap)
+            views = self.bank.show(poses.detached(), gap, to_paint=pattern is not None)
         frames = views.frames
         if pattern is not None and views.canvas is not None:
             frames = composite_own(pattern, frames, views.canvas, looks)
