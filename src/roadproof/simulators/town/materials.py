@@ -35,9 +35,21 @@ def static_textures(grain: UInt8[np.ndarray, "g g 3"]) -> dict[str, Texture]:
         "slabs": make_texture(textures.slab_grain(), repeat=True),
         "grass": make_texture(textures.grass_grain(), repeat=True),
         "shade": make_texture(textures.contact_shadow(), mipmaps=False),
-        "solids": make_texture(textures.atlas([maker() for maker in SOLID_TEXTURES.values()], ATLAS_COLUMNS)),
-        "trees": make_texture(textures.atlas([textures.tree(kind) for kind in range(TREES)], ATLAS_COLUMNS)),
+        "solids": make_texture(_solids()),
+        "trees": make_texture(_trees()),
     }
+
+
+@functools.cache
+def _solids() -> UInt8[np.ndarray, "h w c"]:
+    """The atlas of walls and furniture; drawn once, since every town has the same."""
+    return textures.atlas([maker() for maker in SOLID_TEXTURES.values()], ATLAS_COLUMNS)
+
+
+@functools.cache
+def _trees() -> UInt8[np.ndarray, "h w 4"]:
+    """The atlas of trees, drawn once too: their thousands of leaves take a quarter of the time of a small street."""
+    return textures.atlas([textures.tree(kind) for kind in range(TREES)], ATLAS_COLUMNS)
 
 
 def split_by_atlas(meshes: Mapping[str, Mesh]) -> tuple[Mesh, Mesh, Mesh]:

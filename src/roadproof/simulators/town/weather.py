@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -123,6 +124,7 @@ SKIES: dict[Weather, Sky] = {
 }  # fmt: skip
 
 
+@lru_cache(maxsize=len(SKIES))
 def sky_picture(sky: Sky, seed: int = 20) -> UInt8[np.ndarray, "h w 3"]:
     """The sky all around: columns are azimuth from x towards y, rows go from the zenith to the horizon."""
     height, width = 256, 1024
