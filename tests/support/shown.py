@@ -146,17 +146,20 @@ class _Reader:
 
     def _take_commands(self, block: Block) -> None:
         self.printed = None
-        for words in commands(block):
-            if words[0] == "roadproof":
-                self._call(block, [self.python, "-c", READ, *words[1:]])
-            elif words[0] == "make":
-                self._call(block, ["make", "--dry-run", *words[1:]], self.root)
-            if block.mark == "dry run" and " ".join(words[1:]).startswith(HAS_DRY_RUN):
-                self._call(block, [*words, "--dry-run"])
         first = commands(block)[0]
-        if block.mark or first[0] in ("make", "pip"):
+        serves = first[:3] == ["roadproof", "carla", "serve"]
+        is_run = not block.mark and first[0] not in ("make", "pip")
+        for words in commands(block):
+            if words[0] == "make":
+                self._call(block, ["make", "--dry-run", *words[1:]], self.root)
+            elif block.mark == "dry run" and " ".join(words[1:]).startswith(HAS_DRY_RUN):
+                self._call(block, [*words, "--dry-run"])
+            elif words[0] == "roadproof" and (serves or not is_run):
+                # The words of what is run are read there.
+                self._call(block, [self.python, "-c", READ, *words[1:]])
+        if not is_run:
             return
-        if first[:3] == ["roadproof", "carla", "serve"]:
+        if serves:
             self._serve(block, first)
         else:
             self.printed = self._call(block, ["sh", "-ec", self._with_ports(block.text)])
