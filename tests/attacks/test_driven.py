@@ -22,6 +22,11 @@ from runs import driven
 SPACE = SearchSpace(figures=2)
 
 
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    return along_a_street(tmp_path_factory.mktemp("street"))
+
+
 def test_steering_is_summed_over_the_first_four_fifths_as_published():
     scenario = find_scenario("left-03")
     clean = driven(scenario)
@@ -48,8 +53,8 @@ def test_deviation_is_the_one_that_evaluations_report():
 
 
 @pytest.mark.slow
-def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, tmp_path):
-    street, controller = along_a_street(tmp_path), load_controller("pilotnet")
+def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, street, tmp_path):
+    controller = load_controller("pilotnet")
     place = InSimulator(town, street, keep=tmp_path / "driven.json")
     unit = SPACE.random((1, 1), torch.Generator().manual_seed(1))
     first = DrivenMeasure(place, controller, SteeringShift())
@@ -72,8 +77,8 @@ def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, tmp_path):
 
 
 @pytest.mark.slow
-def test_attack_in_a_simulator_finds_the_best_it_drove_over(town, tmp_path):
-    street, controller = along_a_street(tmp_path), load_controller("pilotnet")
+def test_attack_in_a_simulator_finds_the_best_it_drove_over(town, street, tmp_path):
+    controller = load_controller("pilotnet")
     place, method = InSimulator(town, street), CMAES(calls=4)
     found = attack(place, controller, SPACE, method=method, objective=PathDeviation(), seed=3)
     assert found.cost.simulator_calls == 5, "the clean drive, and one for each pattern"
