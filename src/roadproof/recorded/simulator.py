@@ -98,6 +98,9 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         SimulatorError: the vehicle's time step is not the recordings'.
     """
 
+    paint = PaintKind.COMPOSITED
+    """How patterns are put on the road: composited into the pictures."""
+
     def __init__(
         self,
         recordings: RecordingSet,
@@ -119,11 +122,6 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     def recordings(self) -> RecordingSet:
         """The recordings in which it drives."""
         return self._world.recordings
-
-    @property
-    def paint(self) -> PaintKind:
-        """How patterns are put on the road: composited into the pictures."""
-        return PaintKind.COMPOSITED
 
     @cached_property
     def identity(self) -> str:

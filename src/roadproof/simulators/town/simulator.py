@@ -52,6 +52,9 @@ class TownSimulator(RouteSimulator[_Drive]):
             a lens.
     """
 
+    paint = PaintKind.RENDERED
+    """How patterns are put on the road: rendered with the road."""
+
     def __init__(
         self,
         *,
@@ -66,11 +69,6 @@ class TownSimulator(RouteSimulator[_Drive]):
             raise SimulatorError("the town is drawn as a pinhole sees it; give TownSimulator a camera without a lens")
         super().__init__(camera, replace(input, resampling="area"), dt_s)
         self._town: _Town | None = None
-
-    @property
-    def paint(self) -> PaintKind:
-        """How patterns are put on the road: rendered with the road."""
-        return PaintKind.RENDERED
 
     def road_map(self, name: str) -> RoadMap:
         """The map a scenario names; it needs no drive.

@@ -27,9 +27,9 @@ class TrackedSimulator(ABC, Generic[DriveT]):
     """A simulator whose drives are tracked; a subclass opens and closes its world, moves the car and sees.
 
     Args:
-        camera: the camera on the car.
+        camera: the camera on the car; full pictures have its size.
         input: how the controller's frame is cut from the camera picture.
-        dt_s: seconds per step.
+        dt_s: simulated seconds per step.
 
     Raises:
         SimulatorError: the crop leaves the camera picture.
@@ -41,24 +41,9 @@ class TrackedSimulator(ABC, Generic[DriveT]):
                 f"the crop ends at ({input.right_px}, {input.bottom_px}), expected it inside the camera picture of "
                 f"{camera.width_px}×{camera.height_px} pixels"
             )
-        self._camera, self._input, self._dt_s = camera, input, dt_s
+        self.camera, self.input, self.dt_s = camera, input, dt_s
         self._is_open = False
         self._drive: DriveT | None = None
-
-    @property
-    def camera(self) -> CameraModel:
-        """The camera on the car; full pictures have its size."""
-        return self._camera
-
-    @property
-    def input(self) -> CropResize:
-        """How the controller's frame is cut from the camera picture."""
-        return self._input
-
-    @property
-    def dt_s(self) -> float:
-        """Simulated seconds per step."""
-        return self._dt_s
 
     @property
     def state(self) -> VehicleState:
