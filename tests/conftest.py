@@ -55,6 +55,13 @@ def town():
 
 
 @pytest.fixture
+def few_pictures(monkeypatch):
+    """Films and strips of few pictures: drawing them takes most of their time."""
+    monkeypatch.setattr("roadproof.pipeline.film.PICTURE_S", 0.5)
+    monkeypatch.setattr("roadproof.pipeline.film.MOMENTS", 7)
+
+
+@pytest.fixture
 def invoke(monkeypatch, capsys):
     """Calls the installed command, `roadproof WORDS`, in this process; gives exit code and output, `out` and `err`."""
 

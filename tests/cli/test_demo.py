@@ -33,7 +33,7 @@ def demo(invoke):
 
 
 @pytest.mark.slow
-def test_one_command_goes_from_nothing_to_the_report(demo, tmp_path, monkeypatch):
+def test_one_command_goes_from_nothing_to_the_report(demo, few_pictures, tmp_path, monkeypatch):
     needs.town()
     pytest.importorskip("av", reason="av is not installed")
     monkeypatch.setitem(BUDGETS, "quick", TINY)

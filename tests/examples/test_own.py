@@ -29,7 +29,7 @@ def run(name, *arguments, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_controller_of_ones_own_is_stress_tested(tmp_path, monkeypatch, capsys):
+def test_a_controller_of_ones_own_is_stress_tested(few_pictures, tmp_path, monkeypatch, capsys):
     needs.town()
     # The example's own stretch from 20 m before the canvas to 15 m behind it, and its own search, less of it.
     whole = roadproof.find_scenario("straight-04")

@@ -38,7 +38,7 @@ def run(town, folder, **options):
 
 
 @pytest.mark.slow
-def test_the_whole_loop_leaves_every_stage_in_its_folder(town, tmp_path):
+def test_the_whole_loop_leaves_every_stage_in_its_folder(town, few_pictures, tmp_path):
     check_folder(tmp_path / "run", run(town, tmp_path / "run"))
     with pytest.raises(RoadproofError, match="holds a run with seed 0, now it is 1"):
         run(town, tmp_path / "run", seed=1)
