@@ -29,6 +29,7 @@ from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HARDENING_BUDGETS, HardeningBudget
 from roadproof.hardening.tuning import Tuning
+from roadproof.pipeline import film
 from roadproof.pipeline.budget import BUDGETS, Budget
 from roadproof.recordings import save_recordings
 from roadproof.scenarios import Scenario, save_scenarios
@@ -144,6 +145,7 @@ def run(name: str, folder: Path) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     BUDGETS["quick"], HARDENING_BUDGETS["quick"] = TINY, HARDENING
     methods.SHIFT_RUNGS = (Rung(3, 12, every=2),)
+    film.PICTURE_S, film.MOMENTS = 0.5, 7
     # One place for what all runs of a command are given: it is a part of what they leave.
     given = folder.parent / f"given-{name}"
     given.mkdir(exist_ok=True)
