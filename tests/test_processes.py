@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
 from roadproof.errors import ControllerError, TrainingError
 from roadproof.processes import Pool, processes_beside, spread, stopping
@@ -84,6 +85,17 @@ def test_pieces_are_spread_and_nobody_is_left():
 def test_one_process_is_this_one():
     assert dict(spread(squared, [3], nullcontext, processes=4)) == {3: (9, os.getpid())}
     assert not stopping()
+
+
+def threads_of(inside, _):
+    del inside
+    return torch.get_num_threads()
+
+
+def test_no_process_computes_with_more_threads_than_this_one(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    assert dict(spread(threads_of, [1, 2], nullcontext, processes=2)) == {1: 1, 2: 1}
 
 
 def test_what_a_piece_raises_comes_through_and_ends_the_others():

@@ -50,7 +50,8 @@ class Pool(Generic[Inside]):
 
     def __enter__(self) -> Pool[Inside]:
         if self.processes > 1:
-            threads = max(1, (os.cpu_count() or 1) // self.processes)
+            # Never more than here: a controller's last digits depend on how many threads compute them.
+            threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
             self._stop = multiprocessing.get_context("spawn").Event()
             self._beside = self._stack.enter_context(
                 processes_beside(self.processes, _begin_work, self._opens, self._stop, threads)

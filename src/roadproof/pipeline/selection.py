@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -206,21 +207,18 @@ def select_by_driving(
         episodes.put(bare, clean)
     episodes.make(simulator, bare)
 
-    def judged() -> list[Driven]:
-        return [
-            Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, drive))
-            for (rank, candidate), drive in zip(chosen, over, strict=True)
-            if episodes.has(drive)
-        ]
+    @cache
+    def driven_over(place: int) -> Driven:
+        rank, candidate = chosen[place]
+        return Driven(group=candidate.group, rank=rank, trial=episodes.trial(bare, over[place]))
+
+    def tell(done: int) -> None:
+        made = (driven_over(place) for place in range(len(over)) if episodes.has(over[place]))
+        on_drive(1 + done, max((each.effect(by) for each in made), default=0.0))
 
     with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
-        make_missing(
-            driving,
-            episodes,
-            over,
-            lambda done: on_drive(1 + done, max((each.effect(by) for each in judged()), default=0.0)),
-        )
-    driven = judged()
+        make_missing(driving, episodes, over, tell)
+    driven = [driven_over(place) for place in range(len(over))]
     winner = max(range(len(driven)), key=lambda index: driven[index].effect(by))
     selection = Selection(
         pattern=chosen[winner][1].pattern,
