@@ -22,7 +22,7 @@ ifdef RECORDINGS
 	@test -n "$(CONTROLLER)" || { echo "make demo RECORDINGS=... also needs CONTROLLER=..., e.g. CONTROLLER=cil" >&2; exit 2; }
 	$(BIN)/roadproof attack "$(RECORDINGS)" --controller "$(CONTROLLER)" --out "$(OUT)"
 else
-	$(BIN)/roadproof demo --out "$(OUT)"
+	$(BIN)/roadproof demo --processes 0 --out "$(OUT)"
 endif
 
 # A worker that crashes fails the run: restarted under --dist loadfile, it would wait for ever (pytest-xdist 1323).

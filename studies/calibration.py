@@ -26,7 +26,7 @@ import torch
 
 from roadproof.calibration import METHODS, Calibrated, Method, calibrate
 from roadproof.calibration.outline import moved
-from roadproof.calibration.replays import Replays
+from roadproof.calibration.replays import Replays, Target
 from roadproof.calibration.report import Spread, stated_errors_px
 from roadproof.calibration.two_paint import look_at_paints
 from roadproof.compositing import composite, view_canvas
@@ -157,7 +157,7 @@ def judge(
         print(f"  {method}: {time.process_time() - began:.0f} s of one core", flush=True)
     replays = Replays(town, drives, keep)
     painted = {
-        drive.name: [replays.frames(drive, f"pattern-{k}", raster(pattern)) for k, pattern in enumerate(patterns)]
+        drive.name: [replays.look(drive, Target(f"pattern-{k}", raster(pattern))) for k, pattern in enumerate(patterns)]
         for drive in drives.drives
     }
     errors = compare(results, painted, drives, patterns, controller)

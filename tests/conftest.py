@@ -62,6 +62,17 @@ def few_pictures(monkeypatch):
 
 
 @pytest.fixture
+def two_threads():
+    """Threads of torch, whatever the tests have."""
+    import torch
+
+    usual = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(usual)
+
+
+@pytest.fixture
 def invoke(monkeypatch, capsys):
     """Calls the installed command, `roadproof WORDS`, in this process; gives exit code and output, `out` and `err`."""
 

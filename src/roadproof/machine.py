@@ -6,7 +6,8 @@ import ctypes
 import os
 import platform
 import re
-from contextlib import suppress
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # From glibc's malloc.h.
@@ -43,6 +44,19 @@ def sleep_while_waiting() -> None:
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "5000")
+
+
+@contextmanager
+def one_thread() -> Generator[None]:
+    """Let torch compute with one thread here: the last digits of a network's answers depend on how many share them."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def made_with() -> dict[str, object]:

@@ -29,15 +29,6 @@ def network(road):
     return made
 
 
-@pytest.fixture
-def two_threads():
-    """Threads of torch, whatever the tests have."""
-    usual = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(usual)
-
-
 def measured(objective, road, controller, groups=BOTH):
     with known_vehicle():
         return objective.measure(road, controller, groups, device="cpu")

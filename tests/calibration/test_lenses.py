@@ -69,8 +69,8 @@ def test_points_are_straightened_before_the_homography_is_fitted(lens):
         def __init__(self):
             pass
 
-        def look(self, drive, name, paint, see, *, full_pictures=False):
-            five = runs[int(name[-2:]) - 1]
+        def look(self, drive, target):
+            five = runs[int(target.name[-2:]) - 1]
             return camera.distorted(homogeneous(TRUTH, np.broadcast_to(five, (len(TRUTH), 5, 2))))
 
     found, dropped, residuals = homographies_from_points(AllSeen(), Drive.__new__(Drive), camera)

@@ -81,6 +81,21 @@ def test_an_episode_holds_n_observations_and_the_controls_between_them(town):
     assert [command for _, _, command in controller.seen] == episode.command[:-1].tolist()
 
 
+def test_a_controller_is_asked_with_one_thread_and_the_others_come_back(town, two_threads):
+    class Counts(Straight):
+        def act(self, frame, speed_mps, command):
+            self.seen.append(torch.get_num_threads())
+            if len(self.seen) == 3:
+                raise ValueError("enough")
+            return Control(0.0)
+
+    driver = Counts()
+    with pytest.raises(ControllerError, match="enough"):
+        rollout(town, driver, SHORT)
+    assert driver.seen == [1, 1, 1]
+    assert torch.get_num_threads() == 2
+
+
 def test_the_same_seed_gives_the_same_episode_and_another_seed_other_people(town, episode):
     assert same(episode, rollout(town, Straight(0.1), SHORT, weather=Weather.CLOUDY_NOON, seed=7))
 

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
+import torch
 
 from paint_shy import along_a_street
 from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
-from roadproof.calibration import Method
+from roadproof.calibration import CalibrationReport, Method
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window, load_drives
@@ -14,6 +16,7 @@ from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.pipeline.budget import BUDGETS, Budget
 from roadproof.pipeline.fidelity import Fidelity
+from roadproof.pipeline.film import Strip
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stress_test import STAGES, stress_test
 from roadproof.recordings import load_recordings
@@ -38,10 +41,33 @@ def run(town, folder, **options):
 
 
 @pytest.mark.slow
-def test_the_whole_loop_leaves_every_stage_in_its_folder(town, few_pictures, tmp_path):
-    check_folder(tmp_path / "run", run(town, tmp_path / "run"))
+def test_the_whole_loop_leaves_every_stage_in_its_folder_and_two_processes_the_same(
+    town, few_pictures, two_threads, tmp_path
+):
+    from roadproof.simulators.town.simulator import TownSimulator
+
+    folders = tmp_path / "alone", tmp_path / "shared"
+    alone = run(town, folders[0])
+    check_folder(folders[0], alone)
     with pytest.raises(RoadproofError, match="holds a run with seed 0, now it is 1"):
-        run(town, tmp_path / "run", seed=1)
+        run(town, folders[0], seed=1)
+    shared = run(town, folders[1], factory=TownSimulator, processes=2)
+    assert shared.selection.driven == alone.selection.driven
+    assert shared.evaluation.trials == alone.evaluation.trials
+    assert shared.fidelity.agreement == alone.fidelity.agreement
+    calls = [{stage: cost.simulator_calls for stage, cost in each.cost.items()} for each in (alone, shared)]
+    assert calls[0] == calls[1]
+    reports = [CalibrationReport.load(folder / "calibration" / "report.json") for folder in folders]
+    assert (reports[0].drives, reports[0].calls) == (reports[1].drives, reports[1].calls)
+    for one, two in zip(*(load_recordings(folder / "recordings").recordings for folder in folders), strict=True):
+        assert one.name == two.name
+        for name in ("frames", "steer", "image_from_canvas"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+        for name in ("gain", "offset", "visible"):
+            assert torch.equal(getattr(one.maps, name), getattr(two.maps, name))
+    strips = [Strip.load(folder / "evaluation" / "strip.npz") for folder in folders]
+    np.testing.assert_array_equal(strips[0].clean, strips[1].clean)
+    np.testing.assert_array_equal(strips[0].painted, strips[1].painted)
 
 
 def check_folder(folder, result):

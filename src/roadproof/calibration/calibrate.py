@@ -11,10 +11,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.calibration.published import PAINTS, RUNS, colours_from_paints, homographies_from_points
-from roadproof.calibration.replays import Replays, drive_digest
+from roadproof.calibration.published import (
+    colour_targets,
+    colours_from_paints,
+    homographies_from_points,
+    point_targets,
+)
+from roadproof.calibration.replays import Replays, Wanted, drive_digest, replay_in
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
-from roadproof.calibration.two_paint import Paints, look_at_paints, replay_in
+from roadproof.calibration.two_paint import TARGETS, Paints, look_at_paints
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
@@ -123,8 +128,18 @@ class _Geometry:
 
 def replays_needed(drives: Drives, method: Method) -> int:
     """Number of replays in the simulator that a calibration takes on top of the recorded drives."""
-    count = len(drives.drives)
-    return RUNS * count + len(PAINTS) if method is Method.PUBLISHED else 2 * count
+    return len(_wanted(drives, method))
+
+
+def _wanted(drives: Drives, method: Method) -> list[Wanted]:
+    """The replays of a calibration."""
+    if method is not Method.PUBLISHED:
+        return [(drive, target) for drive in drives.drives for target in TARGETS]
+    points, clean = point_targets(), drives.drives[0]
+    return [
+        *((drive, target) for drive in drives.drives for target in points),
+        *((clean, target) for target in colour_targets()),
+    ]
 
 
 def calibrate(
@@ -143,7 +158,7 @@ def calibrate(
         drives: what `drives.record` made.
         method: calibration method, two-paint by default.
         folder: folder that keeps every replay; those it holds already are not driven again. None keeps nothing.
-        pool: processes that are open already and make the replays over two paints, where a folder keeps them.
+        pool: processes that are open already and make the replays, where a folder keeps them.
         on_call: called with the number of replays so far, at first 0.
 
     Raises:
@@ -160,8 +175,8 @@ def calibrate(
         )
     on_call(0)
     began = time.perf_counter()
-    if pool is not None and pool.processes > 1 and folder is not None and method is not Method.PUBLISHED:
-        replay_in(pool, drives, folder, on_call)
+    if pool is not None and pool.processes > 1 and folder is not None:
+        replay_in(pool, drives, folder, _wanted(drives, method), on_call)
         replays = Replays(simulator, drives, folder)
     else:
         replays = Replays(simulator, drives, folder, on_call)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from roadproof.calibration.replays import Replays, uniform
+from roadproof.calibration.replays import Replays, Target, uniform
 from roadproof.datatypes import Observation
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError, ColourError, GeometryError
@@ -76,6 +76,25 @@ def detect_points(picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "5 2
     return found
 
 
+def point_targets() -> list[Target]:
+    """What every drive is replayed over for its homographies: the canvas with five points at a time."""
+    runs = calibration_points().reshape(RUNS, len(COLOURS), 2)
+    return [
+        Target(f"points-{k:02d}", points_target(five), _points_seen, full_pictures=True)
+        for k, five in enumerate(runs, 1)
+    ]
+
+
+def colour_targets() -> list[Target]:
+    """What the clean drive is replayed over for its colours: the canvas in one colour at a time."""
+    return [Target(f"colour-{k:02d}", uniform(*paint)) for k, paint in enumerate(PAINTS, 1)]
+
+
+def _points_seen(seen: Observation) -> Float[np.ndarray, "5 2"]:
+    assert seen.picture is not None
+    return detect_points(seen.picture)
+
+
 def homographies_from_points(
     replays: Replays, drive: Drive, camera: CameraModel
 ) -> tuple[dict[int, Homography], dict[int, str], Float[np.ndarray, " n"]]:
@@ -90,19 +109,7 @@ def homographies_from_points(
         CalibrationError: a replay goes astray.
     """
     points = calibration_points()
-    runs = points.reshape(RUNS, len(COLOURS), 2)
-
-    def see(seen: Observation) -> Float[np.ndarray, "5 2"]:
-        assert seen.picture is not None
-        return detect_points(seen.picture)
-
-    seen = np.concatenate(
-        [
-            replays.look(drive, f"points-{k + 1:02d}", points_target(five), see, full_pictures=True)
-            for k, five in enumerate(runs)
-        ],
-        axis=1,
-    )
+    seen = np.concatenate([replays.look(drive, target) for target in point_targets()], axis=1)
     found: dict[int, Homography] = {}
     dropped: dict[int, str] = {}
     residuals: list[Float[np.ndarray, " n"]] = []
@@ -139,7 +146,7 @@ def colours_from_paints(
     inner = {k: mask for k, mask in inner.items() if mask.any()}
     if not inner:
         raise CalibrationError("no frame of the clean drive shows the inside of the canvas; record nearer to it")
-    looks = [replays.frames(clean, f"colour-{k + 1:02d}", uniform(*paint)) for k, paint in enumerate(PAINTS)]
+    looks = [replays.look(clean, target) for target in colour_targets()]
     seen = [[look[k][mask].mean(0) for k, mask in inner.items()] for look in looks]
     painted = torch.tensor(PAINTS, dtype=torch.float64).repeat_interleave(len(inner), 0) / 255
     measured = torch.tensor(np.array(seen).reshape(-1, 3)) / 255

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import UInt8
@@ -19,9 +21,32 @@ from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.homographies import Homographies
 from roadproof.io.arrays import read_record, write_archive
+from roadproof.processes import Pool
 from roadproof.simulators.protocol import PatternImage, Simulator
 
 ASTRAY_M, ASTRAY_RAD = 0.02, 0.003
+
+
+def frame_of(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
+    """The frame that the controller would get."""
+    return seen.frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """What a drive is replayed over, and what is kept of it. It travels between processes.
+
+    Args:
+        name: name of what is painted and seen, for the file that keeps the result.
+        paint: picture of the paint on the canvas.
+        see: function of a module that is called with the observation of each kept frame; the frame itself by default.
+        full_pictures: whether `see` needs full camera pictures.
+    """
+
+    name: str
+    paint: PatternImage
+    see: Callable[[Observation], np.ndarray] = frame_of
+    full_pictures: bool = False
 
 
 class Replays:
@@ -50,45 +75,21 @@ class Replays:
         """The homographies the simulator itself states, for reports alone; None before the first replay of a drive."""
         return self._stated.get(drive.name)
 
-    def frames(self, drive: Drive, name: str, paint: PatternImage) -> UInt8[np.ndarray, "f h w 3"]:
-        """The kept frames of a drive as they look with paint on the canvas.
+    def look(self, drive: Drive, target: Target) -> np.ndarray:
+        """What is kept of each kept frame of a drive with a target on the canvas, stacked.
 
         Args:
             drive: the drive to replay, one of the drives.
-            name: name of the paint, for the file that keeps the frames.
-            paint: picture of the paint on the canvas.
+            target: what it is replayed over.
 
         Raises:
             CalibrationError: the replay goes another way than the drive.
         """
-        return self.look(drive, name, paint, lambda seen: seen.frame)
-
-    def look(
-        self,
-        drive: Drive,
-        name: str,
-        paint: PatternImage,
-        see: Callable[[Observation], np.ndarray],
-        *,
-        full_pictures: bool = False,
-    ) -> np.ndarray:
-        """What `see` makes of each kept frame of a drive with paint on the canvas, stacked.
-
-        Args:
-            drive: the drive to replay, one of the drives.
-            name: name of what is painted and seen, for the file that keeps the result.
-            paint: picture of the paint on the canvas.
-            see: function that is called with the observation of each kept frame.
-            full_pictures: whether `see` needs full camera pictures.
-
-        Raises:
-            CalibrationError: the replay goes another way than the drive.
-        """
-        path = None if self._folder is None else self._folder / f"{drive.name}-{name}.npz"
-        digest = _digest(self._drives, drive, paint)
+        path = None if self._folder is None else self._folder / f"{drive.name}-{target.name}.npz"
+        digest = _digest(self._drives, drive, target.paint)
         kept = None if path is None else _read(path, digest)
         if kept is None:
-            kept = self._drive_again(drive, paint, see, full_pictures)
+            kept = self._drive_again(drive, target)
             if path is not None:
                 write_archive(path, kept, {"of": digest})
         self.calls += 1
@@ -97,9 +98,7 @@ class Replays:
         self._on_call(self.calls)
         return kept["seen"]
 
-    def _drive_again(
-        self, drive: Drive, paint: PatternImage, see: Callable[[Observation], np.ndarray], full_pictures: bool
-    ) -> dict[str, np.ndarray]:
+    def _drive_again(self, drive: Drive, target: Target) -> dict[str, np.ndarray]:
         wanted = dict(zip(drive.frame_number.tolist(), drive.states, strict=True))
         seen_there: list[np.ndarray] = []
         stated: list[np.ndarray] = []
@@ -109,7 +108,7 @@ class Replays:
             nonlocal step
             if step in wanted:
                 _check_same_way(drive.name, step, seen.state, wanted[step])
-                seen_there.append(see(seen))
+                seen_there.append(target.see(seen))
                 stated.append(self._simulator.image_from_canvas())
             step += 1
 
@@ -118,9 +117,9 @@ class Replays:
             self._simulator,
             drive.episode,
             settings.scenario,
-            pattern=paint,
+            pattern=target.paint,
             steps=last + 1,
-            full_pictures=frozenset(wanted) if full_pictures else False,
+            full_pictures=frozenset(wanted) if target.full_pictures else False,
             on_step=keep,
         )
         if len(seen_there) != len(wanted):
@@ -129,6 +128,37 @@ class Replays:
             )
         seconds = time.perf_counter() - began
         return {"seen": np.stack(seen_there), "stated": np.stack(stated), "seconds": np.array(seconds)}
+
+
+Wanted: TypeAlias = tuple[Drive, Target]
+"""One replay: a drive, and what it is replayed over."""
+
+
+def replay_in(
+    pool: Pool[Simulator], drives: Drives, folder: Path, wanted: Sequence[Wanted], on_call: Callable[[int], object]
+) -> None:
+    """Make replays in other processes; a folder keeps them.
+
+    Args:
+        pool: the processes.
+        drives: the recorded drives.
+        folder: folder that gets the replays; what it holds is not driven again.
+        wanted: the replays.
+        on_call: called with the number of replays so far.
+
+    Raises:
+        CalibrationError: a replay goes astray.
+        SimulatorError: a process died.
+    """
+    work = [(drive.name, target) for drive, target in wanted]
+    for done, _ in enumerate(pool.each(partial(_replay, drives, folder), work), 1):
+        on_call(done)
+
+
+def _replay(drives: Drives, folder: Path, simulator: Simulator, wanted: tuple[str, Target]) -> None:
+    name, target = wanted
+    drive = next(each for each in drives.drives if each.name == name)
+    Replays(simulator, drives, folder).look(drive, target)
 
 
 def uniform(red: int, green: int, blue: int) -> PatternImage:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from roadproof.calibration.outline import GREY, SQUARES, fit_outline, outline_errors_px, predicted_contrast
-from roadproof.calibration.replays import Replays, uniform
-from roadproof.drives import Drive, Drives
+from roadproof.calibration.replays import Replays, Target, uniform
+from roadproof.drives import Drive
 from roadproof.errors import CalibrationError, ColourError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
-from roadproof.processes import Pool
-from roadproof.simulators.protocol import PatternImage, Simulator
+from roadproof.simulators.protocol import PatternImage
 
 LEAST_PX = 20
 
@@ -49,32 +45,7 @@ def dark_target() -> PatternImage:
     return target
 
 
-TARGETS = {"light": uniform(255, 255, 255), "dark": dark_target()}
-"""The two paints by the names that kept replays have."""
-
-
-def replay_in(pool: Pool[Simulator], drives: Drives, folder: Path, on_call: Callable[[int], object]) -> None:
-    """Make all replays in other processes; a folder keeps them.
-
-    Args:
-        pool: the processes.
-        drives: the recorded drives.
-        folder: folder that gets the replays; what it holds is not driven again.
-        on_call: called with the number of replays so far.
-
-    Raises:
-        CalibrationError: a replay goes astray.
-        SimulatorError: a process died.
-    """
-    wanted = [(drive.name, paint) for drive in drives.drives for paint in TARGETS]
-    for done, _ in enumerate(pool.each(partial(_replay, drives, folder), wanted), 1):
-        on_call(done)
-
-
-def _replay(drives: Drives, folder: Path, simulator: Simulator, wanted: tuple[str, str]) -> None:
-    name, paint = wanted
-    drive = next(each for each in drives.drives if each.name == name)
-    Replays(simulator, drives, folder).frames(drive, paint, TARGETS[paint])
+TARGETS = Target("light", uniform(255, 255, 255)), Target("dark", dark_target())
 
 
 def look_at_paints(
@@ -93,7 +64,7 @@ def look_at_paints(
     Raises:
         CalibrationError: the two paints look alike or saturate, or a replay goes astray.
     """
-    light, dark = (replays.frames(drive, name, target) for name, target in TARGETS.items())
+    light, dark = (replays.look(drive, target) for target in TARGETS)
     difference = light.astype(np.float64) - dark
     contrast = difference.mean(-1) / 255
     if refine:

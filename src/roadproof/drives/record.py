@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -20,10 +22,12 @@ from roadproof.drives.folder import Drive, Drives, Settings, forget_settings, re
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
 from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
 from roadproof.driving.episode import Episode
+from roadproof.driving.evaluate import drivers
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.io.files import AnyPath, as_path
+from roadproof.processes import Pool
 from roadproof.recordings import Side, evenly
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
@@ -45,6 +49,7 @@ def record(
     seed: int = 0,
     driver_name: str = "",
     folder: AnyPath | None = None,
+    pool: Pool[SimulatorT] | None = None,
     on_drive: Callable[[int], object] = lambda _done: None,
 ) -> Drives:
     """Record a driver past a bare canvas: one clean drive, and perturbed drives.
@@ -62,6 +67,7 @@ def record(
         seed: seed of the perturbations.
         driver_name: name of the driver in words, for the record; empty by default.
         folder: folder that keeps every finished drive; those it holds already are not driven again. None keeps nothing.
+        pool: processes that are open already and make the perturbed drives instead; the driver must be picklable.
         on_drive: called with the number of finished drives, at first 0.
 
     Raises:
@@ -84,27 +90,31 @@ def record(
         dt_s=simulator.dt_s,
     )
     began = folder is not None and write_settings(settings, folder)
-    drives: list[Drive] = []
-    for done, plan in enumerate(settings.trajectories.plans()):
-        on_drive(done)
-        drive = None if folder is None else read_drive(plan.name, folder)
-        if drive is None:
-            try:
-                drive = (
-                    _perturbed(simulator, driver, settings, plan, drives[0])
-                    if drives
-                    else _clean(simulator, driver, settings)
-                )
-            except RoadproofError:
-                if began and not drives and folder is not None:
-                    # A scenario that the simulator refuses can be mended, and recorded here.
-                    forget_settings(folder)
-                raise
-            if folder is not None:
-                write_drive(drive, folder)
-        drives.append(drive)
-    on_drive(len(drives))
-    return Drives(settings=settings, drives=tuple(drives))
+    plans, done = settings.trajectories.plans(), dict[str, Drive]()
+
+    def keep(drive: Drive, *, made: bool) -> None:
+        if made and folder is not None:
+            write_drive(drive, folder)
+        done[drive.name] = drive
+        on_drive(len(done))
+
+    on_drive(0)
+    for plan in plans:
+        if folder is not None and (kept := read_drive(plan.name, folder)) is not None:
+            keep(kept, made=False)
+    if plans[0].name not in done:
+        try:
+            keep(_clean(simulator, driver, settings), made=True)
+        except RoadproofError:
+            if began and folder is not None:
+                # A scenario that the simulator refuses can be mended, and recorded here.
+                forget_settings(folder)
+            raise
+    astray = partial(_perturbed, driver, settings, done[plans[0].name])
+    with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
+        for _, drive in driving.each(astray, [plan for plan in plans if plan.name not in done]):
+            keep(drive, made=True)
+    return Drives(settings=settings, drives=tuple(done[plan.name] for plan in plans))
 
 
 def record_along(
@@ -194,7 +204,7 @@ def _clean(simulator: SimulatorT, driver: Controller | Driver[SimulatorT], setti
 
 
 def _perturbed(
-    simulator: SimulatorT, driver: Controller | Driver[SimulatorT], settings: Settings, plan: Plan, clean: Drive
+    driver: Controller | Driver[SimulatorT], settings: Settings, clean: Drive, simulator: SimulatorT, plan: Plan
 ) -> Drive:
     path, harm = CleanPath.of(clean.episode), ""
     for tried in range(TRIES):

@@ -17,11 +17,12 @@ import torch
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
 from roadproof.driving.evaluation import ATTACK, Evaluation
+from roadproof.driving.rollout import SimulatorT
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import Pool, require_picklable
+from roadproof.processes import Opens, Pool, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
@@ -159,7 +160,7 @@ def _planned(
     return pairs
 
 
-def drivers(world: Simulator, factory: SimulatorFactory | None, processes: int) -> Pool[Simulator]:
+def drivers(world: SimulatorT, factory: Opens[SimulatorT] | None, processes: int) -> Pool[SimulatorT]:
     """Processes that drive, each in a simulator of its own; one process drives in the open one.
 
     Args:

@@ -19,6 +19,7 @@ from roadproof.controllers.asking import act_after_of, act_of, frame_size_of
 from roadproof.datatypes import Control, Ending, Observation, Weather
 from roadproof.driving.episode import GIVEN, SEEN, Episode
 from roadproof.errors import ControllerError
+from roadproof.machine import one_thread
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Pictures, Simulator
@@ -82,18 +83,20 @@ def rollout(
         seed=seed,
         full_pictures=full_pictures,
     )
-    policy = policy_of(driver, simulator)
     rows, controls, events = [_row(seen)], list[Control](), list(seen.events)
-    while not (stopped := until is not None and until(seen)) and not seen.done:
-        control = policy(seen)
-        if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # drivers are the user's
-            raise ControllerError(f"the driver answered {control!r}, expected a roadproof.datatypes.Control")
-        controls.append(control.clipped())
-        if on_step is not None:
-            on_step(seen, controls[-1])
-        seen = simulator.step(controls[-1])
-        rows.append(_row(seen))
-        events += seen.events
+    # A drive is the same in a process that shares the cores with others.
+    with one_thread():
+        policy = policy_of(driver, simulator)
+        while not (stopped := until is not None and until(seen)) and not seen.done:
+            control = policy(seen)
+            if not isinstance(control, Control):  # pyright: ignore[reportUnnecessaryIsInstance]  # drivers are the user's
+                raise ControllerError(f"the driver answered {control!r}, expected a roadproof.datatypes.Control")
+            controls.append(control.clipped())
+            if on_step is not None:
+                on_step(seen, controls[-1])
+            seen = simulator.step(controls[-1])
+            rows.append(_row(seen))
+            events += seen.events
     if on_step is not None:
         on_step(seen, None)
     late = seen.time_s >= scenario.time_limit_s - 0.5 * simulator.dt_s

@@ -171,7 +171,7 @@ def of_run(budget: Budget, controller: Controller, *, film: bool = True, process
     frames = budget.window.frames * (1 + count // 2) * weathers
     searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
     recorded = RECORDED_DRIVE.times(weathers * count)
-    calibrated = RECORDED_DRIVE.times(weathers * replays, at_once=1 if published else processes)
+    calibrated = RECORDED_DRIVE.times(weathers * replays, at_once=processes)
     chosen = of_drives(budget.select + budget.rounds * (1 + budget.select))
     judged = of_evaluation(len(budget.weathers), budget.starts, budget.runs, film=film, processes=processes)
     return searched + recorded + calibrated + chosen + judged

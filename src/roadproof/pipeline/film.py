@@ -5,10 +5,11 @@ from __future__ import annotations
 import io
 import itertools
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import cast
+from typing import TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -18,12 +19,14 @@ from roadproof.datatypes import Control, Observation
 from roadproof.driving.deviation import lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
+from roadproof.driving.evaluate import drivers
 from roadproof.driving.rollout import drive_again
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import write_atomically
 from roadproof.io.records import RecordFile, Saved
 from roadproof.io.video import can_film, film_file
+from roadproof.processes import Pool
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -101,7 +104,13 @@ class _Side:
 
 
 def film_drives(
-    simulator: Simulator, start: Scenario, files: tuple[str, str], paint: PatternImage, folder: Path
+    simulator: Simulator,
+    start: Scenario,
+    files: tuple[str, str],
+    paint: PatternImage,
+    folder: Path,
+    *,
+    pool: Pool[Simulator] | None = None,
 ) -> bool:
     """Drive two judged drives again, with the camera's full pictures, and keep film, poster and strip.
 
@@ -113,6 +122,7 @@ def film_drives(
         files: the names of the files of the drive without paint and of the one with it.
         paint: picture of the canvas as it was painted.
         folder: the folder of those files, which gets film.mp4, film.jpg and strip.npz.
+        pool: processes that are open already and drive instead.
 
     Returns:
         Whether there is a film; without PyAV (extra `video`) there are poster and strip alone.
@@ -124,10 +134,13 @@ def film_drives(
     predicted = ", predicted" if painted.paint.predicted else ""
     last = min(len(clean), len(painted)) - 1
     steps = sorted(set(passage_steps(clean, painted, start.canvas, MOMENTS)))
-    sides = (
-        _filmed(f"without paint{predicted}", CLEAN, simulator, start, clean, None, steps),
-        _filmed(f"with paint{predicted}", PAINTED, simulator, start, painted, paint, steps),
-    )
+    takes: list[_Take] = [
+        (f"without paint{predicted}", CLEAN, clean, None),
+        (f"with paint{predicted}", PAINTED, painted, paint),
+    ]
+    with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
+        taken = {side.colour: side for _, side in driving.each(partial(_filmed, start, steps), takes)}
+    sides = taken[CLEAN], taken[PAINTED]
     beside_m = lateral_m(path_of(clean), path_of(painted))
     each = sides[0].each
     bare, driven = (
@@ -155,19 +168,16 @@ def passage_steps(clean: Episode, painted: Episode, canvas: CanvasPlacement, cou
     return [round(first + (end - first) * k / (count - 1)) for k in range(count)]
 
 
-def _filmed(
-    title: str,
-    colour: tuple[int, int, int],
-    simulator: Simulator,
-    start: Scenario,
-    episode: Episode,
-    paint: PatternImage | None,
-    strip: Sequence[int],
-) -> _Side:
+_Take: TypeAlias = tuple[str, tuple[int, int, int], Episode, PatternImage | None]
+"""What is to be filmed: a title, its colour, the drive and its paint."""
+
+
+def _filmed(start: Scenario, strip: Sequence[int], simulator: Simulator, take: _Take) -> _Side:
     """A drive again, with the camera's pictures at the film's steps and at those of the strip.
 
     A car that stands for good, at a rail until its time is up, say, is shown for a moment only.
     """
+    title, colour, episode, paint = take
     kept: dict[int, bytes] = {}
     moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
     enough = min(int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s), len(episode)) if moving.size else 1

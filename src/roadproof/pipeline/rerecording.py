@@ -28,6 +28,7 @@ from roadproof.drives import Drives, record_along
 from roadproof.driving.episode import Episode
 from roadproof.errors import CalibrationError, RecordingError
 from roadproof.pipeline.selection import Selection, select_by_driving
+from roadproof.processes import Pool
 from roadproof.recordings import Recording, RecordingSet
 from roadproof.simulators.protocol import Simulator
 
@@ -87,6 +88,7 @@ def search_on(
     method: Calibration,
     folder: Path,
     device: torch.device | str = "cpu",
+    pool: Pool[Simulator] | None = None,
     on_step: Callable[[int, int, str], object] = lambda _done, _total, _word: None,
 ) -> Rounds:
     """Search on for some rounds, each with the recording of one more drive.
@@ -108,6 +110,7 @@ def search_on(
         method: calibration method for the recorded drives.
         folder: path of the run folder; what it holds is not done again.
         device: torch device on which the search computes.
+        pool: processes that are open already and make the replays and the drives over candidates instead.
         on_step: called with the number of steps done, the number of all steps, and a word on the current one.
 
     Raises:
@@ -127,7 +130,7 @@ def search_on(
         tell(0, "recording")
         bare, driven = last.episodes(drives_of_last)
         try:
-            added, calls = _recorded(simulator, controller, clean, driven, method, place)
+            added, calls = _recorded(simulator, controller, clean, driven, method, place, pool)
         except (CalibrationError, RecordingError) as error:
             return Rounds(first=selection, done=tuple(done), stopped=f"round {number}: {error}")
         recordings = replace(recordings, recordings=(*recordings.recordings, added))
@@ -155,6 +158,7 @@ def search_on(
             weather=drives.settings.weather,
             folder=place / "selection",
             clean=bare,
+            pool=pool,
             on_drive=lambda n, far, tell=tell: tell(steps + n - 1, f"{far:.2f} m"),
         )
         done.append(Round(attack=again, selection=chosen, simulator_calls=calls + chosen.simulator_calls))
@@ -171,7 +175,13 @@ def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Cand
 
 
 def _recorded(
-    simulator: Simulator, controller: Controller, clean: Drives, last: Episode, method: Calibration, place: Path
+    simulator: Simulator,
+    controller: Controller,
+    clean: Drives,
+    last: Episode,
+    method: Calibration,
+    place: Path,
+    pool: Pool[Simulator] | None,
 ) -> tuple[Recording, int]:
     """The recording of the last pattern's path, without paint and calibrated, and the number of drives it took."""
     drive = record_along(simulator, controller, clean, last, name=place.name, folder=place)
@@ -179,7 +189,7 @@ def _recorded(
     calibrated = Calibrated.kept(place, both, method)
     if calibrated is None:
         # The clean drive's replays lie there already and are not driven again.
-        calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration")
+        calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration", pool=pool)
         calibrated.save(place)
     calls = drive.calls + replays_needed(both, method) - replays_needed(clean, method)
     return calibrated.recordings.recordings[1], calls

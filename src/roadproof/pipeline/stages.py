@@ -89,6 +89,7 @@ class Stages:
             seed=self.seed,
             driver_name=self.controller_name,
             folder=self._folder_of(number) / "record",
+            pool=self.pool,
             on_drive=lambda done: self.on_progress("Recording", number * wanted.count + done, total, ""),
         )
 
@@ -178,6 +179,7 @@ class Stages:
             method=self.budget.calibration,
             folder=self.folder,
             device=self.device,
+            pool=self.pool,
             on_step=lambda done, total, word: self.on_progress("Searching on", done, total, word),
         )
 
@@ -263,7 +265,7 @@ class Stages:
         """Film two drives and compare composites with renders, for the report."""
         folder, shown = self.folder / "evaluation", evaluation.shown()
         start = shown.start.of(evaluation.scenario)
-        film_drives(self.simulator, start, (shown.clean, shown.painted), raster(pattern), folder)
+        film_drives(self.simulator, start, (shown.clean, shown.painted), raster(pattern), folder, pool=self.pool)
         try:
             return measure_fidelity(
                 self.simulator,

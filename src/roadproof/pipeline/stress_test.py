@@ -120,8 +120,7 @@ def stress_test(
         controller_name: name of the controller in reports.
         device: torch device on which the search computes, "cpu" or "cuda:0".
         factory: opens one more simulator of the same kind; needed for several processes.
-        processes: how many replays of the calibration, drives over candidates and drives of the evaluation are made at
-            once; the controller must be picklable for several.
+        processes: how many drives are made at once; the controller must be picklable for several.
         film: whether to film the two drives that the report shows, and to render the recorded frames over the paint,
             which takes three drives more.
         cheapest_m: the deviation, in metres, for which the least paint is looked for and driven over once; None for
