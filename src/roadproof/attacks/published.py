@@ -131,12 +131,10 @@ class PublishedMeasure:
             ends = point.repeat(2 * count, 1, 1)
             for j in range(count):
                 ends[2 * j, k, j], ends[2 * j + 1, k, j] = low[j] / spans[j], (low[j] + self.grid) / spans[j]
-            both = view.masks(space.pattern(ends).boxes[:, k]).view(count, 2, -1)
-            for j, pair in enumerate(both):
-                # Elsewhere the two renderings are the same.
-                changed = (pair[0] != pair[1]).nonzero()[:, 0]
+            # Elsewhere the two renderings are the same.
+            for j, (changed, pair) in enumerate(view.changes(space.pattern(ends).boxes[:, k].view(count, 2, 5))):
                 moved = masks[:, changed].repeat(2, 1, 1)
-                moved[:, k] = pair[:, changed]
+                moved[:, k] = pair
                 below, above = view.pixels(visibilities(moved), colours, changed)
                 gradients[k, j] = ((above - below) * on_pixels[changed]).sum() / self.grid * spans[j]
         return gradients

@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -26,6 +27,9 @@ from roadproof.homographies import Homographies
 from roadproof.photometry import ColourTransform
 
 _OFF_CANVAS = CANVAS_SIZE_PX**2
+
+Change: TypeAlias = tuple[Int[Tensor, " q"], Float[Tensor, "2 q"]]
+"""Some of the canvas' pixels, and two masks there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +50,14 @@ class BinaryView:
 
     def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
         """1 for each pixel whose canvas pixel the rectangle covers, 0 for the others."""
-        return canvas_mask(boxes).to(self.frames.dtype).flatten(-2)[..., self.lookup]
+        return canvas_mask(boxes).flatten(-2)[..., self.lookup].to(self.frames.dtype)
+
+    def changes(self, pairs: Float[Tensor, "n 2 5"]) -> Iterator[Change]:
+        """For each pair of rectangles, the pixels in which their masks differ, and both masks there."""
+        canvas = canvas_mask(pairs).flatten(-2)
+        for both, differ in zip(canvas, (canvas[:, 0] ^ canvas[:, 1])[:, self.lookup], strict=True):
+            changed = differ.nonzero()[:, 0]
+            yield changed, both[:, self.lookup[changed]].to(self.frames.dtype)
 
     def pixels(
         self, visibility: Float[Tensor, "*b k q"], colours: Float[Tensor, "k 3"], among: Int[Tensor, " q"] | None = None
@@ -82,6 +93,12 @@ class AntialiasedView:
     def masks(self, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b p"]:
         """The share of each pixel that a rectangle covers, antialiased."""
         return coverage(Shape.RECTANGLE, boxes[..., None, :], self.view.footprints)[..., 0, :]
+
+    def changes(self, pairs: Float[Tensor, "n 2 5"]) -> Iterator[Change]:
+        """For each pair of rectangles, the pixels in which their masks differ, and both masks there."""
+        for both in self.masks(pairs):
+            changed = (both[0] != both[1]).nonzero()[:, 0]
+            yield changed, both[:, changed]
 
     def pixels(
         self, visibility: Float[Tensor, "*b k q"], colours: Float[Tensor, "k 3"], among: Int[Tensor, " q"] | None = None
@@ -143,8 +160,13 @@ def pasted(view: MaskedView, pixels: Float[Tensor, "p 3"]) -> Float[Tensor, "f h
 
 def canvas_mask(boxes: Float[Tensor, "*b 5"]) -> Tensor:
     """Which canvas pixels a rectangle paints: corners cut to integers, edges included, (*b, 400, 400) of bool."""
-    corners = polygon_vertices(Shape.RECTANGLE, boxes).trunc()[..., None, None, :, :]
+    corners = polygon_vertices(Shape.RECTANGLE, boxes).trunc()
     line = torch.arange(CANVAS_SIZE_PX, device=boxes.device, dtype=boxes.dtype)
-    x, y = line[:, None], line[:, None, None]
     edges = corners.roll(-1, -2) - corners
-    return (edges[..., 0] * (y - corners[..., 1]) - edges[..., 1] * (x - corners[..., 0]) >= 0).all(-1)
+    # Whole numbers below 2²⁴: each side is exact, so comparing them is comparing their difference with 0.
+    down = edges[..., 0, None] * (line - corners[..., 1, None])
+    along = edges[..., 1, None] * (line - corners[..., 0, None])
+    inside = down[..., 0, :, None] >= along[..., 0, None, :]
+    for edge in range(1, corners.shape[-2]):
+        inside &= down[..., edge, :, None] >= along[..., edge, None, :]
+    return inside
