@@ -1,11 +1,14 @@
 """Numbers out of range are refused in one line, before any work, with the range in the line and in the help."""
 
+import re
+
 import pytest
 from rich.markup import render
 from typer.main import get_command
 
 from command import roadproof
 from roadproof.cli import app
+from roadproof.cli.group import SEVERAL
 
 ATTACK = ("attack", "nowhere", "--controller", "pilotnet")
 EVALUATE = ("evaluate", "nowhere.json", "--controller", "pilotnet")
@@ -49,15 +52,23 @@ def every_verb():
     return list(verbs(get_command(app), ()))
 
 
-def test_the_help_states_ranges_and_defaults_and_no_type_beside_flags(invoke, monkeypatch):
+def test_the_help_states_ranges_and_defaults_and_plain_types(invoke, monkeypatch):
     monkeypatch.setenv("COLUMNS", "250")
     for words in ((), *(words for words, _ in every_verb())):
         code, printed = invoke(*words, "--help")
         assert code == 0
         assert "<bool>" not in printed.out
+        # Neither `<float,float>...` nor `<list[str]>`: several values are named.
+        assert re.findall(r"<\w*[^\w>][^>]*>", printed.out) == []
         if words == ("attack",):
             assert "[1 to 64] [default: 5]" in printed.out
             assert "[default: (100; 32 for a deviation or a speed)]" in printed.out
+            assert "DARKEST BRIGHTEST" in printed.out
+
+
+def test_what_an_option_of_several_values_takes_is_named():
+    several = {option.name for _, options in every_verb() for option in options if option.nargs > 1 or option.multiple}
+    assert several == set(SEVERAL)
 
 
 def test_the_help_is_shown_as_it_is_written():

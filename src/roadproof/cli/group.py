@@ -1,4 +1,4 @@
-"""Verbs and groups of verbs whose help names no type beside what takes no value, and which know the words given."""
+"""Verbs and groups of verbs whose help says in words what an option takes, and which know the words given."""
 
 from __future__ import annotations
 
@@ -6,6 +6,16 @@ from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+SEVERAL = {
+    "albedo": "DARKEST BRIGHTEST",
+    "contrast": "LEAST MOST",
+    "deviation_m": "METRES",
+    "map_file": "FILE",
+    "noise_deg": "LEAST MOST",
+    "start_range": "METRES RADIANS M/S",
+}
+"""What stands in the help for the values of an option that takes several."""
 
 _words: tuple[str, ...] = ()  # one command a process
 
@@ -19,6 +29,11 @@ def _plain(options: list[Any]) -> list[Any]:
     for option in options:
         if getattr(option, "is_flag", False):
             option.metavar = ""
+        elif option.name in SEVERAL:
+            option.metavar = SEVERAL[option.name]
+        elif option.param_type_name == "argument" and option.nargs < 0:
+            # The dots behind its name say that it may be given several times.
+            option.display_type_rich = lambda **_: None
     return options
 
 
