@@ -68,6 +68,8 @@ def test_every_tutorial_is_linked_from_the_first_page_and_the_index():
         ("<!-- not run: long -->\n```sh\nroadproof demo --figure 3\n```", "No such option.*--figure"),
         ("<!-- not run: long -->\n```sh\nroadproof study walk\n```", "no command walk"),
         ("<!-- dry run: long -->\n```sh\nroadproof demo --scenario left-99\n```", "left-99"),
+        ("<!-- dry run: long -->\n```sh\nroadproof record left-99\n```", "left-99"),
+        ("<!-- dry run: long -->\n```sh\nroadproof study run no.toml\n```", "no.toml"),
         ("<!-- not run: long -->\n```python\nimport import\n```", "invalid syntax"),
         ("```python\nimport roadproof\nroadproof.nothing\n```", "no attribute 'nothing'"),
     ],

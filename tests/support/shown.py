@@ -29,7 +29,7 @@ from pathlib import Path
 
 LIMIT_S = 900.0
 MARK = re.compile(r"<!-- (file|dry run|not run): (.+) -->")
-# Reads the words of one command as the command line does, without doing anything.
+# Reads the words of one command as the command line does, without doing anything, and prints what options it has.
 READ = """
 import sys, typer
 from roadproof.cli import app
@@ -42,8 +42,8 @@ try:
 except Exception as error:
     if getattr(error, "exit_code", 1):  # 0: it only asked for the version or for help
         sys.exit(getattr(error, "message", str(error)))
+print(*(name for option in command.params for name in option.opts))
 """
-HAS_DRY_RUN = ("attack", "check", "demo", "evaluate", "harden", "study run")
 
 
 class ShownError(Exception):
@@ -152,11 +152,11 @@ class _Reader:
         for words in commands(block):
             if words[0] == "make":
                 self._call(block, ["make", "--dry-run", *words[1:]], self.root)
-            elif block.mark == "dry run" and " ".join(words[1:]).startswith(HAS_DRY_RUN):
-                self._call(block, [*words, "--dry-run"])
             elif words[0] == "roadproof" and (serves or not is_run):
                 # The words of what is run are read there.
-                self._call(block, [self.python, "-c", READ, *words[1:]])
+                options = self._call(block, [self.python, "-c", READ, *words[1:]]).split()
+                if block.mark == "dry run" and "--dry-run" in options:
+                    self._call(block, [*words, "--dry-run"])
         if not is_run:
             return
         if serves:
