@@ -97,7 +97,7 @@ HARDENING_BUDGETS = {
         unseen=TPE(calls=400),
     ),
 }
-"""Named budgets: quick takes about an hour a round on a laptop, full a night."""
+"""Named budgets; docs/hardening.md says what they take, by streets and rounds."""
 
 
 def check_streets(training: Sequence[Scenario], judging: Sequence[Scenario]) -> None:
