@@ -1,5 +1,7 @@
 """`roadproof harden` as its users call it: what cannot work is one line, before anything is driven."""
 
+import json
+
 import pytest
 
 
@@ -38,3 +40,9 @@ def test_controllers_that_cannot_learn_are_one_line(invoke, tmp_path, controller
     assert message in printed.err
     assert printed.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_the_estimate_counts_the_drives_over_the_bare_road_that_are_asked_for(invoke):
+    asked = ("harden", "pilotnet", "--train-on", "left-07", "--judge-on", "straight-04", "--dry-run", "--json")
+    usual, all_forty = (json.loads(invoke(*asked, *more)[1].out)["drives"] for more in ((), ("--clean-on", "all")))
+    assert all_forty - usual == 2 * 4 * (40 - 2)

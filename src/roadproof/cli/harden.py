@@ -32,7 +32,7 @@ def harden(
     ] = "",
     scenarios: options.ScenarioFile = None,
     rounds: Annotated[int, number("Rounds of attack, tuning and re-test.", 1, 100)] = 2,
-    budget: Annotated[str, typer.Option(help="quick or full.")] = "quick",
+    budget: Annotated[str, typer.Option(help="quick, or full: ten times the tuning; see --dry-run.")] = "quick",
     training_step: Annotated[
         str | None, unset("module:function(model, batch) that gives the loss, where the usual does not fit.")
     ] = None,
@@ -64,6 +64,7 @@ def harden(
 
     spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))].varied(paint.variation)
     training, judging = named(train_on), named(judge_on)
+    clean = list(known) if clean_on == "all" else named(clean_on) or [*training, *judging]
     step = (
         usual_step
         if training_step is None
@@ -71,7 +72,8 @@ def harden(
     )
     check_streets(training, judging)
     load_trainable(controller)
-    begin(_estimate(spent, load_controller(controller, device=device), rounds, len(training), len(judging)), out)
+    who = load_controller(controller, device=device)
+    begin(_estimate(spent, who, rounds, len(training), len(judging), len(clean)), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,
@@ -79,7 +81,7 @@ def harden(
             training,
             out,
             judge_on=judging,
-            clean_on=known if clean_on == "all" else named(clean_on),
+            clean_on=clean,
             rounds=rounds,
             budget=spent,
             space=SearchSpace(figures=figures, limits=paint.limits),
@@ -100,8 +102,10 @@ def harden(
     answer(stored(out / "hardening.json"))
 
 
-def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int) -> Estimate:
-    """The estimate of attacks, tuning and judging, where clean drives are those on all streets, before and after."""
+def _estimate(
+    budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int, clean: int
+) -> Estimate:
+    """The estimate of attacks, tuning and judging, from numbers of streets; clean drives are made before and after."""
     from roadproof.pipeline.estimate import Estimate, frame_seconds, of_drives, of_run, of_search
 
     learnt = Estimate(seconds=budget.tuning.pictures * frame_seconds(who))
@@ -111,5 +115,5 @@ def _estimate(budget: HardeningBudget, who: Controller, rounds: int, training: i
         found = of_search(budget.unseen, budget.judge.objective, 0, who)
         again = of_search(budget.judge.method, budget.judge.objective, budget.judge.window.frames, who)
         whole += (of_run(budget.judge, who, film=False) + found + again).times(2 * judging)
-        whole += of_drives(2 * len(budget.clean_weathers) * (training + judging))
+        whole += of_drives(2 * len(budget.clean_weathers) * clean)
     return whole
