@@ -2,9 +2,13 @@ from __future__ import annotations
 
 import time
 
+import pytest
 import torch
 
-from roadproof.pipeline.estimate import frame_seconds
+from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
+from roadproof.compositing import Variation
+from roadproof.pipeline import estimate
+from roadproof.pipeline.estimate import frame_seconds, of_search
 
 
 class Waits(torch.nn.Module):
@@ -33,3 +37,13 @@ def test_threads_that_wait_for_each_other_do_not_count():
     finally:
         torch.set_num_threads(threads)
     assert 0.02 <= 8 * took_s < 0.1
+
+
+@pytest.mark.parametrize("objective", [PathDeviation, SteeringShift])
+def test_a_search_over_looks_shows_every_frame_in_each(monkeypatch, objective):
+    monkeypatch.setattr(estimate, "frame_seconds", lambda *_, **__: 0.002)
+    one, four = (
+        of_search(GradOpt(), objective(variation=variation), 40, Waits(0.0)).seconds
+        for variation in (None, Variation(draws=4))
+    )
+    assert four == pytest.approx(4 * one)

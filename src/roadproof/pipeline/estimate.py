@@ -15,7 +15,7 @@ from torch.nn import Module
 
 from roadproof.attacks import GradOpt, Method, Objective, Published
 from roadproof.attacks.gradopt import DRAWN, Rung
-from roadproof.attacks.objective import ClosedLoop, SpeedChange
+from roadproof.attacks.objective import ClosedLoop, SpeedChange, variation_of
 from roadproof.calibration import Method as Calibration
 from roadproof.calibration.published import PAINTS, RUNS
 from roadproof.controllers import Controller
@@ -127,7 +127,9 @@ def of_search(
         * _pictures(rung, objective, frames)
         for rung in rungs
     )
-    seconds = groups * count * frame_seconds(controller, gradients=method.by_gradient)
+    variation = variation_of(objective)
+    looks = 1 if variation is None else variation.draws
+    seconds = groups * count * looks * frame_seconds(controller, gradients=method.by_gradient)
     return Estimate(seconds=seconds, megabytes=1.0, basis=_MEASURED)
 
 
