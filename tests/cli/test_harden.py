@@ -11,6 +11,7 @@ import pytest
         (["--train-on", "left-08", "--judge-on", "right-07"], "left-08 is trained on and right-07 judged on"),
         (["--train-on", "left-99"], "did you mean"),
         (["--train-on", ","], "there is no scenario to train on"),
+        (["--train-on", "left-07", "--clean-on", "all"], "give --judge-on too"),
         (["--train-on", "left-07", "--rounds", "0"], "--rounds is 0, expected 1 to"),
         (["--train-on", "left-07", "--budget", "endless"], "--budget is 'endless', expected one of quick, full"),
         (["--train-on", "left-07", "--training-step", "nowhere:step"], "cannot import nowhere:step"),

@@ -13,6 +13,7 @@ from roadproof.cli.options import argument, choice, number, unset
 from roadproof.cli.output import answer, say, stored
 from roadproof.cli.paint import Paint, with_paint
 from roadproof.cli.verbs import begin
+from roadproof.errors import RoadproofError
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
@@ -64,6 +65,8 @@ def harden(
 
     spent = HARDENING_BUDGETS[choice(budget, "budget", tuple(HARDENING_BUDGETS))].varied(paint.variation)
     training, judging = named(train_on), named(judge_on)
+    if clean_on and not judging:
+        raise RoadproofError("--clean-on is driven where the result is judged; give --judge-on too, or leave it out")
     clean = list(known) if clean_on == "all" else named(clean_on) or [*training, *judging]
     step = (
         usual_step
