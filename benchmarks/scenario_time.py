@@ -1,6 +1,7 @@
 """How long does a default scenario take from the command to the report, and in which stage does the time go?
 
     python benchmarks/scenario_time.py --json OUT [--scenario left-03] [--controllers pilotnet cil] [--times 3]
+        [--processes 1]
 
 `roadproof demo` with its defaults in a fresh process and a new folder, so many times for each controller, in turn. The
 first time is cold where this process may tell Linux to forget the files that it has read, and as it was otherwise;
@@ -37,9 +38,10 @@ def forget_files() -> bool:
     return False
 
 
-def timed(scenario: str, controller: str, folder: Path) -> dict[str, Any]:
+def timed(scenario: str, controller: str, processes: int, folder: Path) -> dict[str, Any]:
     """One run: seconds by the clock, by stage, and in none."""
-    line = ["demo", "--scenario", scenario, "--controller", controller, "--out", str(folder), "--quiet"]
+    line = ["demo", "--scenario", scenario, "--controller", controller, "--processes", str(processes)]
+    line += ["--out", str(folder), "--quiet"]
     began = time.perf_counter()
     subprocess.run([sys.executable, "-c", "from roadproof.cli import main; main()", *line], check=True)
     whole_s = time.perf_counter() - began
@@ -55,13 +57,14 @@ def main() -> None:
     parser.add_argument("--scenario", default="left-03")
     parser.add_argument("--controllers", nargs="+", default=list(GOALS_S))
     parser.add_argument("--times", type=int, default=3)
+    parser.add_argument("--processes", type=int, default=1, help="as of `roadproof demo`; 0 for one a core")
     given = parser.parse_args()
     records: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as place:
         for k in range(given.times):
             for controller in given.controllers:
                 cold = k == 0 and forget_files()
-                run = timed(given.scenario, controller, Path(place) / f"{controller}-{k}")
+                run = timed(given.scenario, controller, given.processes, Path(place) / f"{controller}-{k}")
                 records.append({"controller": controller, "cold": cold} | run)
                 print(json.dumps(records[-1]), flush=True)
     warm = {
@@ -74,6 +77,7 @@ def main() -> None:
     content = {
         "made_with": made_with(),
         "scenario": given.scenario,
+        "processes": given.processes,
         "goals_s": GOALS_S,
         "warm_median_s": warm,
         "records": records,
