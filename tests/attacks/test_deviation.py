@@ -8,7 +8,7 @@ import torch
 
 from painted_ground import RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack, methods
-from roadproof.attacks.gradopt import BEHIND, DRAWN, MUTATION, Rung, gradopt
+from roadproof.attacks.gradopt import BEHIND, MUTATION, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
@@ -19,6 +19,10 @@ from roadproof.search_space import SearchSpace, derived_seed
 
 SPACE = SearchSpace(figures=1)
 SHORT = GradOpt(iterations=8, restarts=2, halving=False)
+ONE_STEP = GradOpt(iterations=1, restarts=1, halving=False)
+GOAL = PathDeviation(every=4)
+DRAWN = 32
+"""Of how many random points screened starts are the best here."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -27,13 +31,18 @@ def vehicle():
         yield
 
 
+@pytest.fixture(autouse=True)
+def few_are_drawn(monkeypatch):
+    monkeypatch.setattr("roadproof.attacks.gradopt.DRAWN", DRAWN)
+
+
 @pytest.fixture(scope="module")
 def road():
     return recorded_road(every=2)
 
 
 def search(road, **options):
-    return attack(road, RampFollower(), SPACE, **{"objective": PathDeviation(), "method": SHORT, **options})
+    return attack(road, RampFollower(), SPACE, **{"objective": GOAL, "method": SHORT, **options})
 
 
 @pytest.fixture(scope="module")
@@ -70,12 +79,12 @@ def test_a_search_drives_in_every_weather_that_was_recorded(road):
     both = pooled({"clear-noon": road, "rainy-noon": dark})
     unit = SPACE.random((2, 3), torch.Generator().manual_seed(4))
     values = [
-        PathDeviation().measure(each, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").values(SPACE, unit)
+        GOAL.measure(each, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").values(SPACE, unit)
         for each in (road, dark, both)
     ]
     assert (values[0] - values[1]).abs().max() > 0.01
     assert torch.allclose(values[2], (values[0] + values[1]) / 2, atol=1e-5)
-    result = attack(both, RampFollower(), SPACE, objective=PathDeviation(), method=SHORT)
+    result = attack(both, RampFollower(), SPACE, objective=GOAL, method=ONE_STEP)
     apart = [
         RecordedWorld(each)
         .foretold(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)
@@ -94,8 +103,7 @@ def test_a_search_doubts_a_controller_that_was_not_recorded(road, whole):
 
     found = {check.name: check for check in whole.checks}
     assert found["keeps to the recorded road without paint"].passed
-    method = GradOpt(iterations=1, restarts=1, halving=False)
-    stray = attack(road, Stray(), SPACE, objective=PathDeviation(), method=method)
+    stray = attack(road, Stray(), SPACE, objective=GOAL, method=ONE_STEP)
     (doubt,) = (check for check in stray.checks if check.name == "keeps to the recorded road without paint")
     assert not doubt.passed
     assert "record with it" in doubt.advice
@@ -121,14 +129,14 @@ def test_several_starts_are_valued_by_their_mean(road):
     starts = (Start(right_m=0.3), Start(right_m=-0.3))
 
     def value(*chosen):
-        measure = PathDeviation(starts=chosen).measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
-        return measure.values(SPACE, unit)
+        goal = dataclasses.replace(GOAL, starts=chosen)
+        return goal.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").values(SPACE, unit)
 
     apart = (value(starts[0]) + value(starts[1])) / 2
     assert torch.allclose(value(*starts), apart, atol=2e-3)
     # What goes to the right for one group counts against the other.
     right, left = value(Start())[:, 0].tolist()
-    same = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    same = GOAL.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     both = same.values(SPACE, unit[:1].expand(2, -1, -1, -1))[:, 0]
     assert float(both[0]) == pytest.approx(-float(both[1]))
     assert right == pytest.approx(float(both[0]), abs=1e-4)
@@ -137,7 +145,7 @@ def test_several_starts_are_valued_by_their_mean(road):
 
 def test_a_search_can_begin_with_the_steering_shift(road, tmp_path):
     rungs = (Rung(4, 6, every=2, open_loop=True), Rung(4, 2, every=6), Rung(2, 1))
-    measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    measure = GOAL.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     seen: list[float] = []
     found = gradopt(measure, SPACE, rungs, seed=0, on_step=lambda _, best: seen.append(best))
     alone = SteeringShift().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu").thinned(2)
@@ -176,7 +184,7 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
         Rung(2, 2, 0.01),
     )
     groups = (RIGHT_GROUP, LEFT_GROUP)
-    measure = PathDeviation().measure(road, OneSided(), groups, device="cpu")
+    measure = GOAL.measure(road, OneSided(), groups, device="cpu")
     found = gradopt(measure, SPACE, rungs, seed=0)
     assert list(found.gave_way) == [0]
     assert found.best.shape == (1, 4), "the places of both sides, all to the left"
@@ -186,7 +194,7 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
     assert left.groups == (LEFT_GROUP,)
     assert torch.allclose(left.values(SPACE, found.best_unit), found.best)
     # Where nobody is far behind, nothing changes hands.
-    equal = PathDeviation().measure(road, RampFollower(), groups, device="cpu")
+    equal = GOAL.measure(road, RampFollower(), groups, device="cpu")
     assert gradopt(equal, SPACE, rungs, seed=0).gave_way == {}
     stopped = tmp_path / "search.safetensors"
 
@@ -204,7 +212,7 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
 def test_a_result_says_which_side_gave_way(road, monkeypatch):
     monkeypatch.setattr(methods, "PATH_RUNGS", (Rung(4, 1, open_loop=True, screened=2), Rung(4, 2, every=4)))
     method = GradOpt(iterations=2, restarts=2)
-    result = attack(road, OneSided(), SPACE, objective=PathDeviation(), method=method)
+    result = attack(road, OneSided(), SPACE, objective=GOAL, method=method)
     assert list(result.by_group) == [str(LEFT_GROUP)]
     assert {each.group for each in result.candidates} == {str(LEFT_GROUP)}
     assert len(result.candidates) == 4
@@ -213,7 +221,7 @@ def test_a_result_says_which_side_gave_way(road, monkeypatch):
 
 
 def test_some_starts_are_the_best_of_many_and_the_others_at_random(road):
-    measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    measure = GOAL.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     plain = gradopt(measure, SPACE, (Rung(3, 1),), seed=4).history[0]
     found = gradopt(measure, SPACE, (Rung(3, 1, screened=2),), seed=4).history[0]
     assert torch.allclose(found[:, 0], plain[:, 0], atol=1e-3), "at random as before"
@@ -226,7 +234,7 @@ def test_some_starts_are_the_best_of_many_and_the_others_at_random(road):
 
 
 def test_offspring_with_figures_of_two_of_the_best_compete_with_them(road):
-    measure = PathDeviation().measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    measure = GOAL.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     first = Rung(4, 1)
     alone = gradopt(measure, SPACE, (first, Rung(4, 1, every=4)), seed=1)
     found = gradopt(measure, SPACE, (first, Rung(4, 1, every=4, offspring=64)), seed=1)
