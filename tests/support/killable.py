@@ -38,7 +38,7 @@ from team_folder import write_team
 CLEAR = (Weather.CLEAR_NOON,)
 TINY = Budget(
     objective=SteeringShift(),
-    method=GradOpt(iterations=12, restarts=2),
+    method=GradOpt(iterations=6, restarts=2),
     trajectories=Trajectories(perturbation=Swerve((0.5,))),
     window=Window(frames=4),
     select=2,
@@ -79,14 +79,15 @@ calls = 2
 
 
 def demo(given: Path) -> list[str]:
-    save_scenarios([along_a_street(given, 3.2)], given / "scenarios.toml")
+    save_scenarios([along_a_street(given, 2.4)], given / "scenarios.toml")
     where = ["--scenarios", f"{given}/scenarios.toml", "--scenario", "street"]
     return ["demo", *where, "--controller", "pilotnet", "--rounds", "1", "--figures", "1"]
 
 
 def attack(given: Path) -> list[str]:
     if not (given / "set").exists():
-        save_recordings(drivable_set(), given / "set")
+        whole = drivable_set()
+        save_recordings(replace(whole, recordings=tuple(each.thinned(4) for each in whole.recordings)), given / "set")
     tiny = ["--iterations", "12", "--restarts", "2", "--figures", "2", "--random-patterns", "3"]
     return ["attack", f"{given}/set", "--controller", "pilotnet", "--objective", "steering", *tiny]
 
@@ -144,7 +145,7 @@ def run(name: str, folder: Path) -> None:
     # As in a terminal: what a shell runs in the background ignores Ctrl-C, and so would its children.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     BUDGETS["quick"], HARDENING_BUDGETS["quick"] = TINY, HARDENING
-    methods.SHIFT_RUNGS = (Rung(3, 12, every=2),)
+    methods.SHIFT_RUNGS = (Rung(3, 6, every=2),)
     film.PICTURE_S, film.MOMENTS = 0.5, 7
     # One place for what all runs of a command are given: it is a part of what they leave.
     given = folder.parent / f"given-{name}"
