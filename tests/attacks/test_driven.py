@@ -24,7 +24,7 @@ SPACE = SearchSpace(figures=2)
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    return along_a_street(tmp_path_factory.mktemp("street"))
+    return along_a_street(tmp_path_factory.mktemp("street"), 2.5)
 
 
 def test_steering_is_summed_over_the_first_four_fifths_as_published():

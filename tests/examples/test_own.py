@@ -31,10 +31,10 @@ def run(name, *arguments, monkeypatch):
 @pytest.mark.slow
 def test_a_controller_of_ones_own_is_stress_tested(few_pictures, tmp_path, monkeypatch, capsys):
     needs.town()
-    # The example's own stretch from 20 m before the canvas to 15 m behind it, and its own search, less of it.
+    # The example's own stretch from 17 m before the canvas to 8 m behind it, and its own search, less of it.
     whole = roadproof.find_scenario("straight-04")
-    start = dataclasses.replace(whole.start, x_m=whole.canvas.x_m + 20.0, speed_mps=6.0)
-    stretch = dataclasses.replace(whole, start=start, goal_m=(whole.canvas.x_m - 15.0, whole.goal_m[1]))
+    start = dataclasses.replace(whole.start, x_m=whole.canvas.x_m + 17.0, speed_mps=6.0)
+    stretch = dataclasses.replace(whole, start=start, goal_m=(whole.canvas.x_m - 8.0, whole.goal_m[1]))
     monkeypatch.setattr("roadproof.find_scenario", {"straight-04": stretch}.__getitem__)
     tiny = dataclasses.replace(
         QUICK,
