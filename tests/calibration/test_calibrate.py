@@ -25,7 +25,7 @@ from roadproof.simulators.town.simulator import TownSimulator
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return along_a_street(tmp_path_factory.mktemp("street"))
+    return along_a_street(tmp_path_factory.mktemp("street"), 2.5)
 
 
 @pytest.fixture(scope="module")
