@@ -24,7 +24,7 @@ from pathlib import Path
 from roadproof.io.files import write_json
 from roadproof.machine import made_with
 
-GOALS = {"alone_fps": 300.0, "traffic_fps": 150.0, "start_s": 3.0, "memory_mb": 400.0}
+GOALS = {"alone_fps": 500.0, "traffic_fps": 300.0, "start_s": 2.0, "memory_mb": 400.0}
 AGENTS = 20
 SCENARIOS = ("straight-01", "left-05", "right-03", "straight-08", "left-02", "right-07")
 
