@@ -33,7 +33,7 @@ def _plain(options: list[Any]) -> list[Any]:
             option.metavar = SEVERAL[option.name]
         elif option.param_type_name == "argument" and option.nargs < 0:
             # The dots behind its name say that it may be given several times.
-            option.display_type_rich = lambda **_: None
+            option.display_type_rich = _no_type
     return options
 
 
@@ -65,3 +65,7 @@ class Verbs(typer.Typer):
     def command(self, name: str | None = None, **more: Any) -> Any:  # noqa: ANN401
         """What makes a function a verb of the group, as `typer.Typer.command` does."""
         return super().command(name, cls=_Verb, **more)
+
+
+def _no_type(**_: object) -> None:
+    """What stands for the type beside a name that says enough."""
