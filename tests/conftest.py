@@ -64,12 +64,10 @@ def few_pictures(monkeypatch):
 @pytest.fixture
 def two_threads():
     """Threads of torch, whatever the tests have."""
-    import torch
+    from roadproof.machine import threads
 
-    usual = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(usual)
+    with threads(2):
+        yield
 
 
 @pytest.fixture

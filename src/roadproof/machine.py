@@ -47,16 +47,16 @@ def sleep_while_waiting() -> None:
 
 
 @contextmanager
-def one_thread() -> Generator[None]:
-    """Let torch compute with one thread here: the last digits of a network's answers depend on how many share them."""
+def threads(count: int) -> Generator[None]:
+    """Let torch compute with so many threads here: the last digits of a network's answers depend on their number."""
     import torch
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    usual = torch.get_num_threads()
+    torch.set_num_threads(count)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(usual)
 
 
 def made_with() -> dict[str, object]:

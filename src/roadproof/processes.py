@@ -11,8 +11,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack
-from functools import cache, cached_property, lru_cache
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from functools import cache, cached_property, lru_cache, partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar, cast
@@ -104,6 +104,12 @@ class Pool(Generic[Inside]):
                 yield waiting[future], cast("Result", future.result())
         except BrokenProcessPool:
             raise SimulatorError(DIED) from None
+
+
+def open_or_here(pool: Pool[Inside] | None, inside: Inside) -> AbstractContextManager[Pool[Inside]]:
+    """Processes that are open already, and stay open; without them this process alone, working in what is given."""
+    here: Opens[Inside] = partial(nullcontext, inside)
+    return nullcontext(pool) if pool is not None else Pool[Inside](here, 1)
 
 
 def spread(

@@ -75,7 +75,7 @@ def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, scene
 
 @pytest.mark.slow
 def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(town, scene, drives, tmp_path):
-    assert drives.calls + replays_needed(drives, Method.PUBLISHED) == 61
+    assert drives.calls + replays_needed(len(drives.drives), Method.PUBLISHED) == 61
     # Full pictures take long: one drive only, which begins 13 m before the middle of the canvas.
     near = dataclasses.replace(scene, start=dataclasses.replace(scene.start, x_m=scene.canvas.x_m - 13.0))
     one = record(town, expert, near, trajectories=Trajectories(count=1), window=Window(frames=3))

@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.calibration.published import (
+    PAINTS,
+    RUNS,
     colour_targets,
     colours_from_paints,
     homographies_from_points,
@@ -126,9 +128,9 @@ class _Geometry:
     residuals_px: Float[np.ndarray, " n"]
 
 
-def replays_needed(drives: Drives, method: Method) -> int:
-    """Number of replays in the simulator that a calibration takes on top of the recorded drives."""
-    return len(_wanted(drives, method))
+def replays_needed(count: int, method: Method) -> int:
+    """Number of replays in the simulator that a calibration of so many recorded drives takes on top of them."""
+    return RUNS * count + len(PAINTS) if method is Method.PUBLISHED else len(TARGETS) * count
 
 
 def _wanted(drives: Drives, method: Method) -> list[Wanted]:

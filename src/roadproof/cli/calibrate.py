@@ -50,7 +50,7 @@ def calibrate(
             continue
         with (
             open_simulator(simulator) as world,
-            progress(f"Calibrating {path.name}", replays_needed(drives, how), "replays") as show,
+            progress(f"Calibrating {path.name}", replays_needed(len(drives.drives), how), "replays") as show,
         ):
             result = run(
                 world, drives, how, folder=path / "calibration", on_call=lambda done, show=show: show(done, 0.0)

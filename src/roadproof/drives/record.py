@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -22,12 +21,11 @@ from roadproof.drives.folder import Drive, Drives, Settings, forget_settings, re
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
 from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import drivers
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.io.files import AnyPath, as_path
-from roadproof.processes import Pool
+from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Side, evenly
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
@@ -111,7 +109,7 @@ def record(
                 forget_settings(folder)
             raise
     astray = partial(_perturbed, driver, settings, done[plans[0].name])
-    with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
+    with open_or_here(pool, simulator) as driving:
         for _, drive in driving.each(astray, [plan for plan in plans if plan.name not in done]):
             keep(drive, made=True)
     return Drives(settings=settings, drives=tuple(done[plan.name] for plan in plans))

@@ -19,7 +19,7 @@ from roadproof.controllers.asking import act_after_of, act_of, frame_size_of
 from roadproof.datatypes import Control, Ending, Observation, Weather
 from roadproof.driving.episode import GIVEN, SEEN, Episode
 from roadproof.errors import ControllerError
-from roadproof.machine import one_thread
+from roadproof.machine import threads
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Pictures, Simulator
@@ -85,7 +85,7 @@ def rollout(
     )
     rows, controls, events = [_row(seen)], list[Control](), list(seen.events)
     # A drive is the same in a process that shares the cores with others.
-    with one_thread():
+    with threads(1):
         policy = policy_of(driver, simulator)
         while not (stopped := until is not None and until(seen)) and not seen.done:
             control = policy(seen)

@@ -16,11 +16,11 @@ from torch.nn import Module
 from roadproof.attacks import GradOpt, Method, Objective, Published
 from roadproof.attacks.gradopt import DRAWN, Rung
 from roadproof.attacks.objective import ClosedLoop, SpeedChange, variation_of
-from roadproof.calibration import Method as Calibration
-from roadproof.calibration.published import PAINTS, RUNS
+from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.controllers.checks import require_usable
+from roadproof.machine import threads
 from roadproof.pipeline.budget import Budget
 
 DRIVE_S, CROWDED_S = 2.2, 12.0
@@ -89,17 +89,14 @@ def frame_seconds(controller: Controller, *, gradients: bool = True) -> float:
     require_usable(controller, size=size, device=str(device), drives=False, gradients=gradients)
     frames = torch.rand(_BATCH, 3, *size, device=device, requires_grad=gradients)
     speed, command = torch.full((_BATCH,), 7.0, device=device), torch.full((_BATCH,), 2, device=device)
-    took_s, threads = math.inf, torch.get_num_threads()
-    try:
-        for used in sorted({1, threads}) * _ROUNDS:
-            torch.set_num_threads(used)
+    took_s = math.inf
+    for used in sorted({1, torch.get_num_threads()}) * _ROUNDS:
+        with threads(used):
             began = time.perf_counter()
             answer = steer_of(controller, frames, speed, command)
             if gradients:
                 answer.sum().backward()
             took_s = min(took_s, time.perf_counter() - began)
-    finally:
-        torch.set_num_threads(threads)
     return COMPOSITING * took_s / _BATCH
 
 
@@ -165,11 +162,10 @@ def of_run(budget: Budget, controller: Controller, *, film: bool = True, process
         budget: budget of the stress test.
         controller: controller that is timed.
         film: whether the film of two drives is made.
-        processes: number of replays over two paints and of drives of the evaluation made at once.
+        processes: number of replays and of drives of the evaluation made at once.
     """
     count, weathers = budget.trajectories.count, len(budget.recorded_in)
-    published = budget.calibration is Calibration.PUBLISHED
-    replays = RUNS * count + len(PAINTS) if published else 2 * count
+    replays = replays_needed(count, budget.calibration)
     frames = budget.window.frames * (1 + count // 2) * weathers
     searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
     recorded = RECORDED_DRIVE.times(weathers * count)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import itertools
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -19,14 +18,13 @@ from roadproof.datatypes import Control, Observation
 from roadproof.driving.deviation import lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import drivers
 from roadproof.driving.rollout import drive_again
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import write_atomically
 from roadproof.io.records import RecordFile, Saved
 from roadproof.io.video import can_film, film_file
-from roadproof.processes import Pool
+from roadproof.processes import Pool, open_or_here
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -138,7 +136,7 @@ def film_drives(
         (f"without paint{predicted}", CLEAN, clean, None),
         (f"with paint{predicted}", PAINTED, painted, paint),
     ]
-    with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
+    with open_or_here(pool, simulator) as driving:
         taken = {side.colour: side for _, side in driving.each(partial(_filmed, start, steps), takes)}
     sides = taken[CLEAN], taken[PAINTED]
     beside_m = lateral_m(path_of(clean), path_of(painted))

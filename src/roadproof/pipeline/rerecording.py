@@ -191,7 +191,7 @@ def _recorded(
         # The clean drive's replays lie there already and are not driven again.
         calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration", pool=pool)
         calibrated.save(place)
-    calls = drive.calls + replays_needed(both, method) - replays_needed(clean, method)
+    calls = drive.calls + replays_needed(len(both.drives), method) - replays_needed(len(clean.drives), method)
     return calibrated.recordings.recordings[1], calls
 
 

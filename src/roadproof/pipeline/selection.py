@@ -8,7 +8,6 @@ SELECTION/episodes/*.npz      the drives: clean, and one for each candidate (`dr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -20,14 +19,14 @@ from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import drivers, make_missing
+from roadproof.driving.evaluate import make_missing
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import require_same
 from roadproof.io.records import RecordFile, plain
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
-from roadproof.processes import Pool
+from roadproof.processes import Pool, open_or_here
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator
 
@@ -216,7 +215,7 @@ def select_by_driving(
         made = (driven_over(place) for place in range(len(over)) if episodes.has(over[place]))
         on_drive(1 + done, max((each.effect(by) for each in made), default=0.0))
 
-    with nullcontext(pool) if pool else drivers(simulator, None, 1) as driving:
+    with open_or_here(pool, simulator) as driving:
         make_missing(driving, episodes, over, tell)
     driven = [driven_over(place) for place in range(len(over))]
     winner = max(range(len(driven)), key=lambda index: driven[index].effect(by))

@@ -95,7 +95,7 @@ class Stages:
 
     def calibrate(self, number: int, drives: Drives) -> RecordingSet:
         """Calibrate the drives of the weather of this number."""
-        place, each = self._folder_of(number), replays_needed(drives, self.budget.calibration)
+        place, each = self._folder_of(number), replays_needed(len(drives.drives), self.budget.calibration)
         done, total = Calibrated.kept(place, drives, self.budget.calibration), each * len(self.budget.recorded_in)
         if done is None:
             done = calibrate(

@@ -183,7 +183,7 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
         ledger.calls("record", sum(each.calls for each in drives))
     with ledger.stage("calibrate"):
         calibrated = [run.calibrate(number, each) for number, each in enumerate(drives)]
-        ledger.calls("calibrate", sum(replays_needed(each, budget.calibration) for each in drives))
+        ledger.calls("calibrate", sum(replays_needed(len(each.drives), budget.calibration) for each in drives))
         recordings = pooled({str(d.settings.weather): c for d, c in zip(drives, calibrated, strict=True)})
     with ledger.stage("attack"):
         found = run.attack(recordings)
