@@ -88,6 +88,16 @@ def test_a_dry_run_answers_what_it_would_take(invoke, tmp_path, monkeypatch):
     assert printed.err.startswith("32 drives, about ")
 
 
+def test_a_dry_run_counts_the_search_for_less_paint_and_the_drive_over_it(invoke, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("roadproof.pipeline.estimate.frame_seconds", lambda *_, **__: 0.002)
+    usual, less = (
+        answered(invoke("demo", "--dry-run", "--json", *more)[1].out) for more in ((), ("--cheapest", "0.8"))
+    )
+    assert less["drives"] == usual["drives"] + 1
+    assert less["seconds"] > 1.2 * usual["seconds"]
+
+
 def test_what_is_no_number_is_null_and_every_terminal_can_show_the_rest(capsys):
     with in_json():
         say("in words")

@@ -39,7 +39,8 @@ MOST_LEVELS = 14
 
 _LOWER, _SMALLEST_STEP = 0.7, 0.9
 _NO_LIMIT_M2 = 1e4
-_RUNGS = (Rung(1, 8, 0.03),)
+RUNGS = (Rung(1, 8, 0.03),)
+"""What is climbed below each limit of the area."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +248,7 @@ class _Run:
         """The search after going on under a lower limit of the area, in m²."""
         assert self.space.limits is not None
         space = replace(self.space, limits=replace(self.space.limits, max_area_m2=most_m2))
-        search = gradopt(self.measure, space, _RUNGS, seed=self.seed, starts=[self.unit[0].cpu()])
+        search = gradopt(self.measure, space, RUNGS, seed=self.seed, starts=[self.unit[0].cpu()])
         return replace(self, space=space, unit=search.best_unit)
 
     def _least_m(self, space: SearchSpace, unit: Float[Tensor, "1 s k n"]) -> Float[Tensor, " s"]:

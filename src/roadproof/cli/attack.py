@@ -85,7 +85,7 @@ def attack(
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.coverage import Shape
-    from roadproof.pipeline.estimate import of_search
+    from roadproof.pipeline.estimate import of_cheapest, of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
@@ -113,7 +113,8 @@ def attack(
     _check_attacked(attacked, drives, searched, goal, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     frames = sum(len(each.frames) for each in drives.recordings)
-    begin(of_search(searched, goal, frames, attacked, groups=len(chosen)), out)
+    work = of_search(searched, goal, frames, attacked, groups=len(chosen))
+    begin(work if cheapest is None else work + of_cheapest(space.figures, goal, attacked), out)
     checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(goal)) as on_step:
         result = run(

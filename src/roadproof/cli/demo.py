@@ -49,7 +49,7 @@ def demo(
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.pipeline.budget import BUDGETS
-    from roadproof.pipeline.estimate import of_run
+    from roadproof.pipeline.estimate import of_cheapest, of_drives, of_run
     from roadproof.pipeline.stress_test import stress_test
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
@@ -61,7 +61,9 @@ def demo(
     spent = replace(spent, objective=varied(spent.objective, paint.variation))
     space = SearchSpace(figures=figures, limits=paint.limits)
     who = load_controller(controller, device=device)
-    begin(of_run(spent, who, processes=processes), out)
+    work = of_run(spent, who, processes=processes)
+    less = None if cheapest is None else of_cheapest(figures, spent.objective, who) + of_drives(1)
+    begin(work if less is None else work + less, out)
     with open_simulator(simulator) as world, stages() as show:
         result = stress_test(
             world,

@@ -14,6 +14,7 @@ import torch
 from torch.nn import Module
 
 from roadproof.attacks import GradOpt, Method, Objective, Published
+from roadproof.attacks.cheapest import MOST_LEVELS, RUNGS
 from roadproof.attacks.gradopt import DRAWN, Rung
 from roadproof.attacks.objective import ClosedLoop, SpeedChange, variation_of
 from roadproof.calibration import replays_needed
@@ -22,6 +23,7 @@ from roadproof.controllers.asking import steer_of
 from roadproof.controllers.checks import require_usable
 from roadproof.machine import threads
 from roadproof.pipeline.budget import Budget
+from roadproof.recorded.world import UNSURE
 
 DRIVE_S, CROWDED_S = 2.2, 12.0
 """A drive of a built-in scenario in the town, alone and among 20 cars and 20 people."""
@@ -124,10 +126,28 @@ def of_search(
         * _pictures(rung, objective, frames)
         for rung in rungs
     )
-    variation = variation_of(objective)
-    looks = 1 if variation is None else variation.draws
-    seconds = groups * count * looks * frame_seconds(controller, gradients=method.by_gradient)
+    seconds = groups * count * _looks(objective) * frame_seconds(controller, gradients=method.by_gradient)
     return Estimate(seconds=seconds, megabytes=1.0, basis=_MEASURED)
+
+
+def of_cheapest(figures: int, objective: Objective, controller: Controller) -> Estimate:
+    """Estimate the search for less paint, where every limit of the area is tried.
+
+    Args:
+        figures: number of figures of the pattern that is begun with.
+        objective: objective of the search before.
+        controller: controller that is timed.
+    """
+    climbed = sum(rung.starts * rung.iterations * _pictures(rung, objective, STRETCH_STEPS) for rung in RUNGS)
+    # Below each limit the pattern, and what it is without each of its figures, is only valued.
+    valued = len(UNSURE) * STRETCH_STEPS * (1 + figures) / 3
+    count = MOST_LEVELS * (climbed * _looks(objective) + valued)
+    return Estimate(seconds=count * frame_seconds(controller), basis=_MEASURED)
+
+
+def _looks(objective: Objective) -> int:
+    variation = variation_of(objective)
+    return 1 if variation is None else variation.draws
 
 
 def _pictures(rung: Rung, objective: Objective, frames: int) -> int:
