@@ -6,7 +6,7 @@ import torch
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.homographies import apply_homography
-from roadproof.training.pasting import FARTHEST_M, PastedPaint, _covered, _ground_seen
+from roadproof.training.pasting import FARTHEST_M, PastedPaint, _covered, ground_seen
 
 
 def grey(count):
@@ -37,7 +37,7 @@ def test_no_paint_in_the_sky():
 
 
 def test_the_ground_is_where_the_homography_of_a_canvas_puts_it():
-    inside, ground = _ground_seen(CIL_CAMERA, CIL_INPUT)
+    inside, ground = ground_seen(CIL_CAMERA, CIL_INPUT)
     canvas = CanvasPlacement(x_m=10.0, y_m=0.5)
     image_from_canvas = homography_from_pose(CIL_CAMERA, VehicleState(0.0, 0.0, 0.0, 0.0, 0.0), canvas)
     spots = np.array([[50.0, 60.0], [200.0, 200.0], [300.0, 390.0]])

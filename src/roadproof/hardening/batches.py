@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,11 +13,10 @@ from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of
 from roadproof.controllers.conditional import ConditionalNetwork
 from roadproof.controllers.precision import multiplies_bfloat16
+from roadproof.hardening.town import Town
 from roadproof.hardening.views import Street, Views
 from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
-from roadproof.training.dataset import Dataset
-from roadproof.training.pasting import PastedPaint
 
 
 class TuningBatch(NamedTuple):
@@ -59,7 +58,7 @@ def mixed_precision(place: torch.device) -> torch.autocast:
 
 
 class Shown(NamedTuple):
-    """Pictures of a street, what should be answered to them, and a pattern for each of those that are painted."""
+    """Pictures of one place, what should be answered to them, and a pattern for each of those that are painted."""
 
     views: Views
     target: Float[Tensor, "b c"]
@@ -72,51 +71,43 @@ class Shown(NamedTuple):
         frames = torch.where(self.bare[:, None, None, None], views.frames, views.painted(pattern))
         return TuningBatch(frames, views.speed_mps, views.command, self.target)
 
+    def climbed(self, space: SearchSpace, step: float) -> Shown:
+        """The same pictures with their patterns a step up their gradient, where they have one.
+
+        A training step of the user's own need not look at the pictures.
+        """
+        unit = self.unit
+        return self if unit.grad is None else self._replace(unit=space.project(unit.detach() + step * unit.grad.sign()))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pictures:
     """Draws pictures of streets and of drives through the town, and asks the teacher about them.
 
     Args:
-        town: frames of clean drives through the town; None for none.
         teacher: the controller whose answers to bare pictures are the targets.
         space: the search space of the patterns.
         found: patterns that attacks found, as points of the search space; on the device of all that is drawn.
         known: share of the painted patterns that are found ones, slightly moved; the others are random.
-        bare: share of a street's pictures that stay without paint.
+        bare: share of the pictures that stay without paint.
     """
 
-    town: Dataset | None
     teacher: Controller
     space: SearchSpace
     found: Float[Tensor, "p k n"]
     known: float
     bare: float
-    _weights: Float[Tensor, " n"] | None = field(init=False)
-    _paste: PastedPaint = field(init=False, default_factory=lambda: PastedPaint(0.5))
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_weights", None if self.town is None else self.town.weights())
-
-    def of_street(self, street: Street, count: int, draw: torch.Generator) -> Shown:
-        """Pictures of a street, most of them to be painted."""
-        views = street.draw(count, draw)
+    def of(self, source: Street | Town, count: int, draw: torch.Generator) -> Shown:
+        """Pictures of a street or of the town, most of them to be painted."""
+        views = source.draw(count, draw)
         with torch.no_grad():
             target = answers(self.teacher, views.frames, views.speed_mps, views.command)
-            target[:, 0] = street.returning(views.place, target[:, 0])
+            if isinstance(source, Street) and views.place is not None:
+                target[:, 0] = source.returning(views.place, target[:, 0])
         unit = self._drawn(len(views.frames), draw)
         bare = (torch.rand(len(unit), generator=draw) < self.bare).to(unit.device)
         return Shown(views, target, bare, unit)
-
-    def of_town(self, count: int, draw: torch.Generator) -> TuningBatch | None:
-        """Pictures of drives through the town, half of them with rectangles pasted on the road; None without a town."""
-        if self.town is None or self._weights is None:
-            return None
-        chosen = torch.multinomial(self._weights, count, replacement=True, generator=draw)
-        seen = self.town.batch(chosen, self.found.device)
-        with torch.no_grad():
-            target = answers(self.teacher, seen.frames, seen.speed_mps, seen.command)
-        return TuningBatch(self._paste(seen.frames, draw), seen.speed_mps, seen.command, target)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
         """Points of the search space: some found ones, slightly moved, some random ones."""

@@ -17,6 +17,7 @@ from roadproof.errors import TrainingError
 from roadproof.hardening.judgement import Clean, Judge, Judged, clean_drives
 from roadproof.hardening.result import Round
 from roadproof.hardening.run import Run
+from roadproof.hardening.town import Town
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.views import Street
 from roadproof.io.files import write_tensors
@@ -72,7 +73,7 @@ class Stages:
                 for each in self.run.scenarios
             ]
 
-    def tune(self, number: int, tests: Sequence[Sequence[StressTest]], town: Dataset | None) -> None:
+    def tune(self, number: int, tests: Sequence[Sequence[StressTest]], town: Town | None) -> None:
         """Tune on what all attacks so far found, from the weights of the round before."""
         run, tuning = self.run, self.run.budget.tuning
         if run.weights(number).exists():
@@ -141,8 +142,8 @@ class Stages:
             self.ledger.calls("bare road", before.drives + after.drives)
         return before, after
 
-    def town(self) -> Dataset | None:
-        """Frames of the controller's clean drives through the town, where there is one."""
+    def town(self) -> Town | None:
+        """The controller's clean drives through the town, where there is one."""
         drives = self.run.budget.town_drives
         if not drives or not isinstance(self.simulator, TownSimulator):
             return None
@@ -154,7 +155,7 @@ class Stages:
                     record_drive(self.simulator, plan, number, self.teacher).save(path)
                 self.tell("Driving through the town", number + 1, drives, "drives")
             self.ledger.calls("town", drives)
-        return Dataset.load(paths)
+        return Town(Dataset.load(paths), self.simulator.camera, self.simulator.input, device=self.run.device)
 
     def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
         """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""

@@ -1,11 +1,11 @@
 """Fine-tuning a controller on painted pictures: it learns to answer as it did where nothing was painted.
 
-The teacher is the controller before. Every batch has pictures of one street, most of them painted, and pictures of
-drives through the town, half of them with rectangles pasted on the road; the target is what the teacher answers to the
-same picture without paint, and far aside a steering that returns. On what stays bare this is distillation: clean
-driving stays. Some patterns are found ones, some random. A batch is learnt from several times in a row, and each time
-its patterns climb a step by the gradient of the very loss that the controller has just learnt from: they cost nothing,
-and it does not learn a handful of patterns by heart ("free" adversarial training, Shafahi et al. 2019).
+The teacher is the controller before. Every batch has pictures of one street and of drives through the town, most of
+them painted; the target is what the teacher answers to the same picture without paint, and far aside a steering that
+returns. On what stays bare this is distillation: clean driving stays. Some patterns are found ones, some random. A
+batch is learnt from several times in a row, and each time its patterns climb a step by the gradient of the very loss
+that the controller has just learnt from: they cost nothing, and it does not learn a handful of patterns by heart
+("free" adversarial training, Shafahi et al. 2019).
 
 The controller is tuned in eval mode: dropout is off, and the statistics of batch normalisation stay as they were, as
 all buffers do.
@@ -29,9 +29,9 @@ from roadproof.controllers import Controller
 from roadproof.errors import TrainingError
 from roadproof.foreign import call
 from roadproof.hardening.batches import Pictures, TuningBatch, answers, mixed_precision
+from roadproof.hardening.town import Town
 from roadproof.hardening.views import Street
 from roadproof.search_space import SearchSpace
-from roadproof.training.dataset import Dataset
 
 PEDALS = 0.3
 """What throttle and brake count in the loss, against 1 for steering."""
@@ -53,7 +53,7 @@ class Tuning:
         repeats: how often it learns from each in a row, while the patterns climb.
         batch: how many pictures there are in a batch.
         learning_rate: AdamW's largest; it rises over the first steps and falls along a cosine to almost nothing.
-        bare: share of the street's pictures that stay without paint.
+        bare: share of the pictures that stay without paint.
         found: share of the painted patterns that attacks found; the others are random.
         climb: length of a pattern's step between two repeats, in units of each parameter's range.
 
@@ -65,7 +65,7 @@ class Tuning:
     repeats: int = 8
     batch: int = 48
     learning_rate: float = 1e-3
-    bare: float = 0.25
+    bare: float = 1 / 3
     found: float = 0.5
     climb: float = 0.1
 
@@ -111,7 +111,7 @@ def tune(
     streets: Sequence[Street],
     space: SearchSpace,
     found: Float[Tensor, "p k n"],
-    town: Dataset | None,
+    town: Town | None,
     tuning: Tuning,
     *,
     seed: int,
@@ -128,7 +128,7 @@ def tune(
         streets: the streets that pictures are drawn from, in turn; each already has ways (`Street.add_ways`).
         space: the search space of the patterns.
         found: patterns that attacks found, as points of the search space.
-        town: frames of clean drives through the town, learnt from besides; None for none.
+        town: clean drives through the town, learnt from besides; None for none.
         tuning: how many batches there are, and what they are made of.
         seed: the seed of everything drawn.
         device: the torch device on which the controller learns.
@@ -145,18 +145,17 @@ def tune(
     network.to(device=place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
     parameters = [each for each in network.parameters() if each.requires_grad]
     optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
-    pictures = Pictures(town, teacher, space, found.to(device), tuning.found, tuning.bare)
-    count = tuning.batch if town is None else tuning.batch // 2
+    pictures = Pictures(teacher, space, found.to(device), tuning.found, tuning.bare)
+    besides = () if town is None else (town,)
+    count = tuning.batch // (1 + len(besides))
     total, begun = 0.0, 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
     for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
-        shown = pictures.of_street(streets[number % len(streets)], count, draw)
-        driven = pictures.of_town(count, draw)
+        shown = [pictures.of(source, count, draw) for source in (streets[number % len(streets)], *besides)]
         for again in range(tuning.repeats):
-            unit = shown.unit.detach().requires_grad_()
-            batch = shown.painted(space.pattern(unit))
-            if driven is not None:
-                batch = TuningBatch(*(torch.cat(columns) for columns in zip(batch, driven, strict=True)))
+            shown = [each._replace(unit=each.unit.detach().requires_grad_()) for each in shown]
+            painted = [each.painted(space.pattern(each.unit)) for each in shown]
+            batch = TuningBatch(*(torch.cat(columns) for columns in zip(*painted, strict=True)))
             for group in optimiser.param_groups:
                 group["lr"] = tuning.rate(number * tuning.repeats + again)
             with mixed_precision(place):
@@ -167,9 +166,7 @@ def tune(
             nn.utils.clip_grad_norm_(parameters, 5.0)
             optimiser.step()
             total += float(loss.detach())
-            # A step of the user's own need not look at the pictures.
-            if unit.grad is not None:
-                shown = shown._replace(unit=space.project(unit.detach() + tuning.climb * unit.grad.sign()))
+            shown = [each.climbed(space, tuning.climb) for each in shown]
         if (number + 1) % 10 == 0 or number + 1 == tuning.steps:
             if checkpoint is not None:
                 _keep(parameters, optimiser, checkpoint, number + 1)

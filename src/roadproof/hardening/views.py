@@ -33,20 +33,20 @@ RECORDED_M = 1.5
 
 
 class Views(NamedTuple):
-    """Pictures of the bare road from B poses of one street.
+    """Pictures of the bare road from B poses.
 
     Args:
         frames: RGB in [0, 1].
         speed_mps: speed of the car at each picture.
         command: command at each picture, in CARLA's codes.
-        place: where the car is at each picture, relative to the clean path.
-        canvas: where each picture shows the canvas; None where no picture shows it.
+        place: where the car is at each picture, relative to a street's clean path; None where there is no such path.
+        canvas: where each picture shows a canvas; None where no picture shows one.
     """
 
     frames: Float[Tensor, "b 3 h w"]
     speed_mps: Float[Tensor, " b"]
     command: Int[Tensor, " b"]
-    place: Place
+    place: Place | None
     canvas: OwnViews | None
 
     def painted(self, pattern: Pattern) -> Float[Tensor, "b 3 h w"]:

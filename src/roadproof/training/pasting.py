@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from roadproof.datatypes import VehicleState
@@ -33,7 +33,7 @@ class PastedPaint:
 
     def __init__(self, share: float) -> None:
         self.share = share
-        self._inside, self._ground = _ground_seen(CIL_CAMERA, CIL_INPUT)
+        self._inside, self._ground = ground_seen(CIL_CAMERA, CIL_INPUT)
 
     def __call__(self, frames: Float[Tensor, "b 3 h w"], generator: torch.Generator) -> Float[Tensor, "b 3 h w"]:
         """Copies with paint in some of them; drawn on the CPU, whatever the frames are on.
@@ -48,17 +48,13 @@ class PastedPaint:
         inside, ground = self._inside.to(frames.device), self._ground.to(frames)
         pixels = frames.contiguous().flatten(2).clone()
         seen = pixels[chosen][:, :, inside]
-        # Paint is lit like the road it lies on, and some of the road's grain shows through.
-        grain = seen.mean(dim=1, keepdim=True)
-        light = (grain.mean(dim=2, keepdim=True) / 0.45).clamp(0.3, 1.2)
-        grain = grain / grain.mean(dim=2, keepdim=True).clamp_min(0.05)
+        light = light_on_paint(seen)
         count = torch.randint(1, MOST + 1, (len(chosen),), generator=generator)
         for k in range(MOST):
             box, colour, cover = _rectangles(len(chosen), generator)
             covered = _covered(ground, box.to(frames)) * (count > k).to(frames)[:, None, None]
             covered = covered * cover.to(frames)
-            paint = colour.to(frames) * light * (0.8 + 0.2 * grain)
-            seen = torch.lerp(seen, paint, covered)
+            seen = torch.lerp(seen, colour.to(frames) * light, covered)
         pixels[chosen[:, None, None], torch.arange(3)[None, :, None], inside[None, None, :]] = seen.clamp(0.0, 1.0)
         return pixels.reshape(frames.shape)
 
@@ -86,8 +82,15 @@ def _covered(ground: Float[Tensor, "p 2"], box: Float[Tensor, "b 5"]) -> Float[T
     return ((ahead.abs() <= length / 2) & (left.abs() <= width / 2)).to(ground)[:, None]
 
 
-def _ground_seen(camera: CameraModel, view: CropResize) -> tuple[Tensor, Float[Tensor, "p 2"]]:
-    """Which pixels of the input see the ground, as flat indices, and where."""
+def light_on_paint(road: Float[Tensor, "b 3 p"]) -> Float[Tensor, "b 1 p"]:
+    """What paint is multiplied with: it is lit as the road is, and some of the road's grain shows through."""
+    grain = road.mean(dim=1, keepdim=True)
+    bright = grain.mean(dim=2, keepdim=True)
+    return (bright / 0.45).clamp(0.3, 1.2) * (0.8 + 0.2 * grain / bright.clamp_min(0.05))
+
+
+def ground_seen(camera: CameraModel, view: CropResize) -> tuple[Int[Tensor, " p"], Float[Tensor, "p 2"]]:
+    """Which pixels of the input see the ground up to `FARTHEST_M`, as flat indices, and where."""
     camera_from_ground = camera.image_from_world(VehicleState(0.0, 0.0, 0.0, 0.0, 0.0))[:, [0, 1, 3]]
     ground_from_input = np.linalg.inv(view.input_from_camera @ camera_from_ground)
     ground, _ = sight(view, camera).on(ground_from_input)
