@@ -158,7 +158,7 @@ def coverage(shape: Shape, box: Float[Tensor, "*b 5"], footprints: Footprints) -
 def canvas_share(footprints: Footprints) -> Float[Tensor, "*v p"]:
     """Share of every footprint that lies on the canvas."""
     middle, size = (CANVAS_SIZE_PX - 1) / 2, float(CANVAS_SIZE_PX)
-    whole = footprints.centre.new_tensor([middle, middle, size, size, 0.0])
+    whole = constant((middle, middle, size, size, 0.0), footprints.centre)
     return _rectangle_coverage(whole.expand(*footprints.centre.shape[:-2], 5), footprints)
 
 

@@ -16,6 +16,7 @@ from typing import TypedDict, Unpack
 
 import torch
 
+from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.attacks.step import State, corrected, require_finite_step, stepped
 from roadproof.attacks.surrogate import Surrogate
@@ -50,7 +51,7 @@ class Replay:
 
     Args:
         measure: the measure that is made large, whose frames are counted.
-        same: the measure whose steps are the same operations every time, see `Surrogate.replayable`.
+        same: the measure whose steps are the same operations every time, see `replayable` of a measure.
         space: the search space.
         **steps: learning rate, momentum, iterations and state; see `Steps`.
 
@@ -121,7 +122,7 @@ def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Step
     """The steps of a rung as a `Replay`; why there is none, in words; None where there is no need, as on a CPU."""
     if measure.device.type not in RECORDERS or int(steps["state"]["done"]) >= steps["iterations"]:
         return None
-    same = measure.replayable() if isinstance(measure, Surrogate) else None
+    same = measure.replayable() if isinstance(measure, Surrogate | ClosedLoopMeasure) else None
     if same is None:
         return "their operations differ from step to step"
     try:

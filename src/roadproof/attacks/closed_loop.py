@@ -114,6 +114,19 @@ class ClosedLoopMeasure(ABC):
         vars(part)["_steering"] = self._steering.of_groups(kept)
         return part
 
+    def replayable(self) -> ClosedLoopMeasure | None:
+        """The measure with the same operations on tensors of the same shapes in every step; None with a variation.
+
+        It paints densely, and does not look whether poses and answers are finite: whoever asks it for values has to.
+        Its frames are counted from nought.
+        """
+        if self.variation is not None:
+            return None
+        same = copy.copy(self)
+        worlds = tuple(world.replayable() for world in self.worlds)
+        vars(same).update(worlds=worlds, frames_evaluated=0, _bare={}, _unsure={})
+        return same
+
     def redraw(self, seed: int) -> None:
         """Take the mean over the looks of another seed from now on; does nothing without a variation."""
         if self.variation is not None:

@@ -132,6 +132,8 @@ def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
 
 def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
+    if view.runs is None:
+        return dense_colours(pattern, view)
     seen = view.response(pattern.colours)
     if any(shape is not Shape.RECTANGLE for shape in pattern.shapes):
         return blend(visibilities(coverages(pattern, view.footprints)), seen, view)

@@ -28,7 +28,7 @@ class CanvasPixels:
         gain: A = s·gain, (*, P, 3), with s the share of the pixel that lies on the canvas.
         bias: B = s·(offset − clean), (*, P, 3).
         response: response from painted to seen colour, before gain and bias.
-        runs: the same pixels cut into runs, for painting rectangles.
+        runs: the same pixels cut into runs, for painting rectangles; None where every figure is painted in every pixel.
     """
 
     footprints: Footprints
@@ -36,7 +36,7 @@ class CanvasPixels:
     gain: Float[Tensor, "*b p 3"]
     bias: Float[Tensor, "*b p 3"]
     response: Response
-    runs: Runs
+    runs: Runs | None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

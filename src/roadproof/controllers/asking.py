@@ -40,14 +40,14 @@ def steer_of(
 
 
 def controls_of(
-    controller: PedalController, frames: Frames, speed_mps: Speeds, command: Commands
+    controller: PedalController, frames: Frames, speed_mps: Speeds, command: Commands, *, finite: bool = True
 ) -> Float[Tensor, "b 3"]:
     """What `PedalController.controls` answers, checked: steer, throttle and brake of each frame, (B, 3).
 
     Raises:
         ControllerError: the controller raises, or answers wrongly, as in `steer_of` but with three numbers per frame.
     """
-    return _usable(answer_of(controller, "controls", frames, speed_mps, command), "controls", frames)
+    return _usable(answer_of(controller, "controls", frames, speed_mps, command), "controls", frames, finite=finite)
 
 
 def controls_after_of(
@@ -57,6 +57,8 @@ def controls_after_of(
     speed_mps: Speeds,
     command: Commands,
     elapsed_s: float,
+    *,
+    finite: bool = True,
 ) -> tuple[Float[Tensor, "b 3"], object]:
     """What `TemporalController.controls_after` answers, checked: controls of each car, (B, 3), and what it remembers.
 
@@ -71,24 +73,32 @@ def controls_after_of(
         found = _in_words(cast("object", pair))
         raise ControllerError(f"{what} answered {found}, expected a tuple: the controls, and what it remembers")
     answer, after = answers
-    return _usable(_checked(answer, member, frames), member, frames), after
+    return _usable(_checked(answer, member, frames), member, frames, finite=finite), after
 
 
 def next_controls_of(
-    controller: Controller, memory: object, frames: Frames, speed_mps: Speeds, command: Commands, elapsed_s: float
+    controller: Controller,
+    memory: object,
+    frames: Frames,
+    speed_mps: Speeds,
+    command: Commands,
+    elapsed_s: float,
+    *,
+    finite: bool = True,
 ) -> tuple[Float[Tensor, "b c"], object]:
     """All that a controller of any kind says: steer, throttle and brake, (B, 3), or steer alone, (B, 1).
 
-    It comes with what is remembered; the arguments are those of `TemporalController.controls_after`.
+    It comes with what is remembered; the arguments are those of `TemporalController.controls_after`, and `finite` is
+    that of `steer_of`.
 
     Raises:
         ControllerError: the controller raises, or answers wrongly.
     """
     if isinstance(controller, TemporalController):
-        return controls_after_of(controller, memory, frames, speed_mps, command, elapsed_s)
+        return controls_after_of(controller, memory, frames, speed_mps, command, elapsed_s, finite=finite)
     if isinstance(controller, PedalController):
-        return controls_of(controller, frames, speed_mps, command), None
-    return steer_of(controller, frames, speed_mps, command)[:, None], None
+        return controls_of(controller, frames, speed_mps, command, finite=finite), None
+    return steer_of(controller, frames, speed_mps, command, finite=finite)[:, None], None
 
 
 def act_after_of(

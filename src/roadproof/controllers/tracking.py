@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.constants import constant
 from roadproof.errors import ControllerError
 
 LEAST_M = 0.1
@@ -82,7 +83,7 @@ class PurePursuit(TrackingLaw):
 
     def curvature(self, path: Float[Tensor, "b n 2"], speed_mps: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Curvature of the arc that leads the car on to the path, 1/m, left positive."""
-        rear = path.new_tensor([-0.5 * self.wheelbase_m, 0.0])
+        rear = constant((-0.5 * self.wheelbase_m, 0.0), path)
         sight = (self.sight_s * speed_mps.to(path.dtype)).clamp_min(self.sight_m) - 0.5 * self.wheelbase_m
         aim = point_along(path, sight) - rear
         return 2.0 * aim[:, 1] / aim.square().sum(1).clamp_min(LEAST_M**2)

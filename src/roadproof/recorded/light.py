@@ -27,8 +27,10 @@ class Light:
     """
 
     def __init__(self, recordings: RecordingSet, device: torch.device) -> None:
-        self._view, self._colour = recordings.view, recordings.colour
+        view = self._view = recordings.view
         self._maps = _maps(recordings, device)
+        pixels = camera_points(torch.arange(view.height_px * view.width_px), view).float()
+        self._everywhere = tuple(part.to(device) for part in recordings.colour.gain_and_offset(pixels))
 
     def at(
         self,
@@ -47,7 +49,7 @@ class Light:
         """
         share = canvas_share(footprints)[:, 0]
         if self._maps is None:
-            gain, offset = self._colour.gain_and_offset(camera_points(pixel, self._view).float())
+            gain, offset = (part[pixel] for part in self._everywhere)
             return gain, offset, share
         height, width = self._view.height_px, self._view.width_px
         # Light changes slowly across a frame: the nearest pixel's will do.

@@ -15,12 +15,13 @@ a lens pixels are straightened first (`geometry.sight`), and what W gives is ben
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -29,6 +30,7 @@ from roadproof.compositing.view import OwnViews, dilated
 from roadproof.coverage import Footprints
 from roadproof.errors import RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
+from roadproof.photometry.responses import response_on
 from roadproof.recorded.light import Light
 from roadproof.recordings import RecordingSet
 
@@ -123,6 +125,8 @@ class FrameBank:
         self.speed_mps = self._joined(recordings, "speed_mps", torch.float32)
         self.command = self._joined(recordings, "command", torch.int64)
         self._light = Light(recordings, self.device)
+        self._response = response_on(self.colour.response, self.device, torch.float32)
+        self._replayed = False
         self._set_rays()
         self.input_from_ground = self._recorded_views(recordings)
         self._input_from_car = self.input_from_ground @ _ground_from_car(self.poses)
@@ -185,13 +189,23 @@ class FrameBank:
         views = self._exact(recordings.view.input_from_camera @ seen) @ self._canvas_from_ground
         return views / views.square().sum((1, 2), keepdim=True).sqrt()
 
+    def replayable(self) -> FrameBank:
+        """The same frames, looked up by the same operations on tensors of the same shapes whatever the poses are.
+
+        All pixels of the ground are painted, and nobody looks whether poses are out of all bounds, or NaN.
+        """
+        same = copy.copy(self)
+        vars(same).update(_replayed=True)
+        return same
+
     def nearest(self, poses: Poses, alike: Alike = NEAREST) -> Gap:
         """The recorded frame that shows most of what is seen from each pose.
 
         Raises:
             RecordingError: a pose is out of all bounds, or NaN.
         """
-        _require_on_earth(poses)
+        if not self._replayed:
+            _require_on_earth(poses)
         dx, dy = poses.x_m[:, None] - self.poses.x_m, poses.y_m[:, None] - self.poses.y_m
         c, s = torch.cos(poses.yaw_rad)[:, None], torch.sin(poses.yaw_rad)[:, None]
         ahead, left = c * dx + s * dy, c * dy - s * dx
@@ -211,13 +225,14 @@ class FrameBank:
         """
         input_from_ground, ground_from_input, source = self._sources(poses, gap)
         shown, beyond = self._sampled(gap, source)
-        missed = (beyond.flatten(1).amax(1) > MISSED).nonzero()[:, 0]
+        missing = beyond.flatten(1).amax(1) > MISSED
+        missed = torch.arange(len(shown), device=self.device) if self._replayed else missing.nonzero()[:, 0]
         if len(missed):
             turned = poses.picked(missed)
             other = self.nearest(turned, LOOKING_THE_SAME_WAY)
             second, further = self._sampled(other, self._sources(turned, other)[2])
             first, short = shown.index_select(0, missed), beyond.index_select(0, missed)
-            better = (short > 0) & (further < short)
+            better = (short > 0) & (further < short) & missing[missed][:, None, None]
             shown = shown.index_copy_(0, missed, torch.where(better[:, None], second, first))
         frames = shown.round_().div_(255)
         if not to_paint:
@@ -230,8 +245,8 @@ class FrameBank:
         The place is in half widths and half heights of the frame, from its middle.
         """
         # The car has moved on the ground as a whole: the camera looks at it as it did from the recorded pose.
-        wanted = self._input_from_car[gap.frame] @ _inverse(_ground_from_car(poses))
-        ground_from_input = _inverse(wanted)
+        wanted = self._input_from_car[gap.frame] @ self._inverse(_ground_from_car(poses))
+        ground_from_input = self._inverse(wanted)
         below = self.input_from_ground[gap.frame] @ ground_from_input
         c, s, o = torch.cos(gap.turned_rad), torch.sin(gap.turned_rad), torch.zeros_like(gap.turned_rad)
         turn = torch.stack([c, o, -s, o, o + 1, o, s, o, c], -1).view(-1, 3, 3)
@@ -260,6 +275,14 @@ class FrameBank:
         shown = grid_sample(levels, grid, mode="bilinear", padding_mode="border", align_corners=False)
         return shown, near.abs_().amax(1).view(-1, height, width) - 1
 
+    def _inverse(self, matrix: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r 3 3"]:
+        if not self._replayed:
+            return cast("Tensor", torch.linalg.inv(matrix))
+        # Torch asks the device whether there is an inverse.
+        a, b, c = matrix.unbind(1)
+        columns = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], 2)
+        return columns / (a * columns[:, :, 0]).sum(1)[:, None, None]
+
     def _canvas_views(
         self,
         frames: Float[Tensor, "r 3 h w"],
@@ -270,7 +293,7 @@ class FrameBank:
     ) -> OwnViews | None:
         """The canvas' pixels of each picture with the light on them; None if no picture shows the canvas."""
         width = self.view.width_px
-        rows = self._canvas_rows(input_from_ground)
+        rows = self._ground_rows if self._replayed else self._canvas_rows(input_from_ground)
         if rows is None:
             return None
         canvas_from_input = (self._canvas_from_ground @ ground_from_input).float()
@@ -283,21 +306,12 @@ class FrameBank:
         middle = (CANVAS_SIZE_PX - 1) / 2
         inside = ((seen - middle).abs_().amax(1) < CANVAS_SIZE_PX / 2) & ahead
         touches = dilated(inside.view(len(inside), -1, width)).flatten(1) & ahead
-        counts = touches.sum(1)
-        most = int(counts.max())
-        if most == 0:
+        packed = _everything(touches) if self._replayed else _packed(touches)
+        if packed is None:
             return None
-        _, pixel = touches.nonzero(as_tuple=True)
-        # Rows are filled up with copies of their last pixel, which are painted as it is.
-        start = counts.cumsum(0) - counts
-        number = torch.arange(most, device=depth.device)
-        place = start[:, None] + torch.minimum(number, (counts[:, None] - 1).clamp_min(0))
-        own = pixel[place.clamp_max(len(pixel) - 1)]
-        valid = number < counts[:, None]
-        # A picture without any canvas has no pixel to copy: what stands for it must only be finite.
-        some = (counts > 0)[:, None]
-        at = torch.where(some[:, None], _picked(seen, own), 1.0)
-        scale = torch.where(some, depth.gather(1, own), 1.0)
+        own, valid, real = packed
+        at = torch.where(real[:, None], _picked(seen, own), 1.0)
+        scale = torch.where(real, depth.gather(1, own), 1.0)
         flat = own + first
         straight = self.camera.lens is None
         by = canvas_from_input[:, :, :2, None] if straight else canvas_from_input[..., None]
@@ -305,7 +319,7 @@ class FrameBank:
         jacobian = jacobian if straight else jacobian @ self._bend[flat]
         footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
         gain, offset, share = self._light.at(flat, _picked(source, flat).mT, gap.frame, footprints)
-        share = torch.where(some, share, 0.0)[..., None]
+        share = torch.where(real, share, 0.0)[..., None]
         clean = _picked(frames.flatten(2), flat).mT
         gain, bias = share * gain, share * (offset - clean)
         return OwnViews(
@@ -315,14 +329,19 @@ class FrameBank:
             clean=clean,
             gain=gain,
             bias=bias,
-            response=self.colour.response,
-            runs=Runs.of(footprints.features[:, 0], clean, gain, bias),
+            response=self._response,
+            runs=None if self._replayed else Runs.of(footprints.features[:, 0], clean, gain, bias),
         )
+
+    @property
+    def _ground_rows(self) -> slice | None:
+        """The rows that show the ground; None if none does."""
+        return slice(self.horizon_row, self.view.height_px) if self.horizon_row < self.view.height_px else None
 
     def _canvas_rows(self, input_from_ground: Float[Tensor, "r 3 3"]) -> slice | None:
         """The range of rows in which every picture has its canvas; None if no picture has one."""
         if self.camera.lens is not None:  # Its edges are curves, which corners do not bound.
-            return slice(self.horizon_row, self.view.height_px) if self.horizon_row < self.view.height_px else None
+            return self._ground_rows
         seen = input_from_ground @ self._corners
         ahead, row = seen[:, 2] > 0, seen[:, 1] / seen[:, 2]
         if not bool(ahead.any()):
@@ -362,13 +381,44 @@ class Views(NamedTuple):
     canvas: OwnViews | None
 
 
+class _Packed(NamedTuple):
+    """Which of their pixels are computed of R pictures.
+
+    Args:
+        own: index of each pixel among those asked about, (R, P).
+        valid: which of them are to be painted, (R, P).
+        real: which of them lie where paint could be, so that their numbers mean something, (R, P) or (R, 1).
+    """
+
+    own: Int[Tensor, "r p"]
+    valid: Bool[Tensor, "r p"]
+    real: Bool[Tensor, "r _"]
+
+
+def _packed(touches: Bool[Tensor, "r n"]) -> _Packed | None:
+    """The pixels that show the canvas, as many as the picture has that shows most; None if none shows any."""
+    counts = touches.sum(1)
+    most = int(counts.max())
+    if most == 0:
+        return None
+    _, pixel = touches.nonzero(as_tuple=True)
+    # Rows are filled up with copies of their last pixel, which are painted as it is.
+    start = counts.cumsum(0) - counts
+    number = torch.arange(most, device=touches.device)
+    place = start[:, None] + torch.minimum(number, (counts[:, None] - 1).clamp_min(0))
+    # A picture without any canvas has no pixel to copy: what stands for it must only be finite.
+    return _Packed(pixel[place.clamp_max(len(pixel) - 1)], number < counts[:, None], (counts > 0)[:, None])
+
+
+def _everything(touches: Bool[Tensor, "r n"]) -> _Packed:
+    """All pixels, whether they show the canvas or not."""
+    own = torch.arange(touches.shape[1], device=touches.device).expand_as(touches)
+    return _Packed(own, touches, touches)
+
+
 def _picked(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
     """The pixels of each picture at the given indices."""
     return planes.gather(2, index[:, None].expand(-1, planes.shape[1], -1))
-
-
-def _inverse(matrix: Float[Tensor, "*b n n"]) -> Float[Tensor, "*b n n"]:
-    return cast("Tensor", torch.linalg.inv(matrix))
 
 
 def _ground_from_car(poses: Poses) -> Float[Tensor, "r 3 3"]:

@@ -5,6 +5,7 @@ pose → picture → controller → vehicle → pose, for any number of cars at 
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import cast
 
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from roadproof.compositing.composite import composite_own
 from roadproof.compositing.variation import Looks
+from roadproof.constants import constant
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of, steer_of
 from roadproof.driving.deviation import deviation_m
@@ -139,6 +141,16 @@ class RecordedWorld:
         self.obstacles = Obstacles(recordings.obstacles or (), path, middle, device=device)
         self._shown_m = float(self.course.locate(self.bank.poses).s_m.max()) + PAST_M
         self.device = self.bank.device
+        self._replayed = False
+
+    def replayable(self) -> RecordedWorld:
+        """The same world, driven in by the same operations on tensors of the same shapes in every drive.
+
+        It does not look whether poses and answers are finite: whoever drives in it has to.
+        """
+        same = copy.copy(self)
+        vars(same).update(_replayed=True, bank=self.bank.replayable())
+        return same
 
     def fit(self, controller: Controller) -> None:
         """Fit the law of steering on the bare road, from a controller's answers to all recorded frames.
@@ -186,8 +198,7 @@ class RecordedWorld:
         course = self.course
         rows: list[tuple[Tensor, ...]] = []
         controls = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
-        off = torch.tensor([start.steer for start in starts], dtype=torch.float64, device=self.device)
-        off = off.repeat(count // len(starts))
+        off = self._offsets_of(starts)[:, 3].repeat(count // len(starts))
         gap = self.bank.nearest(Poses(*car[:3]))
         memory: object = None
         for step in range(course.count):
@@ -198,7 +209,7 @@ class RecordedWorld:
                 frames = self._frames(pattern, poses, gap, looks, step)
                 seen = (frames, car.speed_mps.float(), self.bank.command[gap.frame])
                 elapsed_s = min(step, every) * self.vehicle.dt_s
-                found, memory = next_controls_of(controller, memory, *seen, elapsed_s)
+                found, memory = next_controls_of(controller, memory, *seen, elapsed_s, finite=not self._replayed)
                 answer = found.double()
                 past = place.s_m > self._shown_m
                 steer = torch.where(past, course.law(place), answer[:, 0] + off + course.feedback(place))
@@ -214,7 +225,8 @@ class RecordedWorld:
 
     def step(self, car: Motion, controls: Float[Tensor, "r 3"]) -> Motion:
         """Where R cars are a time step later, given steer, throttle and brake; what stands in their way holds them."""
-        return self.obstacles.hold(car, self.vehicle.step(car, *controls.unbind(1)), self.vehicle.dt_s)
+        after = self.vehicle.step(car, *controls.unbind(1))
+        return self.obstacles.hold(car, after, self.vehicle.dt_s, asks=not self._replayed)
 
     def whole_path(self, rolled: Rolled, index: int) -> Float[np.ndarray, "n 2"]:
         """World x, y of one drive at all instants at which the canvas is in view.
@@ -263,11 +275,7 @@ class RecordedWorld:
     def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:
         """Cars at the first recorded frame of the clean drive, one for each start, repeated `repeats` times."""
         course, first = self.course, self.course.first
-
-        def told(name: str) -> Tensor:
-            return torch.tensor([getattr(start, name) for start in starts], device=self.device).double().repeat(repeats)
-
-        right, turned, faster = told("right_m"), told("turned_rad"), told("faster_mps")
+        right, turned, faster, _ = self._offsets_of(starts).repeat(repeats, 1).unbind(1)
         yaw = course.poses.yaw_rad[first]
         o = torch.zeros_like(right)
         return Motion(
@@ -278,6 +286,11 @@ class RecordedWorld:
             o + course.curvature[first],
             o + course.steer[max(first - 1, 0)],
         )
+
+    def _offsets_of(self, starts: tuple[Start, ...]) -> Float[Tensor, "s 4"]:
+        """The numbers of some starts."""
+        rows = tuple((start.right_m, start.turned_rad, start.faster_mps, start.steer) for start in starts)
+        return constant(rows, self.course.arclength_m)
 
     def _frames(
         self, pattern: Pattern | None, poses: Poses, gap: Gap, looks: Looks | None, step: int
