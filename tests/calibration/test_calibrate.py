@@ -133,6 +133,11 @@ def test_a_calibration_is_kept_for_its_own_drives_and_method(two_paint, drives, 
     assert Calibrated.kept(tmp_path, drives, Method.TWO_PAINT) is None
     two_paint.save(tmp_path)
     assert Calibrated.kept(tmp_path, drives, Method.TWO_PAINT).report == two_paint.report
+    loaded = Calibrated.load(tmp_path)
+    assert (loaded.report, loaded.made_of) == (two_paint.report, two_paint.made_of)
+    assert [drive.name for drive in loaded.recordings.recordings] == ["clean", "right", "left"]
+    assert loaded._repr_html_() == two_paint._repr_html_()
+    assert loaded._repr_html_().count("<tr>") == 1 + 3
     with pytest.raises(CalibrationError, match="holds a calibration with method 'two-paint', now it is 'pose'"):
         Calibrated.kept(tmp_path, drives, Method.POSE)
     clean, *others = drives.drives

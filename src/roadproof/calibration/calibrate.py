@@ -28,6 +28,7 @@ from roadproof.errors import CalibrationError
 from roadproof.geometry import homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
+from roadproof.io.html import table
 from roadproof.io.identity import require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.processes import Pool
@@ -68,14 +69,34 @@ class Calibrated:
     made_of: Mapping[str, object] = field(default_factory=dict[str, object])
     """The method and a digest of every drive, which tell it from another calibration."""
 
-    def save(self, run: Path) -> None:
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: a row for each drive."""
+        head = ("drive", "frames", "dropped", "misses what was seen by, px", "misses what the simulator states by, px")
+        return table(head, map(_shown, self.report.drives))
+
+    def save(self, run: AnyPath) -> None:
         """Write report and recordings, the recordings last, since their presence says that the calibration is finished.
 
         Raises:
             OutputError: the files cannot be written.
         """
+        run = as_path(run)
         CalibrationReport.FILE.write(run / "calibration" / "report.json", self.report, made_of=self.made_of)
         save_recordings(self.recordings, run / "recordings")
+
+    @staticmethod
+    def load(run: AnyPath) -> Calibrated:
+        """Read what `save` wrote.
+
+        Raises:
+            CalibrationError, RecordingError: a file is missing or damaged.
+        """
+        run = as_path(run)
+        path = run / "calibration" / "report.json"
+        content = CalibrationReport.FILE.content(path)
+        report = CalibrationReport.FILE.made(path, content)
+        made_of = content.get("made_of") or {"method": report.method}
+        return Calibrated(load_recordings(run / "recordings"), report, made_of)
 
     @staticmethod
     def kept(run: Path, drives: Drives, method: Method) -> Calibrated | None:
@@ -91,19 +112,20 @@ class Calibrated:
         """
         if not (run / "recordings").exists():
             return None
-        path, now = run / "calibration" / "report.json", _parts(drives, method)
-        content = CalibrationReport.FILE.content(path)
-        report = CalibrationReport.FILE.made(path, content)
-        before = content.get("made_of") or {"method": report.method}
-        require_same(run / "recordings", "a calibration", before, now, CalibrationError)
-        recordings = load_recordings(run / "recordings")
-        for recording in recordings.recordings:
+        found = Calibrated.load(run)
+        require_same(run / "recordings", "a calibration", found.made_of, _parts(drives, method), CalibrationError)
+        for recording in found.recordings.recordings:
             if not _same_frames(recording, drives):
                 raise CalibrationError(
                     f"{run / 'recordings'}: drive {recording.name} has other frames than were recorded in this run; "
                     "remove that folder, and the drives are calibrated again"
                 )
-        return Calibrated(recordings, report, now)
+        return found
+
+
+def _shown(drive: DriveReport) -> tuple[object, ...]:
+    seen, stated = ("" if each is None else f"{each.mean:.2f}" for each in (drive.residual_px, drive.stated_px))
+    return drive.name, drive.frames, len(drive.dropped), seen, stated
 
 
 def _same_frames(recording: Recording, drives: Drives) -> bool:
