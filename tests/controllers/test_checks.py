@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from markupsafe import escape
 from torch import nn
 
-from roadproof.controllers import CIL, check_controller, pilotnet_controller
+from roadproof.controllers import CIL, ControllerReport, check_controller, pilotnet_controller
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 
@@ -133,6 +134,18 @@ def test_a_controller_of_any_size_needs_a_size():
     with pytest.raises(ControllerError, match="any size"):
         check_controller(controller)
     assert check_controller(controller, size=(6, 8)).passed
+
+
+def test_a_report_survives_its_file_and_shows_what_to_do(tmp_path):
+    report = check_controller(ThreeAnswers())
+    report.save(tmp_path / "report.json")
+    assert ControllerReport.load(tmp_path / "report.json") == report
+    shown = report._repr_html_()
+    assert shown.count("<tr>") == 1 + len(report.checks)
+    assert all(str(escape(check.advice)) in shown for check in report.failures)
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises(ControllerError, match=r"report\.json"):
+        ControllerReport.load(tmp_path / "report.json")
 
 
 def test_the_same_seed_gives_the_same_report():

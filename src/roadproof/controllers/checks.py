@@ -34,6 +34,8 @@ from roadproof.controllers.protocol import (
 from roadproof.datatypes import Command
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
+from roadproof.io.html import table
+from roadproof.io.records import RecordFile, Saved
 
 DRIVES = "drives"
 """The check without which nothing can be driven."""
@@ -63,7 +65,7 @@ class ControllerCheck:
 
 
 @dataclass(frozen=True, slots=True)
-class ControllerReport:
+class ControllerReport(Saved):
     """All checks in the order in which they were made, without those that an earlier failure makes impossible."""
 
     checks: tuple[ControllerCheck, ...]
@@ -78,6 +80,11 @@ class ControllerReport:
         """The checks that did not pass."""
         return tuple(check for check in self.checks if not check.passed)
 
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: a row for each check."""
+        rows = [(c.name, "kept" if c.passed else "broken", c.found, "" if c.passed else c.advice) for c in self.checks]
+        return table(("promise", "", "found", "what to do"), rows)
+
     def require(self) -> None:
         """Refuse a controller that fails a check.
 
@@ -90,6 +97,9 @@ class ControllerReport:
             )
 
 
+ControllerReport.FILE = RecordFile(
+    kind=ControllerReport, name="roadproof-controller", error=ControllerError, remedy="check the controller again"
+)
 _ON_A_COPY = "work on a copy: steer must not write into the frames it is given"
 
 
