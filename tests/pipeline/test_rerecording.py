@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from paint_shy import PaintShy, along_a_street
 from roadproof.attacks import GradOpt, SteeringShift, methods
@@ -17,7 +18,7 @@ from roadproof.drives.folder import read_drive
 from roadproof.driving.drive_store import load_episodes
 from roadproof.errors import CalibrationError, RoadproofError
 from roadproof.pipeline.budget import Budget
-from roadproof.pipeline.stress_test import stress_test
+from roadproof.pipeline.stress_test import StressTest, stress_test
 from roadproof.recordings import Side
 from roadproof.search_space import SearchSpace
 
@@ -114,6 +115,20 @@ def test_what_is_done_is_not_done_again(done, town, street):
     on = [done for stage, done, total, _ in told if stage == "Searching on" and total == 16]
     assert on == sorted(on)
     assert on[-1] == 16
+
+
+def test_the_folder_of_a_run_is_its_result(done):
+    folder, result, _ = done
+    loaded = StressTest.load(folder)
+    assert loaded.evaluation.trials == result.evaluation.trials
+    assert loaded.selection.driven == result.selection.driven
+    assert loaded.rounds.best.driven == result.rounds.best.driven
+    assert [each.simulator_calls for each in loaded.rounds.done] == [5, 5]
+    assert torch.equal(loaded.pattern.boxes, result.pattern.boxes)
+    assert loaded.cost.keys() == result.cost.keys()
+    assert (loaded.prediction, loaded.fidelity, loaded.cheapest) == (None, None, None)
+    with pytest.raises(RoadproofError, match=r"round-1.evaluation.evaluation\.json"):
+        StressTest.load(folder / "round-1")
 
 
 def test_a_controller_that_was_trained_again_is_not_answered_from_what_the_one_before_left(done, town, street):

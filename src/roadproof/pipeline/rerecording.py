@@ -15,16 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count, takewhile
 from pathlib import Path
 
 import torch
 
 from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, kept_attack
 from roadproof.attacks.groups import Direction, Group, parse_groups
-from roadproof.calibration import Calibrated, calibrate, replays_needed
+from roadproof.calibration import Calibrated, CalibrationReport, calibrate, replays_needed
 from roadproof.calibration import Method as Calibration
 from roadproof.controllers import Controller
-from roadproof.drives import Drives, record_along
+from roadproof.drives import Drive, Drives, record_along
+from roadproof.drives.folder import read_drive
 from roadproof.driving.episode import Episode
 from roadproof.errors import CalibrationError, RecordingError
 from roadproof.pipeline.selection import Selection, select_by_driving
@@ -71,6 +73,20 @@ class Rounds:
     def simulator_calls(self) -> int:
         """Number of simulator drives in all rounds."""
         return sum(each.simulator_calls for each in self.done)
+
+    @staticmethod
+    def kept(folder: Path, first: Selection) -> Rounds | None:
+        """The finished rounds in the folder of a run, after the selection before them; None if there is none.
+
+        Raises:
+            RoadproofError: a round is damaged.
+        """
+        places = takewhile(
+            lambda place: (place / "selection" / "selection.json").exists(),
+            (folder / f"round-{number}" for number in count(1)),
+        )
+        done = tuple(map(_read_round, places))
+        return Rounds(first=first, done=done) if done else None
 
 
 def search_on(
@@ -191,8 +207,23 @@ def _recorded(
         # The clean drive's replays lie there already and are not driven again.
         calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration", pool=pool)
         calibrated.save(place)
-    calls = drive.calls + replays_needed(len(both.drives), method) - replays_needed(len(clean.drives), method)
-    return calibrated.recordings.recordings[1], calls
+    return calibrated.recordings.recordings[1], _calls_of(drive, method)
+
+
+def _calls_of(drive: Drive, method: Calibration) -> int:
+    """Number of drives that recording a round's drive and calibrating it beside the clean one takes."""
+    return drive.calls + replays_needed(2, method) - replays_needed(1, method)
+
+
+def _read_round(place: Path) -> Round:
+    """A finished round, from its folder."""
+    attack, selection = AttackResult.load(place / "attack"), Selection.load(place / "selection")
+    report = CalibrationReport.load(place / "calibration" / "report.json")
+    drive = read_drive(place.name, place)
+    if drive is None:
+        raise RecordingError(f"{place} lacks the drive {place.name}; give the same call again to record it")
+    calls = _calls_of(drive, Calibration(report.method)) + selection.simulator_calls
+    return Round(attack=attack, selection=selection, simulator_calls=calls)
 
 
 def _gone_on(method: Method) -> Method:

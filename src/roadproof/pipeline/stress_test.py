@@ -39,8 +39,8 @@ from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
-from roadproof.pipeline.stage_costs import Ledger, StageCost
-from roadproof.pipeline.stages import OnProgress, Stages
+from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
+from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages
 from roadproof.processes import require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
@@ -88,6 +88,32 @@ class StressTest:
         rows = [] if told is None else [(f"{told.predicted_m:.2f}", f"{told.driven_m:.2f}")]
         search, judged = map(html_of, (self.attack, self.evaluation))
         return search + table(("predicted m", "driven m, to verify"), rows) + judged
+
+    @staticmethod
+    def load(folder: AnyPath) -> StressTest:
+        """Read the folder of a finished stress test, which keeps all of it.
+
+        Rounds are there as far as they came; why there are fewer than asked for is not kept.
+
+        Raises:
+            RoadproofError: a stage is missing or damaged; the message names it.
+        """
+        folder = as_path(folder)
+        place, less = folder / "selection", folder / CHEAPEST
+        selection = Selection.load(place) if place.is_dir() else None
+        prediction, fidelity = folder / "prediction.npz", folder / "evaluation" / "fidelity.npz"
+        return StressTest(
+            attack=AttackResult.load(folder / "attack"),
+            selection=selection,
+            rounds=None if selection is None else Rounds.kept(folder, selection),
+            prediction=Prediction.load(prediction) if prediction.exists() else None,
+            evaluation=Evaluation.load(folder / "evaluation"),
+            fidelity=Fidelity.load(fidelity) if fidelity.exists() else None,
+            cost=read_cost(folder),
+            cheapest=(Cheapest.load(less), Selection.load(less / "selection"))
+            if (less / "cheapest.json").exists()
+            else None,
+        )
 
 
 def stress_test(
