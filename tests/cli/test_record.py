@@ -11,7 +11,7 @@ import pytest
 import needs
 from command import answered, stored
 from roadproof.cli import verbs
-from roadproof.drives import load_drives
+from roadproof.drives import Drives
 from roadproof.io import commands
 from roadproof.pipeline.selection import Selection
 from roadproof.recordings import load_recordings
@@ -142,7 +142,7 @@ def test_a_scenario_that_is_a_link_out_of_the_folder_is_not_followed(call, workp
 def test_a_recording_is_not_mixed_with_another(run, call):
     said = call(*RECORD, "--weather", "rainy-noon", code=2)
     assert "holds a recording with weather 'clear-noon', now it is 'rainy-noon'" in said
-    assert load_drives(run / "record").settings.weather == "clear-noon"
+    assert Drives.load(run / "record").settings.weather == "clear-noon"
 
 
 MISTAKES = {

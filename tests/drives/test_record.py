@@ -8,7 +8,7 @@ import pytest
 import needs
 from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
-from roadproof.drives import Swerve, Trajectories, Window, load_drives, record, record_along
+from roadproof.drives import Drives, Swerve, Trajectories, Window, record, record_along
 from roadproof.drives.folder import write_settings
 from roadproof.errors import OutputError, RecordingError, ScenarioError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
@@ -81,7 +81,7 @@ def test_finished_drives_are_not_driven_again(drives, folder, town):
     (folder / "left" / "episode.npz").unlink()
     (folder / "left").rmdir()
     with pytest.raises(RecordingError, match="lacks the drive left; give the same `roadproof record` again"):
-        load_drives(folder)
+        Drives.load(folder)
     driven = []
 
     def watched(world):
@@ -90,7 +90,7 @@ def test_finished_drives_are_not_driven_again(drives, folder, town):
 
     again = record(town, watched, LEFT, folder=folder, **ASKED)
     assert len(driven) == 1
-    loaded = load_drives(folder)
+    loaded = Drives.load(folder)
     assert loaded.settings == again.settings == drives.settings
     for one, two, three in zip(drives.drives, again.drives, loaded.drives, strict=True):
         assert one.name == two.name == three.name
@@ -114,13 +114,13 @@ def test_damage_is_named(drives, folder, tmp_path):
     whole = path.read_bytes()
     path.write_bytes(whole[:200])
     with pytest.raises(RecordingError, match=r"clean.drive\.npz is damaged"):
-        load_drives(copy)
+        Drives.load(copy)
     path.write_bytes(whole)
     (copy / "record.json").write_text((copy / "record.json").read_text().replace('"seed": 4', '"seed": "four"'))
     with pytest.raises(RecordingError, match=r"record\.json is incomplete or damaged"):
-        load_drives(copy)
+        Drives.load(copy)
     with pytest.raises(RecordingError, match=r"has no record\.json"):
-        load_drives(tmp_path)
+        Drives.load(tmp_path)
 
 
 def test_a_driver_that_never_sees_the_canvas_is_refused(town):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import needs
 from roadproof.attacks import AttackResult
 from roadproof.controllers import load_controller
-from roadproof.drives import load_drives
+from roadproof.drives import Drives
 from roadproof.driving.evaluate import drivers
 from roadproof.pipeline import stages
 from roadproof.pipeline.budget import QUICK
@@ -38,7 +38,7 @@ def test_a_search_for_less_paint_that_found_none_is_not_repeated(tmp_path, monke
     )
     write_attack(tmp_path)
     write_record(tmp_path / "record", scenario)
-    found, drives = AttackResult.load(tmp_path), load_drives(tmp_path / "record")
+    found, drives = AttackResult.load(tmp_path), Drives.load(tmp_path / "record")
     for wanted_m in (0.5, 0.5, 0.7):
         assert run.cheapest(recording_set(), found, wanted_m, drives) is None
     assert asked == [0.5, 0.7]

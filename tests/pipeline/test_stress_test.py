@@ -11,7 +11,7 @@ from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
 from roadproof.calibration import CalibrationReport, Method
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
-from roadproof.drives import Swerve, Trajectories, Window, load_drives
+from roadproof.drives import Drives, Swerve, Trajectories, Window
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.pipeline.budget import BUDGETS, Budget
@@ -71,7 +71,7 @@ def test_the_whole_loop_leaves_every_stage_in_its_folder_and_two_processes_the_s
 
 
 def check_folder(folder, result):
-    assert [drive.name for drive in load_drives(folder / "record").drives] == ["clean", "right", "left"]
+    assert [drive.name for drive in Drives.load(folder / "record").drives] == ["clean", "right", "left"]
     assert len(load_recordings(folder / "recordings").recordings) == 3
     assert Selection.load(folder / "selection").driven == result.selection.driven
     assert Evaluation.load(folder / "evaluation").trials == result.evaluation.trials

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from roadproof.drives import load_drives
+from roadproof.drives import Drives
 from roadproof.errors import RoadproofError
 from roadproof.recordings import load_recordings
 from roadproof.report.page import write_report
@@ -21,7 +21,7 @@ SLOW_S = 30.0
 DOORS: dict[str, Callable[[Path], object]] = {
     "run": read_run,
     "recordings": lambda folder: load_recordings(folder / "recordings"),
-    "record": lambda folder: load_drives(folder / "record"),
+    "record": lambda folder: Drives.load(folder / "record"),
 }
 REPORT: dict[str, Callable[[Path], object]] = {"report": write_report}
 

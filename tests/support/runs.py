@@ -19,9 +19,12 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.trial import judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
+from roadproof.hardening.judgement import Clean, Judged, Judgement
+from roadproof.hardening.result import Hardened, Round
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.film import Strip
 from roadproof.pipeline.selection import Driven, Selection
+from roadproof.pipeline.stage_costs import StageCost
 from roadproof.recordings import Side, save_recordings
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import find_scenario
@@ -225,6 +228,35 @@ def write_record(folder, scenario):
             ),
             folder,
         )
+
+
+def hardened():
+    """A hardening that helped."""
+    judged = [
+        Judged(
+            scenario="left-03",
+            kind=kind,
+            after=after,
+            deviation_m=(metres, metres),
+            left_lane=(metres > 1, False),
+            simulator_calls=4,
+        )
+        for kind in ("by gradient", "random")
+        for after, metres in ((False, 1.2), (True, 0.3))
+    ]
+    rounds = tuple(
+        Round(number=number, deviation_m={"right-02": metres}, left_lane=metres / 2)
+        for number, metres in ((0, 1.1), (1, 0.4))
+    )
+    clean = (Clean(4, 4, ()), Clean(4, 3, ("left-03, rainy-noon",)))
+    return Hardened(
+        controller="pilotnet",
+        hardened="hardened.safetensors",
+        rounds=rounds,
+        best=1,
+        judgement=Judgement(tuple(judged), clean),
+        cost={"learn": StageCost(90.0), "judge": StageCost(60.0, 16)},
+    )
 
 
 def read_result(folder):

@@ -31,7 +31,7 @@ def calibrate(
     from roadproof.calibration import METHODS, Calibrated, replays_needed
     from roadproof.calibration import calibrate as run
     from roadproof.cli.progress import progress
-    from roadproof.drives import load_drives
+    from roadproof.drives import Drives
     from roadproof.errors import RecordingError
     from roadproof.io.locks import hold
     from roadproof.simulators.loading import open_simulator
@@ -40,7 +40,7 @@ def calibrate(
     runs = [folder] if (folder / "record").is_dir() else sorted(path.parent for path in folder.glob("*/record"))
     if not runs:
         raise RecordingError(f"{folder} holds no run with a folder named record; make one with `roadproof record`")
-    recorded = {path: load_drives(path / "record") for path in runs}
+    recorded = {path: Drives.load(path / "record") for path in runs}
     hold(folder)
 
     for path, drives in recorded.items():

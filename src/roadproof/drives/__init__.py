@@ -2,7 +2,6 @@
 
 from roadproof.drives.folder import Drive as Drive
 from roadproof.drives.folder import Drives as Drives
-from roadproof.drives.folder import load_drives as load_drives
 from roadproof.drives.record import record as record
 from roadproof.drives.record import record_along as record_along
 from roadproof.drives.trajectories import Scheme as Scheme

@@ -22,6 +22,7 @@ from roadproof.driving.episode import Episode
 from roadproof.errors import RecordingError
 from roadproof.geometry import CameraModel, CropResize
 from roadproof.io.files import AnyPath, as_path, check_closed, write_folder_atomically
+from roadproof.io.html import table
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Side, Track
@@ -147,6 +148,42 @@ class Drives:
         """Number of drives the simulator made, those given up included."""
         return sum(drive.calls for drive in self.drives)
 
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: a row for each drive."""
+        head = ("drive", "frames", "furthest from the clean drive, m", "note")
+        return table(head, [(each.name, len(each.frames), f"{each.offset_m:+.2f}", each.note) for each in self.drives])
+
+    def save(self, folder: AnyPath) -> None:
+        """Write the folder that `record` fills where it is given one.
+
+        Raises:
+            RecordingError: the folder holds a recording with other settings.
+            OutputError: the folder holds one of the drives already, or cannot be written.
+        """
+        folder = as_path(folder)
+        write_settings(self.settings, folder)
+        for drive in self.drives:
+            write_drive(drive, folder)
+
+    @staticmethod
+    def load(folder: AnyPath) -> Drives:
+        """Read a finished recording, of `save` or of `record`.
+
+        Raises:
+            RecordingError: the folder is missing, damaged, or not finished; the message says what to do.
+            EpisodeError: an episode in it is damaged.
+        """
+        folder = as_path(folder)
+        settings = read_settings(folder)
+        plans = settings.trajectories.plans()
+        drives = [read_drive(plan.name, folder) for plan in plans]
+        missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]
+        if missing:
+            raise RecordingError(
+                f"{folder} lacks the drive {missing[0]}; give the same `roadproof record` again to finish"
+            )
+        return Drives(settings=settings, drives=tuple(drive for drive in drives if drive is not None))
+
 
 def write_settings(settings: Settings, folder: Path) -> bool:
     """Write the settings of a recording, which begins its folder; says whether it was not begun before.
@@ -207,23 +244,6 @@ def read_settings(folder: Path) -> Settings:
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
     check_closed(folder, RecordingError)
     return _SETTINGS.read(folder / "record.json")
-
-
-def load_drives(folder: AnyPath) -> Drives:
-    """Read a finished recording.
-
-    Raises:
-        RecordingError: the folder is missing, damaged, or not finished; the message says what to do.
-        EpisodeError: an episode in it is damaged.
-    """
-    folder = as_path(folder)
-    settings = read_settings(folder)
-    plans = settings.trajectories.plans()
-    drives = [read_drive(plan.name, folder) for plan in plans]
-    missing = [plan.name for plan, drive in zip(plans, drives, strict=True) if drive is None]
-    if missing:
-        raise RecordingError(f"{folder} lacks the drive {missing[0]}; give the same `roadproof record` again to finish")
-    return Drives(settings=settings, drives=tuple(drive for drive in drives if drive is not None))
 
 
 class _Trajectories(TypedDict):

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from roadproof.datatypes import Ending, Event, VehicleState, Weather
 from roadproof.errors import EpisodeError
+from roadproof.io.html import table
 from roadproof.io.records import RecordFile, Saved, check_arrays
 from roadproof.simulators.protocol import PaintKind
 
@@ -82,6 +83,18 @@ class Episode(Saved):
     def __len__(self) -> int:
         """How many observations there are."""
         return self.time_s.size
+
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: what was driven, and how it ended."""
+        events = ", ".join(f"{each.kind} at {each.time_s:.1f} s" for each in self.events)
+        rows = (
+            ("scenario", f"{self.scenario}, {self.weather}"),
+            ("paint", self.paint if self.painted else "none"),
+            ("others on the road", f"{self.cars} cars, {self.pedestrians} pedestrians, seed {self.seed}"),
+            ("ended", f"{self.ending}, after {self.time_s[-1] - self.time_s[0]:.1f} s"),
+            ("events", events or "none"),
+        )
+        return table(("drive", ""), rows)
 
     def state(self, step: int) -> VehicleState:
         """Pose and speed of the car at an observation."""

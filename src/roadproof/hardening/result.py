@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from roadproof.driving.evaluation import ATTACK
+from roadproof.errors import TrainingError
 from roadproof.hardening.judgement import Judgement
-from roadproof.io.files import write_json
+from roadproof.io.files import AnyPath, as_path
+from roadproof.io.html import table
+from roadproof.io.records import RecordFile
 from roadproof.pipeline.stage_costs import StageCost
 from roadproof.pipeline.stress_test import StressTest
-
-FORMAT = "roadproof-hardening"
-FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +65,35 @@ class Hardened:
     judgement: Judgement | None
     cost: dict[str, StageCost]
 
-    def save(self, folder: Path) -> None:
+    def _repr_html_(self) -> str:
+        """How a notebook shows it: a row for each round, and the verdict."""
+        rows = [(f"round {r.number}", f"{r.mean_m:.2f} m, leaves its lane in {r.left_lane:.0%}") for r in self.rounds]
+        told = [] if self.judgement is None else [("on other streets", self.judgement.verdict().sentence)]
+        return table(("attacked afresh", "driven deviation, mean"), [*rows, ("kept", f"round {self.best}"), *told])
+
+    def save(self, folder: AnyPath) -> None:
         """Write hardening.json.
 
         Raises:
             OutputError: the folder cannot be written.
         """
-        content = {"format": FORMAT, "version": FORMAT_VERSION, "kind": "closed loop"} | asdict(self)
-        if self.judgement is not None:
-            content["verdict"] = asdict(self.judgement.verdict())
-        write_json(folder / "hardening.json", content)
+        verdict = {} if self.judgement is None else {"verdict": self.judgement.verdict()}
+        _FILE.write(as_path(folder) / "hardening.json", self, **verdict)
+
+    @staticmethod
+    def load(folder: AnyPath) -> Hardened:
+        """Read what `save` wrote, from the folder of `harden`.
+
+        Raises:
+            TrainingError: the file is missing, damaged or of another format.
+        """
+        return _FILE.read(as_path(folder) / "hardening.json")
+
+
+_FILE = RecordFile(
+    kind=Hardened,
+    name="roadproof-hardening",
+    error=TrainingError,
+    remedy="harden again",
+    notes={"kind": "closed loop"},
+)

@@ -17,7 +17,7 @@ from jaxtyping import Int
 from roadproof.attacks import AttackResult, Cheapest
 from roadproof.calibration.report import CalibrationReport
 from roadproof.datatypes import Weather
-from roadproof.drives import Drives, load_drives
+from roadproof.drives import Drives
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation, load_paint
@@ -157,7 +157,7 @@ def read_run(folder: Path) -> Run:
     report = folder / "calibration" / "report.json"
     run = Run(
         folder=folder,
-        drives=load_drives(folder / "record") if (folder / "record" / "record.json").exists() else None,
+        drives=Drives.load(folder / "record") if (folder / "record" / "record.json").exists() else None,
         recordings=load_recordings(folder / "recordings") if (folder / "recordings").is_dir() else None,
         calibration=CalibrationReport.load(report) if report.exists() else None,
         attack=attack,

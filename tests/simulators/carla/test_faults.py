@@ -24,7 +24,7 @@ pytest.importorskip("msgpack", reason="serving needs the extra roadproof[carla]"
 import carla
 
 from roadproof.datatypes import Control, VehicleState
-from roadproof.drives import Swerve, Trajectories, Window, load_drives, record
+from roadproof.drives import Drives, Swerve, Trajectories, Window, record
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CanvasPlacement
 from roadproof.scenarios import save_scenarios
@@ -89,7 +89,7 @@ def test_a_server_killed_in_mid_episode_keeps_the_recordings_so_far_and_the_rest
         drives = recorded(world, tmp_path)
     assert [drive.name for drive in drives.drives] == ["clean", "right", "left"]
     assert kept.stat().st_mtime_ns == before
-    assert len(load_drives(tmp_path).drives) == 3
+    assert len(Drives.load(tmp_path).drives) == 3
 
 
 @pytest.mark.slow
