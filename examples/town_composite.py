@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from roadproof import SearchSpace, TownSimulator, calibrate, composite, find_scenario, record
 from roadproof.compositing import view_canvas
 from roadproof.drives import Drive, Trajectories, Window
-from roadproof.pipeline.fidelity import rendered_frames
-from roadproof.training.expert import expert
+from roadproof.pipeline import rendered_frames
+from roadproof.training import expert
 
 SCENARIO = find_scenario("right-04")
 AHEAD_M = (12.0, 9.0, 6.5)

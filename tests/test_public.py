@@ -51,6 +51,9 @@ def test_readme_docs_and_examples_use_public_names_and_documented_rooms_alone(pa
     assert "roadproof.geometry" in rooms
     text = path.read_text()
     assert set(re.findall(r"^(?:from|import) (roadproof[\w.]*)", text, re.M)) <= rooms | {"roadproof"}
+    for room in re.findall(r"^(?:from|import) (roadproof[\w.]*)", text, re.M):
+        # Nothing deeper than a module at the top, or a package.
+        assert room.count(".") < 2 or hasattr(importlib.import_module(room), "__path__"), room
     for room, names in re.findall(r"^from (roadproof[\w.]*) import ([\w, ]+)$", text, re.M):
         assert [name for name in names.split(", ") if not hasattr(importlib.import_module(room), name)] == []
     for name in re.findall(r"\broadproof\.(\w[\w.]*\w)", text):

@@ -1,6 +1,7 @@
 """The expert on a car of a few lines: it keeps to the route, slows for bends, and hits nobody."""
 
 import math
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -74,7 +75,7 @@ def test_the_expert_turns_the_wheel_towards_the_route() -> None:
 
 
 def test_speed_falls_in_time_for_bends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadproof.training.expert.CRUISE_MPS", 9.0)
+    monkeypatch.setattr(import_module("roadproof.training.expert"), "CRUISE_MPS", 9.0)
     for scenario in SCENARIOS:
         route = scenario_route(scenario, load_map("town"))
         limit = speed_limits(route)

@@ -4,3 +4,5 @@
 the car and the traffic; `signals` tells which lights and signs the car runs; `inject` paints the canvas into pictures;
 `simulator` is what `roadproof` drives.
 """
+
+from roadproof.simulators.carla.simulator import CarlaSimulator as CarlaSimulator
