@@ -99,11 +99,10 @@ def attack(
     search = method.search(
         measure,
         space,
-        objective,
+        objective=objective,
         seed=seed,
         starts=[_points(space, starts, group) for group in groups],
         checkpoint=None if checkpoint is None else as_path(checkpoint),
-        aim=objective.name,
         on_step=on_step,
     )
     frames = measure.frames_evaluated

@@ -19,12 +19,10 @@ from torch import Tensor
 from roadproof.attacks import proposals
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.driven import DrivenMeasure
-from roadproof.attacks.gradopt import Running, Search
-from roadproof.attacks.groups import Group, parse_groups
+from roadproof.attacks.gradopt import Running, Search, aim_of
 from roadproof.attacks.method import Method
 from roadproof.attacks.objective import Measure, Objective
 from roadproof.errors import RoadproofError
-from roadproof.recordings import RecordingSet
 from roadproof.search_space import Family, SearchSpace
 
 AT_ONCE = 16
@@ -56,23 +54,20 @@ class BlackBox(Method):
     def __post_init__(self) -> None:
         at_least_one(self, "calls")
 
-    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """The function that proposes the next points of a space; the first `given` trials come from another search."""
+    def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
+        """The function that proposes the next points of a space."""
         raise NotImplementedError
 
-    def steps(self, objective: Objective) -> int:
+    def proposer_after(self, _: int, /, space: SearchSpace, seed: int) -> proposals.Propose:
+        """The same where so many first trials come from another search; by default they count as its own."""
+        return self.proposer(space, seed)
+
+    def steps(self, _: Objective, /) -> int:
         """The number of patterns tried, since `on_step` is called once for each."""
-        del objective
         return self.calls
 
-    def groups(self, recordings: RecordingSet, objective: Objective | None = None) -> tuple[Group, ...]:
-        """One group of all drives, to whichever side each gives way."""
-        del objective
-        return parse_groups("all", recordings)
-
-    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+    def search(self, measure: Measure, space: SearchSpace, **running: Unpack[Running]) -> Search:
         """Try patterns, on recordings several at once; the value of each is that of its best group."""
-        del objective
         groups = len(measure.groups)
 
         def value(unit: Float[Tensor, "b k n"]) -> Float[Tensor, " b"]:
@@ -88,7 +83,7 @@ class BlackBox(Method):
             first=torch.cat(list(given)) if sum(map(len, given)) else None,
             world=measure.fingerprint(),
             checkpoint=running.get("checkpoint"),
-            aim=running.get("aim", ""),
+            aim=aim_of(running),
             on_step=running.get("on_step", lambda _calls, _best: None),
         )
         best = trials.value.topk(min(KEPT, len(trials))).indices
@@ -102,9 +97,8 @@ class RandomSearch(BlackBox):
 
     word: ClassVar[str] = "random"
 
-    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+    def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
         """Independent random points."""
-        del given
         return proposals.random(space, seed)
 
 
@@ -114,9 +108,8 @@ class TPE(BlackBox):
 
     word: ClassVar[str] = "tpe"
 
-    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+    def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
         """Optuna's TPE sampler on the unit cube."""
-        del given
         return proposals.optuna("tpe", space.figures * len(space.names), seed)
 
 
@@ -126,9 +119,8 @@ class GaussianProcess(BlackBox):
 
     word: ClassVar[str] = "gp"
 
-    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+    def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
         """Optuna's Gaussian process sampler on the unit cube."""
-        del given
         return proposals.optuna("gp", space.figures * len(space.names), seed)
 
 
@@ -138,8 +130,12 @@ class CMAES(BlackBox):
 
     word: ClassVar[str] = "cma-es"
 
-    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
-        """CMA-ES, begun at the middle of the unit cube, or at the best of the points given."""
+    def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
+        """CMA-ES, begun at the middle of the unit cube."""
+        return self.proposer_after(0, space, seed)
+
+    def proposer_after(self, given: int, /, space: SearchSpace, seed: int) -> proposals.Propose:
+        """CMA-ES, begun at the best of the points given."""
         return proposals.cma_es(space.figures * len(space.names), seed, given)
 
 
@@ -159,9 +155,8 @@ class BayesianOptimisation(BlackBox):
     def __post_init__(self) -> None:
         at_least_one(self, "calls", "random_calls")
 
-    def proposer(self, space: SearchSpace, seed: int, given: int) -> proposals.Propose:
+    def proposer(self, space: SearchSpace, seed: int) -> proposals.Propose:
         """The paper's Bayesian optimisation, on parameters in natural units (px, degrees, colour levels)."""
-        del given
         return proposals.published_bo(proposals.natural_ranges(space), self.random_calls, seed)
 
 
@@ -232,7 +227,7 @@ def blackbox_search(
             f"at_once is {at_once}, but {method.word} proposes one point at a time; run several scenarios side by side"
         )
     given = None if first is None else cast("list[Any]", first.tolist())
-    propose = method.proposer(space, seed, len(given or ()))
+    propose = method.proposer_after(len(given or ()), space, seed)
     # More calls are the same search, gone on with.
     fields = {name: each for name, each in asdict(method).items() if name != "calls"}
     identity = repr((space, method.word, fields, seed, at_once, given, world))

@@ -27,7 +27,7 @@ from roadproof.attacks.captured import Replay, in_words, replay_of
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.groups import Points, Values
-from roadproof.attacks.objective import Measure, RecordedMeasure
+from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
 from roadproof.attacks.surrogate import FIXED, Surrogate
@@ -136,7 +136,7 @@ class Running(TypedDict, total=False):
         seed: seed of everything random; required.
         starts: points to begin at, one tensor (S, K, N) per group; random points fill the remaining starts.
         checkpoint: file that keeps the search after every step and from which the same search goes on; None for none.
-        aim: name of the objective, which the checkpoint says; a search for another is refused there.
+        objective: what is made large; its name stands in the checkpoint, where a search for another is refused.
         on_step: called after every step with its number and the best value so far. On a GPU some steps are taken
             together (`captured.LOOK_S`); then the file is written, and this called, after the last of them.
     """
@@ -144,8 +144,13 @@ class Running(TypedDict, total=False):
     seed: Required[int]
     starts: Sequence[Float[Tensor, "s k n"]]
     checkpoint: Path | None
-    aim: str
+    objective: Objective
     on_step: Callable[[int, float], object]
+
+
+def aim_of(running: Running) -> str:
+    """The name of the objective that a search is for; empty where nobody said."""
+    return running["objective"].name if "objective" in running else ""
 
 
 def gradopt(
@@ -170,7 +175,7 @@ def gradopt(
     on_step = running.get("on_step", lambda _iteration, _best: None)
     given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
-    checkpoint = Checkpoint(running.get("checkpoint"), identity, running.get("aim", ""))
+    checkpoint = Checkpoint(running.get("checkpoint"), identity, aim_of(running))
     state = checkpoint.load(measure.device)
     at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
     if state is None:

@@ -22,7 +22,7 @@ class Method:
     word: ClassVar[str]
     by_gradient: ClassVar[bool] = True
 
-    def steps(self, objective: Objective) -> int:
+    def steps(self, objective: Objective, /) -> int:
         """How often `on_step` is called during a search for an objective."""
         raise NotImplementedError
 
@@ -30,15 +30,16 @@ class Method:
         """The groups of drives attacked together by default.
 
         With gradients the paper's two sides, each apart, if drives were perturbed to both, or slower and faster for a
-        speed change; otherwise all drives.
+        speed change; otherwise all drives, to whichever side each gives way.
 
         Args:
             recordings: the drives that are attacked.
             objective: what the search makes large; None for one of steering or of the path.
         """
-        if isinstance(objective, SpeedChange):
+        if self.by_gradient and isinstance(objective, SpeedChange):
             return parse_groups("slower,faster", recordings)
-        return (RIGHT_GROUP, LEFT_GROUP) if recordings.has_both_sides else parse_groups("all", recordings)
+        sides = self.by_gradient and recordings.has_both_sides
+        return (RIGHT_GROUP, LEFT_GROUP) if sides else parse_groups("all", recordings)
 
     def measure(
         self,
@@ -62,8 +63,7 @@ class Method:
         Raises:
             RoadproofError: the method cannot search these patterns; the message says what to change.
         """
-        del space
 
-    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+    def search(self, measure: Measure, space: SearchSpace, **running: Unpack[Running]) -> Search:
         """Make an objective's measure large for all of its groups."""
         raise NotImplementedError

@@ -77,13 +77,14 @@ class GradOpt(Method):
         )
         return (*first, *proper) if self.halving else proper
 
-    def steps(self, objective: Objective) -> int:
+    def steps(self, objective: Objective, /) -> int:
         """Number of iterations of all rungs together."""
         return sum(rung.iterations for rung in self.ladder(objective))
 
-    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+    def search(self, measure: Measure, space: SearchSpace, **running: Unpack[Running]) -> Search:
         """Climb all rungs of the search by gradient."""
-        return gradopt(cast("RecordedMeasure", measure), space, self.ladder(objective), **running)
+        ladder = self.ladder(running.get("objective", SteeringShift()))
+        return gradopt(cast("RecordedMeasure", measure), space, ladder, **running)
 
 
 SHIFT_RUNGS = (Rung(24, 30, every=4), Rung(8, 30, every=2))
@@ -135,9 +136,8 @@ class Published(Method):
         if self.masks not in MASKS:
             raise RoadproofError(f"masks is {self.masks!r}, expected {' or '.join(MASKS)}")
 
-    def steps(self, objective: Objective) -> int:
+    def steps(self, _: Objective, /) -> int:
         """The number of iterations, 250."""
-        del objective
         return sum(rung.iterations for rung in self.ladder)
 
     @property
@@ -176,9 +176,8 @@ class Published(Method):
                 "search with method gradopt"
             )
 
-    def search(self, measure: Measure, space: SearchSpace, objective: Objective, **running: Unpack[Running]) -> Search:
+    def search(self, measure: Measure, space: SearchSpace, **running: Unpack[Running]) -> Search:
         """Search by gradient as published."""
-        del objective
         return gradopt(cast("RecordedMeasure", measure), space, self.ladder, momentum=0.0, **running)
 
 

@@ -76,7 +76,7 @@ class HardeningBudget:
             RoadproofError: the library of the black-box method is not installed.
         """
         if isinstance(self.unseen, BlackBox):
-            self.unseen.proposer(space, 0, 0)
+            self.unseen.proposer(space, 0)
 
     def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
         """What judging searches besides `judge`: method and search space by the name of the kind."""
