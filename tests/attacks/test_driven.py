@@ -10,6 +10,7 @@ import torch
 from paint_shy import along_a_street
 from roadproof.attacks import CMAES, AttackResult, GradOpt, InSimulator, PathDeviation, SteeringShift, attack
 from roadproof.attacks.driven import DrivenMeasure, effect_of
+from roadproof.attacks.groups import LEFT_GROUP
 from roadproof.controllers import load_controller
 from roadproof.driving.rollout import rollout
 from roadproof.driving.trial import judge
@@ -100,3 +101,14 @@ def test_a_search_by_gradient_in_a_simulator_is_refused_before_it_drives():
     place = InSimulator(TownSimulator(), find_scenario("left-03"))
     with pytest.raises(RoadproofError, match="needs gradients, and a drive in a simulator has none"):
         attack(place, load_controller("pilotnet"), SPACE, method=GradOpt())
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"groups": (LEFT_GROUP,)}, {"device": "cuda"}, {"random_patterns": 3}],
+    ids=lambda given: next(iter(given)),
+)
+def test_what_only_recordings_use_is_refused_in_a_simulator(given):
+    place = InSimulator(TownSimulator(), find_scenario("left-03"))
+    with pytest.raises(RoadproofError, match=f"in a simulator does not use {next(iter(given))}; leave it out"):
+        attack(place, load_controller("pilotnet"), SPACE, method=CMAES(calls=4), **given)

@@ -69,11 +69,11 @@ def attack(
         objective: what is made large: `SteeringShift()` by default, as published; `PathDeviation()` or
             `SpeedChange()`, which drive in the recordings and need their tracks; or one of your own.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
-        groups: groups of recorded drives, each attacked together. By default, for a method with gradients and drives
-            perturbed to both sides, the paper's two sides, of which the stronger is kept, or for a speed change slower
-            and faster; otherwise one group of all drives, to whichever side they give way.
+        groups: groups of recorded drives, each attacked together; none in a simulator. By default, for a method with
+            gradients and drives perturbed to both sides, the paper's two sides, of which the stronger is kept, or for a
+            speed change slower and faster; otherwise one group of all drives, to whichever side they give way.
         seed: seed of everything random, 0 by default.
-        device: torch device on which the search computes.
+        device: torch device on which a search on recordings computes.
         random_patterns: number of random patterns per group for the self-check on recordings; 0 leaves that check out.
         starts: candidates of an earlier search to start from, each in its own group, in place of as many random starts.
         checkpoint: file that keeps the search after every step, so that an interrupted one goes on; None for none.
@@ -83,12 +83,14 @@ def attack(
         ControllerError: the controller takes frames of another size, or answers NaN.
         RecordingError: a group names drives that the set lacks.
         PatternError: the method cannot search these patterns, or the limits on paint leave none on this road.
-        RoadproofError: the method needs gradients, which a simulator does not give; or `rollout` fails there.
+        RoadproofError: the method needs gradients, which a simulator does not give; groups, a device or random patterns
+            are given for one; or `rollout` fails there.
     """
     objective, method = objective or SteeringShift(), method or GradOpt()
     method.check_space(space)
     start = time.perf_counter()
     if isinstance(recordings, InSimulator):
+        _refuse_in_simulator(groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
         site = site_at(recordings.simulator, recordings.scenario)
         measure = _driven(recordings, controller, objective, method)
     else:
@@ -130,6 +132,12 @@ def attack(
         seed=seed,
         conspicuousness=conspicuousness(first.pattern, space.site or site),
     )
+
+
+def _refuse_in_simulator(**given: object) -> None:
+    """Refuse what an attack in a simulator would not use."""
+    if names := " and ".join(name for name, value in given.items() if value):
+        raise RoadproofError(f"an attack in a simulator does not use {names}; leave it out, or attack recordings")
 
 
 def _driven(recordings: InSimulator, controller: Controller, objective: Objective, method: Method) -> DrivenMeasure:
