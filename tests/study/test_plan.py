@@ -168,6 +168,7 @@ def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, mon
         ("seeds = [0, 1]", "seeds = [-1]", "seeds is -1"),
         ('"rainy-noon"', '"clear-noon"', "weathers has clear-noon twice"),
         ("calls = 100\n", "calls = 40\n", "random_calls is 40 of 40 calls"),
+        ('search = "published-bo"', 'search = "tpe"', "random_calls is 40, which search tpe has not; leave it out"),
         ("runs = 4", "runs = 0", "runs is 0"),
         ("runs = 4", "cars = 0\npedestrians = 0", "leave .traffic. out"),
         ("runs = 4", 'weathers = "some"', "weathers is 'some'"),

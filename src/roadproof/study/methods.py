@@ -25,6 +25,7 @@ from roadproof.pipeline.budget import PUBLISHED, QUICK, Budget
 Hundred: TypeAlias = Annotated[int, msgspec.Meta(le=100)]
 Thousand: TypeAlias = Annotated[int, msgspec.Meta(le=1000)]
 Many: TypeAlias = Annotated[int, msgspec.Meta(le=MANY)]
+RANDOM_CALLS = BayesianOptimisation().random_calls
 Groups: TypeAlias = Literal["group", "group-all", "random"]
 
 
@@ -92,14 +93,17 @@ class BlackBoxPlan:
     name: str
     search: str  # published-bo, random, tpe, gp or cma-es
     calls: Many = 1000  # patterns tried, each in a whole drive
-    random_calls: int = 400  # published-bo: before the model guides
+    random_calls: int = RANDOM_CALLS  # published-bo alone: before the model guides
     objective: Literal["steering", "deviation"] = "deviation"  # as published, or what is reported
     where: Literal["simulator", "recorded"] = "simulator"  # recorded: drives cost no simulator
     start: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 0  # of GradOpt's patterns, by steering, are tried first
 
     def __post_init__(self) -> None:
         budget_of(self, Weather.CLEAR_NOON)
-        if self.search == BayesianOptimisation.word and self.random_calls >= self.calls:
+        guided = self.search == BayesianOptimisation.word
+        if not guided and self.random_calls != RANDOM_CALLS:
+            raise StudyError(f"random_calls is {self.random_calls}, which search {self.search} has not; leave it out")
+        if guided and self.random_calls >= self.calls:
             raise StudyError(f"random_calls is {self.random_calls} of {self.calls} calls; leave some for the model")
         if self.start and self.where == "recorded":
             raise StudyError(f"start is {self.start} with where recorded; expected 0, or where simulator")
