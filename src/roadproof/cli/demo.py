@@ -101,9 +101,7 @@ def _report(result: StressTest, out: Path) -> None:
             f"{foretold.most_m:.2f} over small errors), driven {foretold.driven_m:.2f} m; "
             f"{foretold.path_error_m:.2f} m between the paths on average"
         )
-    for stage, cost in result.cost.items():
-        if cost == StageCost():
-            continue
-        drives = f", {cost.simulator_calls} drives" if cost.simulator_calls else ""
-        say(f"  {stage:10} {cost.seconds:4.0f} s{drives}")
+    spent = [(stage, cost) for stage, cost in result.cost.items() if cost != StageCost()]
+    drives = [f" ({cost.simulator_calls} drives)" if cost.simulator_calls else "" for _, cost in spent]
+    say("Took " + ", ".join(f"{stage} {c.seconds:.0f} s{n}" for (stage, c), n in zip(spent, drives, strict=True)))
     say(f"The report is {page}, its numbers are in {page.with_name('result.json')}")
