@@ -19,13 +19,15 @@ LINE_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 _UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m", "speed change": "predicted m/s"}
 _COLOURS = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
 _INK = "#222222"
+_COLUMNS = 6
+"""Frames of a drive that a strip shows."""
 
 
 def draw_attack(result: AttackResult, shown: Sequence[ShownDrive], folder: Path) -> None:
     """Draw the search as search.png, and every drive of the winner's group as film-DRIVE.png.
 
     Args:
-        result: what the attack found.
+        result: the result of the attack.
         shown: every drive of the winner's group, without and with the pattern (`attacks.show_pattern`).
         folder: the folder that the pictures are written to.
 
@@ -71,9 +73,9 @@ def in_units(objective: str) -> str:
     return f"{objective}, {_UNITS.get(objective.removesuffix(' over variations'), 'its own unit')}"
 
 
-def _film_strip(drive: ShownDrive, columns: int = 6) -> Figure:
+def _film_strip(drive: ShownDrive) -> Figure:
     """Clean frames above, the same with the pattern below, and what the controller answers to every frame."""
-    shown = evenly(len(drive.clean), columns)
+    shown = evenly(len(drive.clean), _COLUMNS)
     rows = (("clean", drive.clean, drive.clean_steer), ("painted", drive.painted, drive.painted_steer))
     figure = Figure(figsize=(2.3 * len(shown) + 0.6, 4.6), layout="constrained")
     title = f"{drive.name}: predicted steering on composited frames, mean shift {drive.mean_shift:+.2f}"

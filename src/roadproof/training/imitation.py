@@ -226,17 +226,6 @@ def plan_loss(answer: Plan, batch: Batch, weights: LossWeights, cruise: CruiseCo
     return PATH_COUNTS * weights.steer * path + (weights.throttle + weights.brake) * speed
 
 
-@torch.no_grad()
-def steering_error(network: Learner, data: Dataset, *, batch: int = 256) -> float:
-    """Mean distance between the network's steering and the expert's, over all frames as they are."""
-    device = next(network.parameters()).device
-    errors: list[Tensor] = []
-    for first in range(0, len(data), batch):
-        seen = data.batch(torch.arange(first, min(first + batch, len(data))), device)
-        errors.append((network.steer(seen.frames, seen.speed_mps, seen.command) - seen.expert[:, 0]).abs().cpu())
-    return float(torch.cat(errors).mean())
-
-
 def scale_dropout(network: nn.Module, factor: float) -> None:
     """Multiply every dropout of a network."""
     for module in network.modules():
