@@ -168,7 +168,7 @@ def test_a_run_that_has_come_only_so_far_says_what_is_missing(tmp_path, stage):
     assert tuple(each["id"] for each in page.all("section")) == SECTIONS
     content = read_result(tmp_path / "part")
     expected = {"attack": "predicted", "evaluation": "fails", "record": "recorded"}
-    assert content["verdict"]["key"] in (expected[stage], "swayed")
+    assert content["verdict"]["key"] in (expected[stage], "deviates")
     assert ("closed_loop" in content) == (stage == "evaluation")
     assert (content["surrogate"] is not None) == (stage == "attack")
     assert ("roadproof evaluate" in page.text) == (stage != "evaluation")
@@ -176,7 +176,7 @@ def test_a_run_that_has_come_only_so_far_says_what_is_missing(tmp_path, stage):
 
 VERDICTS = {
     "fails": {"events": CRASH},
-    "swayed": {"aside_m": 0.7},
+    "deviates": {"aside_m": 0.7},
     "holds": {"aside_m": 0.02},
     "unfit": {"events": CRASH, "clean_events": CRASH[:1]},
 }

@@ -14,7 +14,7 @@ from roadproof.patterns import load_pattern, raster
 from roadproof.report.charts import by_round
 from roadproof.report.html import rendered
 
-_BADGES = {"helped": "holds", "not shown": "swayed", "did not help": "fails"}
+_BADGES = {"helped": "holds", "not shown": "unclear", "did not help": "fails"}
 
 
 def write_hardening(found: Hardened, folder: Path) -> Path:

@@ -15,7 +15,7 @@ from roadproof.driving.speed import speed_in_words
 from roadproof.report.formatting import UNKNOWN, in_words, mean_in_words
 from roadproof.report.run import Run
 
-SWAYED_M = 0.5
+DEVIATES_M = 0.5
 """Half a metre aside and a car of ordinary width is over the line of an ordinary lane."""
 
 
@@ -24,7 +24,7 @@ class Verdict:
     """What came out of a run.
 
     Args:
-        key: "fails", "swayed", "holds", "unfit", "foreseen", "predicted" or "recorded".
+        key: "fails", "deviates", "holds", "unfit", "foreseen", "predicted" or "recorded".
         title: the verdict in two or three words.
         sentence: the whole finding.
     """
@@ -111,10 +111,10 @@ def _driven(evaluation: Evaluation) -> Verdict:
             f"{np.median(deviations):.2f} m (median; {min(deviations):.2f} to {max(deviations):.2f}), is up to "
             f"{furthest:.1f} m aside, and a drive costs {points} penalty points instead of {before}.",
         )
-    if furthest >= SWAYED_M:
+    if furthest >= DEVIATES_M:
         return Verdict(
-            "swayed",
-            "Swayed, no infraction",
+            "deviates",
+            "Deviates, no infraction",
             f"The pattern moves {who} by up to {furthest:.1f} m on {where}, but no drive of {n} has more infractions "
             "than on the bare road.",
         )
