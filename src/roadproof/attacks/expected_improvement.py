@@ -27,7 +27,7 @@ def most_promising(
     Args:
         process: a process as `ExpectedImprovement` takes it.
         ranges: range of each parameter, all beginning at 0.
-        random: where points are drawn from.
+        random: the random generator that points are drawn from.
         drawn: number of random points whose improvement is looked at.
         climbs: number of runs of L-BFGS-B, each from a random point of its own.
 

@@ -179,7 +179,7 @@ def calibrate(
 
     Args:
         simulator: an open simulator, the one the drives were recorded in.
-        drives: what `drives.record` made.
+        drives: the recorded drives that `drives.record` returned.
         method: calibration method, two-paint by default.
         folder: folder that keeps every replay; those it holds already are not driven again. None keeps nothing.
         pool: processes that are open already and make the replays, where a folder keeps them.

@@ -80,7 +80,7 @@ class Replays:
 
         Args:
             drive: the drive to replay, one of the drives.
-            target: what it is replayed over.
+            target: the paint on the canvas during the replay.
 
         Raises:
             CalibrationError: the replay goes another way than the drive.

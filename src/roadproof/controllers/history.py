@@ -47,7 +47,7 @@ def ticks_of(apart_s: float) -> int:
     """How many ticks lie between two moments.
 
     Raises:
-        ControllerError: it is no whole number of them, or not in (0, 10] s.
+        ControllerError: the time between them is no whole number of ticks, or not in (0, 10] s.
     """
     ticks = round(apart_s / TICK_S) if 0 < apart_s <= FURTHEST_S else 0
     if ticks < 1 or abs(ticks * TICK_S - apart_s) > 1e-6:

@@ -177,7 +177,7 @@ def make_missing(
     """Make the drives that a store lacks.
 
     Args:
-        pool: what drives.
+        pool: the processes, each with an open simulator, that make the drives.
         episodes: store of the drives.
         drives: drives that are wanted.
         on_done: called with the number of these drives that are done.

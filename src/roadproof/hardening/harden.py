@@ -72,7 +72,7 @@ def harden(
         clean_on: scenarios driven over the bare road before and after; by default those of training and judging.
         rounds: how many rounds of attack, tuning and re-test there are, at least 1.
         budget: how much is spent on attacks, tuning and judging; `HardeningBudget()` by default.
-        space: which patterns are searched; five rectangles of the published family by default.
+        space: the space of the patterns that are searched; five rectangles of the published family by default.
         training_step: gives the loss of a batch; your own where the usual one does not fit your controller.
         seed: the seed of everything random; judging has fresh ones.
         device: the torch device on which to search and learn, such as "cpu" or "cuda".

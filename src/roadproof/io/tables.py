@@ -138,7 +138,7 @@ def check_range(
     """See that a number is in its range.
 
     Raises:
-        error: it is not.
+        error: the number is out of its range.
     """
     if not least <= value <= most:
         raise error(f"{what} is {value}, expected {least} to {most}")

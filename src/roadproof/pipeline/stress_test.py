@@ -138,7 +138,7 @@ def stress_test(
     Args:
         simulator: an open simulator.
         controller: the controller that is tested; it computes on `device`.
-        scenario: where it drives.
+        scenario: the scenario that is driven, with the canvas that is painted.
         folder: the run folder, which keeps every stage; the same call goes on from it.
         budget: how much is spent, and on which search.
         space: the patterns that are searched; five rectangles of the published family by default.

@@ -31,9 +31,9 @@ class Compared:
     """One run of a comparison.
 
     Args:
-        name: what it is called: its folder's name, with the folders above as far as others have the same.
+        name: the name of the run: its folder's name, with the folders above as far as others have the same.
         judged: the evaluation of the run.
-        verdict: what the run shows.
+        verdict: the verdict on the run.
         alone: the run's drives over the pattern, alone on the road, in each weather, and in all together under None.
         change: mean change of the deviation against the first run over drives alone on the road, metres; None for the
             first run, where no drive has weather and start in common with one of the first run's, and where one run is

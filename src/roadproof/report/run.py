@@ -81,7 +81,7 @@ class Run:
         folder: the run folder that was read.
         drives: the drives as they were recorded, before calibration.
         recordings: the calibrated set of recordings.
-        calibration: what the calibration says of itself.
+        calibration: the report of the calibration.
         attack: the result of the attack.
         selections: the candidates that were driven, of the search and of each round, in that order.
         judged: the evaluation, with what is shown of it.

@@ -98,7 +98,7 @@ class MarkRecord:
     """A line painted on the outer border of a lane, from `offset_m` after the start of its section on.
 
     Args:
-        offset_m: where it begins, metres along the reference line from the start of the section.
+        offset_m: the beginning of the line, metres along the reference line from the start of the section.
         kind: "solid", "broken", "solid solid" …
         colour: "white", "yellow" …
         width_m: width of one strand, metres.

@@ -46,7 +46,7 @@ def beside(folder: Path, listed: str, what: str, plan: str, error: type[Roadproo
         error: the type of error to raise.
 
     Raises:
-        error: it lies elsewhere.
+        error: the file lies outside the folder.
     """
     path = folder / listed
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -75,7 +75,7 @@ def refuse_untrusted(controller: str, simulator: str | None) -> None:
         simulator: the spec of its simulator; None where it opens none.
 
     Raises:
-        StudyError: it would; the message names what it would do, and how to allow that.
+        StudyError: the plan would run code or call another machine; the message says which, and how to allow that.
     """
     if runs_code(controller):
         raise StudyError(

@@ -39,7 +39,7 @@ class Augmentation:
 
         Args:
             frames: RGB in [0, 1].
-            generator: where the randomness comes from.
+            generator: the random generator that is drawn from.
             window: number of pictures, one after the other, that are varied alike but for blur and noise.
         """
         count = len(frames) // window

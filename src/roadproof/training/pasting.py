@@ -40,7 +40,7 @@ class PastedPaint:
 
         Args:
             frames: RGB in [0, 1].
-            generator: where the randomness comes from.
+            generator: the random generator that is drawn from.
         """
         chosen = some(self.share, len(frames), generator)
         if not len(chosen):

@@ -46,7 +46,7 @@ def random_scenario(
     Args:
         roads: the map that the route leads through.
         map_name: the name of the map.
-        generator: where the randomness comes from.
+        generator: the random generator that is drawn from.
         name: the name of the scenario.
         command: the command that one of the route's junctions asks for; `Command.FOLLOW` asks for none.
         displaced: whether the car starts off the middle of its lane, turned and moving, rather than at rest in it.
@@ -92,7 +92,7 @@ class Disturbance:
     Args:
         steps: how many steps the drive has at most.
         dt_s: seconds per step.
-        generator: where the randomness comes from.
+        generator: the random generator that is drawn from.
 
     References:
         Codevilla et al., "End-to-end driving via conditional imitation learning", ICRA 2018, section IV.B.
