@@ -1,0 +1,215 @@
+"""What a value, a function or an object is known by: more than its name, so that who edits it has another one."""
+
+from __future__ import annotations
+
+import dis
+import hashlib
+import inspect
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache, partial
+from pathlib import PurePath
+from types import CodeType, FunctionType, MethodType, ModuleType
+from typing import Any, cast
+
+import numpy as np
+
+from roadproof.io.identity import digest, stated
+
+_DEEPEST = 8
+_CHANGING = (list, dict, set, bytearray, ModuleType)
+"""What a function's surroundings may hold as a memory of its calls."""
+_NOT_THE_USERS = sys.stdlib_module_names | {"torch", "numpy"}
+
+
+def without_addresses(text: str) -> str:
+    """A repr without the places in memory that it names, which are others in every process."""
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
+
+
+def known_by(thing: object) -> Any:  # noqa: ANN401
+    """What tells a value, an object or a function from others, in any process: as JSON has it.
+
+    A function is known by its name and source, and by what it was given: defaults, the arguments of a partial one, the
+    constants and functions of its module and of its closure that it uses, but no lists or dicts, which may grow as it
+    is called. An object is known by its class with its source, and by what its constructor takes, where it keeps that
+    under the same name; a dataclass by its fields; a network by its weights too. Roadproof's own functions and classes
+    have no source here: their version and their answers tell. A path tells nothing, as a folder may be moved.
+    """
+    return _known(thing, ())
+
+
+def plain_fields(thing: object) -> dict[str, Any]:
+    """The numbers, texts and arrays that an object keeps, by name, as `known_by` has them."""
+    usual = _kept(_torch().nn.Module()) if _is_module(thing) else {}
+    kept = {name: value for name, value in _kept(thing).items() if name not in usual}
+    return {name: _known(value, ()) for name, value in kept.items() if _is_plain(value)}
+
+
+def _known(thing: Any, within: tuple[int, ...]) -> Any:  # noqa: ANN401
+    if thing is None or isinstance(thing, bool | int | float | str):
+        return thing.value if isinstance(thing, Enum) else thing
+    if id(thing) in within or len(within) > _DEEPEST:
+        return type(thing).__name__
+    within = (*within, id(thing))
+    if isinstance(thing, PurePath):
+        return "a path"
+    if isinstance(thing, Enum):
+        return thing.name
+    if isinstance(thing, bytes | bytearray):
+        return hashlib.sha256(thing).hexdigest()
+    if isinstance(thing, np.ndarray | np.generic) or _is_tensor(thing):
+        return _array(thing)
+    if isinstance(thing, Mapping):
+        return {str(key): _known(value, within) for key, value in cast("Mapping[object, object]", thing).items()}
+    if isinstance(thing, list | tuple):
+        return [_known(each, within) for each in cast("list[object]", thing)]
+    if isinstance(thing, set | frozenset):
+        return sorted(stated(_known(each, within)) for each in cast("set[object]", thing))
+    if isinstance(thing, partial):
+        return {"partial": [_known(each, within) for each in (thing.func, thing.args, thing.keywords)]}
+    if isinstance(thing, MethodType):
+        return {"method": [_known(each, within) for each in (thing.__func__, thing.__self__)]}
+    if isinstance(thing, FunctionType):
+        return _function(thing, within)
+    if isinstance(thing, type):
+        return _class(thing, within)
+    return _object(thing, within)
+
+
+def _function(function: FunctionType, within: tuple[int, ...]) -> dict[str, Any]:
+    told: dict[str, Any] = {"function": _name(function)}
+    if _is_ours(function):
+        function = inspect.unwrap(function)
+        told["uses"] = _uses(function, within, {})
+    else:
+        given: list[object] = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).items()]
+        told |= {"source": _source(function), "given": [_known(each, within) for each in given]}
+        told["uses"] = _uses(function, within, function.__globals__)
+    return {name: value for name, value in told.items() if value}
+
+
+def _uses(function: FunctionType, within: tuple[int, ...], around: Mapping[str, object]) -> dict[str, Any]:
+    """The constants and functions around a function, and in its closure, that it names and does not set."""
+    code = function.__code__
+    read, written = _names(code)
+    found = {name: around[name] for name in read if name in around}
+    for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
+        try:
+            found[name] = cell.cell_contents
+        except ValueError:  # not set yet
+            continue
+    told: dict[str, Any] = {}
+    for name, value in sorted(found.items()):
+        if name in written or name.startswith("__") or isinstance(value, _CHANGING):
+            continue
+        if isinstance(value, FunctionType | type) and value.__module__ != function.__module__:
+            told[name] = _name(cast("type", value))
+        else:
+            told[name] = _known(value, within)
+    return told
+
+
+def _names(code: CodeType) -> tuple[set[str], set[str]]:
+    """The names that code reads from around it, and those that it sets there."""
+    read = set(code.co_names)
+    stores = ("STORE_GLOBAL", "STORE_DEREF", "DELETE_GLOBAL")
+    written = {str(each.argval) for each in dis.get_instructions(code) if each.opname in stores}
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            more = _names(inner)
+            read, written = read | more[0], written | more[1]
+    return read, written
+
+
+def _class(kind: type, within: tuple[int, ...]) -> dict[str, Any]:
+    """A class with those that it inherits from in its package, each with what its methods use."""
+    package, told = kind.__module__.partition(".")[0], dict[str, Any]()
+    if _is_ours(kind):
+        return {"class": _name(kind)}
+    for each in kind.__mro__:
+        if each.__module__.partition(".")[0] == package and package not in _NOT_THE_USERS:
+            methods = [value for value in vars(each).values() if isinstance(value, FunctionType)]
+            uses = {
+                name: value for method in methods for name, value in _uses(method, within, method.__globals__).items()
+            }
+            told[_name(each)] = [_source(each), uses]
+    return {"class": _name(kind), "source": told}
+
+
+def _object(thing: Any, within: tuple[int, ...], *, weights: bool = True) -> dict[str, Any]:  # noqa: ANN401
+    kind = cast("type[Any]", type(thing))
+    told: dict[str, Any] = _class(kind, within)
+    kept = _kept(thing)
+    if is_dataclass(kind):
+        told["fields"] = {each.name: _known(getattr(thing, each.name, None), within) for each in fields(kind)}
+    else:
+        try:
+            names = list(inspect.signature(kind).parameters)
+        except (TypeError, ValueError):
+            names = []
+        settings = {name: kept.get(name, kept.get(f"_{name}")) for name in names}
+        told["fields"] = {name: _known(value, within) for name, value in settings.items() if value is not None}
+    if _is_module(thing):
+        children = cast("Iterable[tuple[str, object]]", thing.named_children())
+        told["modules"] = {name: _object(each, within, weights=False) for name, each in children}
+        if weights:
+            told["weights"] = _known(thing.state_dict(), within)
+    return told
+
+
+def _kept(thing: object) -> dict[str, object]:
+    return getattr(thing, "__dict__", {})
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_plain, cast("tuple[object, ...]", value)))
+    return isinstance(value, bool | int | float | str | np.ndarray | np.generic) or _is_tensor(value)
+
+
+def _array(values: Any) -> list[Any]:  # noqa: ANN401
+    """The type, shape and content of an array or tensor, wherever its memory lies."""
+    if _is_tensor(values):
+        try:
+            values = values.detach().cpu()
+            content = values.contiguous().flatten().view(_torch().uint8).numpy()
+        except (RuntimeError, TypeError, NotImplementedError):  # sparse, or without memory
+            content = np.frombuffer(str(values).encode(), np.uint8)
+    else:
+        values = np.asarray(values)
+        content = np.ascontiguousarray(values) if values.dtype != object else np.frombuffer(repr(values).encode(), "u1")
+    return [str(values.dtype), list(values.shape), hashlib.sha256(content.tobytes()).hexdigest()]
+
+
+def _torch() -> Any:  # noqa: ANN401
+    """Torch, where it was imported: who has none has no tensors."""
+    return sys.modules.get("torch")
+
+
+def _is_tensor(value: object) -> bool:
+    return _torch() is not None and isinstance(value, _torch().Tensor)
+
+
+def _is_module(value: object) -> bool:
+    return _torch() is not None and isinstance(value, _torch().nn.Module)
+
+
+def _name(thing: FunctionType | type) -> str:
+    return f"{thing.__module__}:{thing.__qualname__}"
+
+
+def _is_ours(thing: FunctionType | type) -> bool:
+    return thing.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+@cache
+def _source(thing: FunctionType | type) -> str:
+    """The digest of a source as it was when it was first asked for; empty where there is none, as at a prompt."""
+    try:
+        return digest(inspect.getsource(thing))[:16]
+    except (OSError, TypeError):
+        return ""
