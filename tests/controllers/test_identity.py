@@ -1,12 +1,15 @@
 """A controller is known by what it answers."""
 
 import pickle
+from functools import partial
 
+import numpy as np
 import pytest
 
 from paint_shy import PaintShy
 from roadproof.controllers import load_controller
-from roadproof.controllers.identity import answers_of, identity_of
+from roadproof.controllers.identity import answers_of, identity_of, parts_of
+from roadproof.datatypes import Control
 from roadproof.errors import ControllerError
 from roadproof.training.expert import expert
 
@@ -40,3 +43,64 @@ def test_answers_are_few_and_plain():
 
     with pytest.raises(ControllerError, match="act"):
         answers_of(Silent(), SIZE)
+
+
+def test_weights_that_no_answer_shows_count_too():
+    """A branch of another command, or a change too small for four digits."""
+    known, unseen = parts_of(load_controller("pilotnet"), SIZE), 0
+    for name in load_controller("pilotnet").state_dict():
+        other = load_controller("pilotnet")
+        other.state_dict()[name].add_(1e-5)
+        found = parts_of(other, SIZE)
+        assert found["controller_digest"] != known["controller_digest"], name
+        unseen += found["answers"] == known["answers"]
+    assert unseen >= 24
+
+
+class Classical:
+    """It looks for one colour, of which noise has none; it counts what it is asked, and keeps a grid."""
+
+    input_size = None
+
+    def __init__(self, gain, at_left=0.0):
+        self.gain, self.at_left, self.asked, self._grid = gain, at_left, 0, None
+
+    def steer(self, frames, speed_mps, command):
+        raise NotImplementedError
+
+    def act(self, frame, speed_mps, command):
+        self.asked += 1
+        self._grid = np.arange(frame.shape[1]) if self._grid is None else self._grid
+        seen = (frame == (1, 2, 3)).all(2).mean()
+        return Control(self.gain * seen + (self.at_left if command == 3 else 0.0))
+
+
+class Seldom(Classical):
+    """It knows nothing but following the lane."""
+
+    def act(self, frame, speed_mps, command):
+        if command != 2:
+            raise ValueError(command)
+        return super().act(frame, speed_mps, command)
+
+
+def test_a_controller_without_weights_is_known_by_its_settings_and_its_answers_to_all_commands():
+    one = Classical(4.0)
+    known = identity_of(one, SIZE)
+    assert known == identity_of(one, SIZE) == identity_of(Classical(4.0), SIZE), "counting and keeping changes nothing"
+    assert known != identity_of(Classical(1.0), SIZE)
+    turning = Classical(4.0)
+    turning.act = lambda frame, speed_mps, command: Control(0.1 * (command == 3))
+    assert known != identity_of(turning, SIZE)
+    set_later = Classical(4.0)
+    set_later.gain = 5.0
+    assert known != identity_of(set_later, SIZE)
+    assert identity_of(Seldom(1.0), SIZE) == identity_of(Seldom(1.0), SIZE)
+
+
+def test_a_function_of_the_users_is_known_by_its_source_and_what_it_was_given():
+    def made(gain):
+        return lambda world: gain
+
+    assert identity_of(made(1.0), SIZE) == identity_of(made(1.0), SIZE) != identity_of(made(2.0), SIZE)
+    assert identity_of(partial(expert, 1), SIZE) != identity_of(partial(expert, 2), SIZE)

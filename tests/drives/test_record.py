@@ -24,6 +24,14 @@ WANTED = Trajectories(count=3, perturbation=Swerve((1.2,)))
 ASKED = {"trajectories": WANTED, "window": Window(frames=5), "weather": Weather.CLOUDY_NOON, "seed": 4}
 
 
+DRIVEN = []
+
+
+def watched(world):
+    DRIVEN.append(world)
+    return expert(world)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("run") / "record"
@@ -31,7 +39,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drives(town, folder):
-    return record(town, expert, LEFT, folder=folder, **ASKED)
+    return record(town, watched, LEFT, folder=folder, **ASKED)
 
 
 def test_the_drives_go_as_far_astray_as_was_asked_and_to_their_side(drives):
@@ -82,12 +90,8 @@ def test_finished_drives_are_not_driven_again(drives, folder, town):
     (folder / "left").rmdir()
     with pytest.raises(RecordingError, match="lacks the drive left; give the same `roadproof record` again"):
         Drives.load(folder)
-    driven = []
-
-    def watched(world):
-        driven.append(world)
-        return expert(world)
-
+    driven = DRIVEN
+    driven.clear()
     again = record(town, watched, LEFT, folder=folder, **ASKED)
     assert len(driven) == 1
     loaded = Drives.load(folder)
@@ -104,6 +108,11 @@ def test_finished_drives_are_not_driven_again(drives, folder, town):
 def test_a_folder_with_other_settings_is_refused(drives, folder, town):
     with pytest.raises(RecordingError, match="holds a recording with weather 'cloudy-noon', now it is 'rainy-noon'"):
         record(town, expert, LEFT, folder=folder, **(ASKED | {"weather": Weather.RAINY_NOON}))
+
+
+def test_a_recording_by_another_function_is_refused(drives, folder, town):
+    with pytest.raises(RecordingError, match="a recording of another controller, whose weights, settings or source"):
+        record(town, lambda world: watched(world), LEFT, folder=folder, **ASKED)
 
 
 def test_damage_is_named(drives, folder, tmp_path):

@@ -14,7 +14,7 @@ import needs
 from paint_shy import PaintShy, along_a_street, magenta
 from roadproof.datatypes import Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
-from roadproof.driving.drive_store import driver_in_words, load_episodes
+from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, driver_in_words, load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import evaluate, random_patterns
 from roadproof.driving.evaluation import Evaluation, load_paint
@@ -271,6 +271,17 @@ def test_a_function_with_arguments_is_known_by_them():
     drive = functools.partial(random_patterns, seed=1)
     assert driver_in_words(drive) == "random_patterns with (), {'seed': 1}"
     assert driver_in_words(drive) != driver_in_words(functools.partial(random_patterns, seed=2))
+
+
+def test_an_edited_function_makes_other_drives(town, street, tmp_path):
+    def made(gain):
+        return lambda world: lambda seen: gain
+
+    bare = Conditions(paint=CLEAN, weather=Weather.CLEAR_NOON)
+    drivers = made(1), made(2), lambda world: lambda seen: 1, functools.partial(made(1), None)
+    names = [Episodes.of(town, each, street, {}, tmp_path).file(bare) for each in (*drivers, made(1))]
+    assert len(set(names)) == 4
+    assert names[-1] == names[0]
 
 
 @pytest.mark.slow

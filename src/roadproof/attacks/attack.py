@@ -33,10 +33,10 @@ from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
-from roadproof.controllers.identity import identity_of
+from roadproof.controllers.identity import parts_of
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.identity import ANSWERS, require_same
+from roadproof.io.identity import require_same
 from roadproof.io.records import plain
 from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
@@ -198,7 +198,7 @@ def kept_attack(
         "groups": groups and list(map(str, groups)),
         "seed": seed,
         "drives": recordings.digest()[:16],
-        ANSWERS: identity_of(controller, (recordings.view.height_px, recordings.view.width_px)),
+        **parts_of(controller, (recordings.view.height_px, recordings.view.width_px)),
     }
     checkpoint, path = folder / "search.safetensors", folder / "result.json"
     if path.exists():

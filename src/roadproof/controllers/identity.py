@@ -1,19 +1,27 @@
-"""Which controller it is: known by what it answers, not by what it is called.
+"""Which controller it is: known by what it is and what it answers, not by what it is called.
 
-A controller that is trained again and keeps its name answers otherwise; so does a function whose author changed it.
-Drives, recordings and runs that were made with the one are not taken for those of the other.
+A controller that is trained again and keeps its name has other weights; a function that its author changed has another
+source. Drives, recordings and runs that were made with the one are not taken for those of the other.
 """
 
 from __future__ import annotations
 
+from itertools import product
+from typing import TypedDict
+
 import numpy as np
+from jaxtyping import UInt8
 
 from roadproof.controllers.asking import act_after_of, act_of, frame_size_of
 from roadproof.controllers.protocol import Controller, TemporalController
+from roadproof.datatypes import Command, Control
+from roadproof.errors import ControllerError
 from roadproof.io.identity import digest, stated
+from roadproof.io.known import known_by, plain_fields
 
 Answers = list[tuple[float, ...]]
 
+_SPEEDS_MPS = (2.0, 8.0)
 _ELAPSED_S = (0.0, 0.05, 0.3, 2.0)
 """Times from picture to picture for a controller that remembers: what it does with near and with far ones tells."""
 
@@ -30,31 +38,83 @@ def answers_of(controller: Controller, size: tuple[int, int]) -> Answers:
         ControllerError: the controller raises, or answers with something that is no control.
     """
     rng = np.random.default_rng(0)
-    height, width = frame_size_of(controller) or size
+    size = frame_size_of(controller) or size
     answers: Answers = []
     memory: object = None
     for elapsed_s in _ELAPSED_S:
-        coarse = rng.integers(0, 256, (6, 8, 3), np.uint8)
-        frame = np.repeat(np.repeat(coarse, -(-height // 6), 0), -(-width // 8), 1)[:height, :width]
-        seen = (np.ascontiguousarray(frame), 6.0, 2)
+        seen = (_picture(rng, size), 6.0, 2)
         if isinstance(controller, TemporalController):
             control, memory = act_after_of(controller, memory, *seen, elapsed_s)
         else:
             control = act_of(controller, *seen)
-        answers.append(tuple(round(value, 4) for value in (control.steer, control.throttle, control.brake)))
+        answers.append(_rounded(control))
     return answers
 
 
 def identity_of(driver: object, size: tuple[int, int]) -> str:
-    """A short digest of a controller's answers; empty for a function, which its user names.
+    """A short digest of all that tells a driver: weights, settings, source, and a controller's answers to any command.
+
+    What a controller keeps of being asked, as a count, does not tell it from others.
 
     Args:
         driver: a controller, or a function that drives, such as `training.expert.expert`.
         size: (height, width) in px of the pictures it is shown, if the controller does not name its own.
 
+    Returns:
+        16 hexadecimal digits; empty for a function of which only the name is known, as for ours.
+
     Raises:
         ControllerError: the controller raises, or answers with something that is no control.
     """
     if not isinstance(driver, Controller):
-        return ""
-    return digest(stated(answers_of(driver, size)))[:16]
+        told = known_by(driver)
+        return "" if set(told) == {"function"} else digest(stated(told))[:16]
+    # Whatever it makes when it is first asked is there then.
+    first = answers_of(driver, size)
+    before = plain_fields(driver)
+    asked = _answers_to_all(driver, size)
+    after = plain_fields(driver)
+    steady = {name: value for name, value in before.items() if after.get(name) == value}
+    return digest(stated([known_by(driver), steady, first, asked]))[:16]
+
+
+class Parts(TypedDict):
+    """The parts by which a folder knows a driver: `io.identity.ANSWERS` and `CONTROLLER`."""
+
+    answers: str
+    controller_digest: str
+
+
+def parts_of(driver: object, size: tuple[int, int]) -> Parts:
+    """The parts by which a folder knows a driver, by name; arguments and errors are those of `identity_of`."""
+    answers = digest(stated(answers_of(driver, size)))[:16] if isinstance(driver, Controller) else ""
+    return {"answers": answers, "controller_digest": identity_of(driver, size)}
+
+
+def _answers_to_all(controller: Controller, size: tuple[int, int]) -> list[tuple[float, ...] | None]:
+    """What a controller answers to every command at two speeds; None to one that it refuses."""
+    rng = np.random.default_rng(1)
+    answers: list[tuple[float, ...] | None] = []
+    for command, speed_mps in product(Command, _SPEEDS_MPS):
+        seen = (_picture(rng, frame_size_of(controller) or size), speed_mps, int(command))
+        try:
+            if isinstance(controller, TemporalController):
+                control, _ = act_after_of(controller, None, *seen, 0.0)
+            else:
+                control = act_of(controller, *seen)
+            answers.append(_rounded(control))
+        except ControllerError:
+            answers.append(None)
+    return answers
+
+
+def _picture(rng: np.random.Generator, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    """A made-up picture of coarse noise."""
+    height, width = size
+    coarse = rng.integers(0, 256, (6, 8, 3), np.uint8)
+    frame = np.repeat(np.repeat(coarse, -(-height // 6), 0), -(-width // 8), 1)[:height, :width]
+    return np.ascontiguousarray(frame)
+
+
+def _rounded(control: Control) -> tuple[float, ...]:
+    return tuple(round(value, 4) for value in (control.steer, control.throttle, control.brake))

@@ -106,7 +106,8 @@ class Settings:
         window: which frames of each drive are kept.
         seed: seed of the perturbations.
         driver: name of the driver, in words.
-        answers: identity of the controller (`controllers.identity`); empty for a function, and in older recordings.
+        answers: how the controller answers (`controllers.identity`); empty for a function, and in older recordings.
+        controller_digest: what tells the driver otherwise; empty where its name is all there is, and in older ones.
         camera: camera on the car.
         view: crop and resize that make the controller's input from the camera picture.
         dt_s: seconds per step.
@@ -122,6 +123,7 @@ class Settings:
     view: CropResize
     dt_s: float
     answers: str = ""
+    controller_digest: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

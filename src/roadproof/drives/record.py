@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from roadproof.compositing.view import canvas_pixels
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import act_of
-from roadproof.controllers.identity import identity_of
+from roadproof.controllers.identity import parts_of
 from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
 from roadproof.drives.folder import Drive, Drives, Settings, forget_settings, read_drive, write_drive, write_settings
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
@@ -82,7 +82,7 @@ def record(
         window=window or Window(),
         seed=seed,
         driver=driver_name,
-        answers=identity_of(driver, (simulator.input.height_px, simulator.input.width_px)),
+        **parts_of(driver, (simulator.input.height_px, simulator.input.width_px)),
         camera=simulator.camera,
         view=simulator.input,
         dt_s=simulator.dt_s,

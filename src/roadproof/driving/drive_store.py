@@ -17,7 +17,7 @@ from typing import Any, TypeAlias, cast
 
 import roadproof
 from roadproof.controllers import Controller
-from roadproof.controllers.identity import answers_of
+from roadproof.controllers.identity import answers_of, identity_of
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, rollout
@@ -25,7 +25,8 @@ from roadproof.driving.starts import NOMINAL, StartOffset
 from roadproof.driving.trial import Trial, judge
 from roadproof.errors import EpisodeError
 from roadproof.io.files import inside
-from roadproof.io.identity import ANSWERS, digest, stated
+from roadproof.io.identity import ANSWERS, CONTROLLER, digest, stated
+from roadproof.io.known import without_addresses
 from roadproof.scenarios import Scenario
 from roadproof.scenarios import identity as identity_of_scenario
 from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
@@ -97,9 +98,9 @@ class Episodes:
 
     @property
     def made_of(self) -> dict[str, object]:
-        """The parts that identify the drives, with the digest of a controller's answers apart from its name."""
-        driver, answers = cast("list[object]", self.parts["driver"])
-        return {**self.parts, "driver": driver, ANSWERS: digest(stated(answers))}
+        """The parts that identify the drives, with the digests of a driver and of its answers apart from its name."""
+        driver, answers, which = cast("list[object]", self.parts["driver"])
+        return {**self.parts, "driver": driver, ANSWERS: digest(stated(answers)), CONTROLLER: which}
 
     def file(self, drive: Conditions) -> str:
         """The file name of a drive's episode."""
@@ -170,21 +171,22 @@ def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:
 def driver_in_words(driver: AnyDriver) -> str:
     """A controller's type, or a function's name, with what a partial one has been given."""
     if isinstance(driver, partial):
-        return f"{driver_in_words(driver.func)} with {driver.args}, {driver.keywords}"
+        return without_addresses(f"{driver_in_words(driver.func)} with {driver.args}, {driver.keywords}")
     return type(driver).__name__ if isinstance(driver, Controller) else str(getattr(driver, "__qualname__", driver))
 
 
 def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[str, object]:
-    """Everything that all drives depend on, by name; a controller is identified by what it answers."""
+    """Everything that all drives depend on, by name."""
     view = simulator.input
-    answers = answers_of(driver, (view.height_px, view.width_px)) if isinstance(driver, Controller) else []
+    size = view.height_px, view.width_px
+    answers = answers_of(driver, size) if isinstance(driver, Controller) else []
     parts: dict[str, object] = {
         "version": roadproof.__version__,
         "simulator": f"{type(simulator).__module__}.{type(simulator).__qualname__}",
         "camera": simulator.camera.stated,
         "input": asdict(view),
         "dt_s": simulator.dt_s,
-        "driver": [driver_in_words(driver), answers],
+        "driver": [driver_in_words(driver), answers, identity_of(driver, size)],
         "scenario": identity_of_scenario(scenario),
     }
     if simulator.paint is not PaintKind.RENDERED:

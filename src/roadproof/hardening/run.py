@@ -7,11 +7,11 @@ from pathlib import Path
 
 from roadproof.attacks.objective import variation_of
 from roadproof.controllers import Controller, load_controller
-from roadproof.controllers.identity import identity_of
+from roadproof.controllers.identity import parts_of
 from roadproof.controllers.loading import runs_code
 from roadproof.hardening.budget import HardeningBudget
 from roadproof.hardening.tuning import TrainingStep
-from roadproof.io.identity import ANSWERS
+from roadproof.io.known import known_by
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace, derived_seed
@@ -86,13 +86,14 @@ class Run:
         view = simulator.input
         return {
             "controller": self.spec,
-            ANSWERS: identity_of(teacher, (view.height_px, view.width_px)),
+            **parts_of(teacher, (view.height_px, view.width_px)),
             "scenarios": [identity(each) for each in self.scenarios],
             "budget": repr(replace(self.budget, judge=self.budget.attack)),
             "space": repr(self.space),
             "variation": repr(variation_of(self.budget.attack.objective)),
             "seed": self.seed,
             "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
+            "training step's source": known_by(step),
         }
 
     def attack(

@@ -11,8 +11,15 @@ from typing import cast
 from roadproof.errors import RoadproofError
 
 ANSWERS = "answers"
-"""The part that says which controller it was (`controllers.identity`), whatever it is called."""
+"""The part that says how the controller answered (`controllers.identity`), whatever it is called."""
 
+CONTROLLER = "controller_digest"
+"""The part that says which controller it was: its weights, settings, source and all answers; younger than `ANSWERS`."""
+
+_ANOTHER = {
+    ANSWERS: "which answers otherwise, as before a training",
+    CONTROLLER: "whose weights, settings or source are others",
+}
 _MOST_CHARACTERS = 60
 
 
@@ -46,13 +53,32 @@ def require_same(
     for part, value in cast("dict[str, object]", json.loads(json.dumps(now, default=str))).items():
         if part not in known or known[part] == value:
             continue
-        if part == ANSWERS:
+        if part in _ANOTHER:
             raise error(
-                f"{folder} holds {what} of another controller, which answers otherwise, as before a training; choose "
-                "another folder, or remove it"
+                f"{folder} holds {what} of another controller, {_ANOTHER[part]}; choose another folder, or remove it"
             )
         name, was, now_is = _first_difference(part, known[part], value)
         raise error(f"{folder} holds {what} with {name} {was}, now it is {now_is}; choose another folder, or remove it")
+
+
+def require_told(
+    folder: Path, what: str, before: object, now: Mapping[str, object], error: type[RoadproofError]
+) -> None:
+    """`require_same`, and refuse what was kept without saying what it was made of, but for what is older than the word.
+
+    Args:
+        folder: the folder in which something was begun.
+        what: what the folder holds, for the message, such as "a run".
+        before: the parts that were kept there; None where the file is older than the word.
+        now: the parts of what is to be done in the folder.
+        error: the type of error to raise.
+
+    Raises:
+        error: a part differs, or there is none.
+    """
+    if before is not None and not before:
+        raise error(f"{folder} holds {what} that does not say what it was made of; choose another folder, or remove it")
+    require_same(folder, what, before, now, error)
 
 
 def _first_difference(name: str, before: object, now: object) -> tuple[str, str, str]:

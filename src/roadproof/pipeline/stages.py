@@ -13,13 +13,13 @@ from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
-from roadproof.controllers.identity import identity_of
+from roadproof.controllers.identity import parts_of
 from roadproof.drives import Drives, record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.files import write_json
-from roadproof.io.identity import ANSWERS, digest, require_same
+from roadproof.io.identity import digest, require_same
 from roadproof.io.text import read_json
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
@@ -71,7 +71,7 @@ class Stages:
             "variation": variation_of(self.budget.objective),
             "seed": self.seed,
             "controller": self.controller_name,
-            ANSWERS: identity_of(self.controller, size),
+            **parts_of(self.controller, size),
             "paint": self.simulator.paint,
         }
 
