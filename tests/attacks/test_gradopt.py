@@ -26,6 +26,7 @@ from roadproof.compositing import Variation, composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control
 from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
+from roadproof.paint.site import LaneMark
 from roadproof.patterns import Pattern, boxes_from_published
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
@@ -337,9 +338,43 @@ def test_a_search_that_was_kept_is_read_and_one_of_other_parts_is_refused(tmp_pa
     }.items():
         with pytest.raises(RoadproofError, match=message):
             kept(**changed)
-    # A result made elsewhere, or older than the word, does not say what it was made of.
-    first.save(tmp_path)
+    # A result older than the word does not say what it was made of; one of today's does, wherever it was made.
+    content = json.loads((tmp_path / "result.json").read_text())
+    (tmp_path / "result.json").write_text(json.dumps({k: v for k, v in content.items() if k != "made_of"}))
     assert kept(seed=1).seed == 0
+    (tmp_path / "result.json").write_text(json.dumps(content | {"made_of": {}}))
+    with pytest.raises(RoadproofError, match="holds a search that does not say what it was made of; choose another fo"):
+        kept()
+    attack(recording_set(), controller, SearchSpace(figures=1), **asked).save(tmp_path)
+    assert kept().seed == 0
+    with pytest.raises(RoadproofError, match="holds a search with seed 0, now it is 1"):
+        kept(seed=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Doubled:
+    """An objective of a user's own, with a name that does not tell its factor."""
+
+    factor: float = 2.0
+    name = "doubled"
+
+    def measure(self, recordings, controller, groups, *, device):
+        return SteeringShift().measure(recordings, controller, groups, device=device)
+
+
+def test_a_search_is_known_by_its_starts_its_marks_and_the_fields_of_a_users_objective(tmp_path):
+    marked = dataclasses.replace(recording_set(), marks=(LaneMark(points_m=((1.0, 0.0), (1.0, 2.0))),))
+    first = kept_attack(
+        tmp_path, marked, pull_to_the_right(), SearchSpace(figures=1), objective=Doubled(), method=QUICK
+    )
+    for message, changed in {
+        r"objective_fields\.fields\.factor 2\.0, now it is 3\.0": {"objective": Doubled(3.0)},
+        "holds a search with starts": {"starts": first.candidates[:1]},
+        "holds a search with marks": {"recordings": dataclasses.replace(marked, marks=())},
+    }.items():
+        asked = {"recordings": marked, "objective": Doubled()} | changed
+        with pytest.raises(RoadproofError, match=message):
+            kept_attack(tmp_path, controller=pull_to_the_right(), space=SearchSpace(figures=1), method=QUICK, **asked)
 
 
 def test_a_controller_for_other_frames_or_one_that_answers_nan_is_refused():

@@ -12,6 +12,7 @@ from lenses import LENSES, behind
 from roadproof.datatypes import Obstacle
 from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CanvasPlacement
+from roadproof.paint.site import LaneMark
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import RecordingSet, Side, Track, load_recordings, pooled, save_recordings
 from scenes import PLAIN, recording, recording_set
@@ -84,6 +85,14 @@ def test_sets_that_differ_in_what_is_driven_over_have_other_digests(saved_placed
     changed += [{"recordings": (one, *others)} for one in (slower, rainy, replace(clean, steer=clean.steer + 0.1))]
     digests = {replace(original, **each).digest() for each in [{}, *changed]}
     assert len(digests) == 1 + len(changed)
+
+
+def test_marks_have_a_digest_of_their_own(tmp_path):
+    original = replace(placed_set(), marks=(LaneMark(points_m=((1.0, 0.0), (1.0, 2.0))),))
+    save_recordings(original, tmp_path / "set")
+    assert load_recordings(tmp_path / "set").marks_digest() == original.marks_digest()
+    moved = replace(original, marks=(LaneMark(points_m=((1.5, 0.0), (1.5, 2.0))),))
+    assert len({each.marks_digest() for each in (original, moved, placed_set())}) == 3
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=str)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -27,16 +28,18 @@ from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import ClosedLoop, Measure, Objective, RecordedMeasure, SteeringShift
+from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SteeringShift, own_objective
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
 from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
-from roadproof.errors import RoadproofError
+from roadproof.errors import ControllerError, RoadproofError
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.identity import require_same
+from roadproof.io.identity import digest, require_told
+from roadproof.io.identity import stated as as_text
+from roadproof.io.known import known_by
 from roadproof.io.records import plain
 from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
@@ -88,6 +91,10 @@ def attack(
     """
     objective, method = objective or SteeringShift(), method or GradOpt()
     method.check_space(space)
+    made_of: dict[str, Any] = {}
+    if isinstance(recordings, RecordingSet):
+        with suppress(ControllerError):  # one that cannot drive is attacked all the same, but nothing goes on with it
+            made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts)
     start = time.perf_counter()
     if isinstance(recordings, InSimulator):
         _refuse_in_simulator(groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
@@ -131,6 +138,7 @@ def attack(
         method=method,
         seed=seed,
         conspicuousness=conspicuousness(first.pattern, space.site or site),
+        made_of=made_of,
     )
 
 
@@ -138,6 +146,33 @@ def _refuse_in_simulator(**given: object) -> None:
     """Refuse what an attack in a simulator would not use."""
     if names := " and ".join(name for name, value in given.items() if value):
         raise RoadproofError(f"an attack in a simulator does not use {names}; leave it out, or attack recordings")
+
+
+def _made_of(
+    recordings: RecordingSet,
+    controller: Controller,
+    space: SearchSpace,
+    objective: Objective,
+    method: Method,
+    groups: Sequence[Group] | None,
+    seed: int,
+    starts: Sequence[Candidate],
+) -> dict[str, Any]:
+    """What identifies a search on recordings, by name, as JSON has it."""
+    begun = [(each.group, known_by(each.pattern)) for each in starts]
+    made_of = {
+        "space": space.stated,
+        "objective": objective.name,
+        "objective_fields": own_objective(objective) or plain(objective),
+        "method": stored(method),
+        "groups": groups and list(map(str, groups)),
+        "seed": seed,
+        "drives": recordings.digest()[:16],
+        "marks": recordings.marks_digest()[:16],
+        "starts": digest(as_text(begun))[:16],
+        **parts_of(controller, (recordings.view.height_px, recordings.view.width_px)),
+    }
+    return cast("dict[str, Any]", plain(made_of))
 
 
 def _driven(recordings: InSimulator, controller: Controller, objective: Objective, method: Method) -> DrivenMeasure:
@@ -187,22 +222,14 @@ def kept_attack(
     `folder` is that of the result, and keeps the checkpoint of the running search; all else is as in `attack`.
 
     Raises:
-        RoadproofError: the stored result is damaged or belongs to another search, or the search itself fails.
+        RoadproofError: the stored result is damaged, belongs to another search or does not say to which, or the search
+            itself fails. A result of a version that kept no such thing is taken.
         OutputError: the folder cannot be written.
     """
-    made_of = {
-        "space": space.stated,
-        "objective": objective.name,
-        "objective_fields": plain(objective) if isinstance(objective, SteeringShift | ClosedLoop) else None,
-        "method": stored(method),
-        "groups": groups and list(map(str, groups)),
-        "seed": seed,
-        "drives": recordings.digest()[:16],
-        **parts_of(controller, (recordings.view.height_px, recordings.view.width_px)),
-    }
     checkpoint, path = folder / "search.safetensors", folder / "result.json"
     if path.exists():
-        require_same(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
+        made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts)
+        require_told(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
     else:
         attack(
             recordings,
@@ -216,7 +243,7 @@ def kept_attack(
             starts=starts,
             checkpoint=checkpoint,
             on_step=on_step,
-        ).save(folder, made_of)
+        ).save(folder)
     checkpoint.unlink(missing_ok=True)
     return AttackResult.load(folder)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -24,6 +24,7 @@ from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
+from roadproof.io.known import known_by
 from roadproof.recorded.world import Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -226,6 +227,11 @@ def varied(objective: Objective, variation: Variation | None) -> Objective:
 def variation_of(objective: Objective) -> Variation | None:
     """The variation of an objective; None if it has none, or is the user's own."""
     return objective.variation if isinstance(objective, SteeringShift | ClosedLoop) else None
+
+
+def own_objective(objective: Objective) -> dict[str, Any] | None:
+    """What tells an objective of the user's own from others of its name, as JSON has it; None for those here."""
+    return None if isinstance(objective, SteeringShift | ClosedLoop) else known_by(objective)
 
 
 OBJECTIVES: dict[str, Objective] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -100,6 +100,7 @@ class AttackResult:
         method: the search method.
         seed: seed of everything random.
         conspicuousness: how conspicuous the strongest pattern is on this road; None in results of versions without it.
+        made_of: identity of the search, by name (`io.identity`); empty in a simulator, and in older files.
     """
 
     pattern: Pattern
@@ -120,6 +121,7 @@ class AttackResult:
     predicted_range_mps: tuple[float, float] | None = None
     driven: Effect | None = None
     conspicuousness: Conspicuousness | None = None
+    made_of: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def _repr_html_(self) -> str:
         """How a notebook shows it: the pattern, and what each kind of number says."""
@@ -145,12 +147,8 @@ class AttackResult:
         low, high = self.predicted_range_m or (self.predicted_m, self.predicted_m)
         return f"{self.predicted_m:.2f} m of deviation", f"{low:.2f} to {high:.2f}"
 
-    def save(self, folder: AnyPath, made_of: Mapping[str, object] | None = None) -> None:
+    def save(self, folder: AnyPath) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.
-
-        Args:
-            folder: folder of the result.
-            made_of: what identifies the search, by name (see `kept_attack`); None outside of it.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -162,7 +160,6 @@ class AttackResult:
         RESULT_FILE.write(
             folder / "result.json",
             self,
-            made_of=made_of or {},
             candidates=[[plain(getattr(each, name)) for name in _Ranked.__struct_fields__] for each in self.candidates],
         )
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from roadproof.attacks.objective import variation_of
+from roadproof.attacks.objective import own_objective, variation_of
 from roadproof.controllers import Controller, load_controller
 from roadproof.controllers.identity import parts_of
 from roadproof.controllers.loading import runs_code
 from roadproof.hardening.budget import HardeningBudget
 from roadproof.hardening.tuning import TrainingStep
-from roadproof.io.known import known_by
+from roadproof.io.known import known_by, without_addresses
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace, derived_seed
@@ -88,7 +88,8 @@ class Run:
             "controller": self.spec,
             **parts_of(teacher, (view.height_px, view.width_px)),
             "scenarios": [identity(each) for each in self.scenarios],
-            "budget": repr(replace(self.budget, judge=self.budget.attack)),
+            "budget": without_addresses(repr(replace(self.budget, judge=self.budget.attack))),
+            "objective": own_objective(self.budget.attack.objective),
             "space": repr(self.space),
             "variation": repr(variation_of(self.budget.attack.objective)),
             "seed": self.seed,

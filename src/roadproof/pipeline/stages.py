@@ -10,7 +10,7 @@ from typing import TypeAlias, cast
 from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, parse_groups
 from roadproof.attacks.cheapest import FILE, MOST_LEVELS
 from roadproof.attacks.groups import Group
-from roadproof.attacks.objective import variation_of
+from roadproof.attacks.objective import own_objective, variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
@@ -20,6 +20,7 @@ from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.files import write_json
 from roadproof.io.identity import digest, require_same
+from roadproof.io.known import without_addresses
 from roadproof.io.text import read_json
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
@@ -66,7 +67,8 @@ class Stages:
         size = self.simulator.input.height_px, self.simulator.input.width_px
         return {
             "scenario": self.scenario,
-            "budget": repr(self.budget),
+            "budget": without_addresses(repr(self.budget)),
+            "objective": own_objective(self.budget.objective),
             "space": self.space.stated,
             "variation": variation_of(self.budget.objective),
             "seed": self.seed,

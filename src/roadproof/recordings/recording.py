@@ -181,10 +181,8 @@ class RecordingSet:
         return self.canvas is not None and all(recording.track is not None for recording in self.recordings)
 
     def digest(self) -> str:
-        """SHA-256 of what a search or a drive in these recordings depends on; the same for a set that was loaded."""
-        told = plain((self.camera, self.view, self.colour.to_dict(), self.canvas, self.obstacles))
-        # A number that was given as an integer is read as a float.
-        found = hashlib.sha256(repr(json.loads(json.dumps(told), parse_int=float)).encode())
+        """SHA-256 of what a drive in these recordings depends on, not marks; the same for a set that was loaded."""
+        found = hashlib.sha256(_as_read((self.camera, self.view, self.colour.to_dict(), self.canvas, self.obstacles)))
         for drive in self.recordings:
             found.update(f"{drive.side} {drive.weather}".encode())
             small = [getattr(drive, name) for name in PER_FRAME]
@@ -195,12 +193,21 @@ class RecordingSet:
                 found.update(values.tobytes())
         return found.hexdigest()
 
+    def marks_digest(self) -> str:
+        """SHA-256 of the lane marks, which limits on paint depend on; the same for a set that was loaded."""
+        return hashlib.sha256(_as_read(self.marks)).hexdigest()
+
     def by_weather(self) -> tuple[RecordingSet, ...]:
         """The drives of each weather as a set of their own, in the order of their first drives."""
         found: dict[str, list[Recording]] = {}
         for recording in self.recordings:
             found.setdefault(recording.weather, []).append(recording)
         return tuple(replace(self, recordings=tuple(some)) for some in found.values())
+
+
+def _as_read(told: object) -> bytes:
+    """Values as they are in a file: a number that was given as an integer is read as a float."""
+    return repr(json.loads(json.dumps(plain(told)), parse_int=float)).encode()
 
 
 def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
