@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
 
+from roadproof.controllers import shipped
 from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.scenarios import builtin_scenarios
@@ -49,6 +51,28 @@ def test_hardened_weights_and_methods_of_a_class_are_known_by_their_files(tmp_pa
         weights.write_bytes(content)
         keys.append(study.jobs[0].key)
     assert len(set(keys)) == (3 if "@" in spec else 2)
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_other_weights_of_a_shipped_controller_are_other_jobs(tmp_path, monkeypatch):
+    study = dataclasses.replace(load_study(written(tmp_path, TEXT)), controller="pilotnet")
+    folder = shutil.copytree(shipped.FOLDER, tmp_path / "assets")
+    monkeypatch.setattr(shipped, "FOLDER", folder)
+    before = study.jobs[0]
+    shutil.copy(folder / "pilotnet-b.safetensors", folder / "pilotnet.safetensors")
+    assert before.weights == ""
+    assert study.jobs[0].weights == "8ad93a3836078ca6"
+    assert study.jobs[0].key != before.key
+
+
+def test_the_jobs_of_published_rows_keep_their_keys_with_the_weights_of_today(tmp_path):
+    published = {path.name for path in (ROOT / "docs" / "results" / "small" / "jobs").iterdir()}
+    assert published <= {job.key for job in load_study(ROOT / "studies" / "small.toml").jobs}
+    study = load_study(written(tmp_path, TEXT))
+    for name in shipped.shipped_names():
+        assert {job.weights for job in dataclasses.replace(study, controller=name).jobs} == {""}, name
 
 
 def test_jobs_on_a_map_of_the_users_are_known_by_what_is_in_it_wherever_it_lies(tmp_path):

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from roadproof.attacks import BayesianOptimisation
 from roadproof.compositing import Variation
 from roadproof.controllers.loading import files_of
+from roadproof.controllers.shipped import installed_weights, shipped_names
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import StartRange
 from roadproof.errors import RoadproofError, StudyError
@@ -123,7 +124,7 @@ class Job(Conditions):
         method: the method by which the pattern is found.
         seed: the seed of the recording and the search.
         weights: digest of the file that the controller's spec names, or of the source of a function of the user's;
-            empty for a controller that comes with the package.
+            empty for a controller that comes with the package, with its first weights.
     """
 
     scenario: Scenario
@@ -268,7 +269,23 @@ def _study(content: dict[str, Any], folder: Path) -> Study:
     )
 
 
+_FIRST_WEIGHTS = {
+    "cil": "bee9fbf17dd944f3",
+    "cil-small": "cfae47e5bb9672bb",
+    "pilotnet": "678d88488c9f5042",
+    "pilotnet-b": "8ad93a3836078ca6",
+    "temporal": "156d6ab596bb6299",
+    "waypoint": "f20de22ec6cfb48f",
+}
+"""Digests of the shipped weights that keys of jobs are older than: those that the published rows were made with."""
+
+
 def _digest(controller: str) -> str:
-    """The digest of the files that a spec names: weights, and the module that a function is written in."""
-    contents = [file.read_bytes() for file in files_of(controller)]
-    return hashlib.sha256(b"".join(contents)).hexdigest()[:16] if contents else ""
+    """The digest of the files that a spec names: weights, and the module that a function is written in.
+
+    It is empty for a controller that comes with the package, with the weights that it had first.
+    """
+    shipped = installed_weights(controller) if controller in shipped_names() else None
+    contents = [file.read_bytes() for file in (files_of(controller) if shipped is None else (shipped,))]
+    found = hashlib.sha256(b"".join(contents)).hexdigest()[:16] if contents else ""
+    return "" if found == _FIRST_WEIGHTS.get(controller) else found
