@@ -12,6 +12,7 @@ from roadproof.attacks import CMAES, AttackResult, GradOpt, InSimulator, PathDev
 from roadproof.attacks.driven import DrivenMeasure, effect_of
 from roadproof.attacks.groups import LEFT_GROUP
 from roadproof.controllers import load_controller
+from roadproof.datatypes import Weather
 from roadproof.driving.rollout import rollout
 from roadproof.driving.trial import judge
 from roadproof.errors import RoadproofError
@@ -67,6 +68,14 @@ def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, street, tmp_p
     assert first.fingerprint() != second.fingerprint()
     with pytest.raises(RoadproofError, match=r"driven\.json holds drives over patterns by another controller"):
         DrivenMeasure(place, load_controller("pilotnet-b"), PathDeviation())
+    moved = dataclasses.replace(street, canvas=dataclasses.replace(street.canvas, y_m=street.canvas.y_m + 0.1))
+    for other in ({"scenario": moved}, {"seed": 1}, {"weather": Weather.CLEAR_SUNSET}):
+        with pytest.raises(RoadproofError, match="its clean drive, scenario, canvas, weather, seed or simulator is an"):
+            DrivenMeasure(dataclasses.replace(place, **other), controller, PathDeviation())
+    older = json.loads(place.keep.read_text())
+    del older["conditions"]
+    place.keep.write_text(json.dumps(older))
+    assert DrivenMeasure(place, controller, PathDeviation()).values(SPACE, unit) == deviation
     damaged = {"format": "roadproof-driven", "version": 1, "drives": [["a", "b"]]}
     (tmp_path / "damaged.json").write_text(json.dumps(damaged))
     with pytest.raises(RoadproofError, match="incomplete or damaged"):

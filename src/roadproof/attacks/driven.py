@@ -23,10 +23,12 @@ from roadproof.attacks.objective import Objective, PathDeviation, SteeringShift
 from roadproof.controllers import Controller
 from roadproof.datatypes import Observation, Weather
 from roadproof.driving.deviation import passage, passage_deviation_m, path_of
+from roadproof.driving.drive_store import Episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
+from roadproof.io.identity import digest, stated
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
@@ -60,7 +62,7 @@ class InSimulator:
         weather: weather of all drives, clear noon by default.
         seed: seed of all drives, 0 by default.
         keep: file that keeps the effect of every drive, so that a known pattern is not driven again; it belongs to one
-            scenario, controller, weather and seed. None keeps nothing.
+            scenario, controller, weather, seed and simulator, and refuses others. None keeps nothing.
     """
 
     simulator: Simulator
@@ -92,6 +94,11 @@ class DrivenMeasure:
             )
         self._deviates = isinstance(objective, PathDeviation)
         self._place, self._known = place, dict[str, Effect]()
+        paints: dict[str, PatternImage] = {}
+        parts = dict(Episodes.of(place.simulator, driver, place.scenario, paints, Path()).parts)
+        # Drives are as costly in the next version; what another one answers otherwise shows in the clean drive.
+        parts.pop("version")
+        self._conditions = digest(stated([parts, place.weather, place.seed]))
         self.calls, self.frames_evaluated = 0, 0
 
         def drive(pattern: PatternImage | None, until: Callable[[Observation], bool] | None) -> Episode:
@@ -104,10 +111,10 @@ class DrivenMeasure:
         self.clean = drive(None, None)
         if place.keep is not None and place.keep.exists():
             kept = _FILE.read(place.keep)
-            if kept.clean not in ("", self._told()):
+            if kept.clean not in ("", self._told()) or kept.conditions not in ("", self._conditions):
                 raise RoadproofError(
-                    f"{place.keep} holds drives over patterns by another controller, or elsewhere: its clean drive is "
-                    "another; give another file, or remove it"
+                    f"{place.keep} holds drives over patterns by another controller, or elsewhere: its clean drive, "
+                    "scenario, canvas, weather, seed or simulator is another; give another file, or remove it"
                 )
             self._known = kept.drives
 
@@ -124,12 +131,12 @@ class DrivenMeasure:
         if key not in self._known:
             self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._place.scenario.canvas)
             if self._place.keep is not None:
-                _FILE.write(self._place.keep, _Kept(self._known, self._told()))
+                _FILE.write(self._place.keep, _Kept(self._known, self._told(), self._conditions))
         return self._known[key]
 
     def fingerprint(self) -> str:
-        """A digest of the clean drive and the objective, which tells this measure from others."""
-        return f"{self._told()} {self._deviates}"
+        """A digest of the clean drive, its conditions and the objective, which tells this measure from others."""
+        return f"{self._told()} {self._conditions} {self._deviates}"
 
     def _told(self) -> str:
         """A digest of the clean drive."""
@@ -162,10 +169,14 @@ def _counted_frames(clean: Episode) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """The file of effects, each by a digest of its paint, with one of the clean drive; older files have none."""
+    """The file of effects, each by a digest of its paint, with one of the clean drive; older files have none.
+
+    Nor have they a digest of the driver, scenario, weather, seed and simulator.
+    """
 
     drives: dict[str, Effect]
     clean: str = ""
+    conditions: str = ""
 
 
 _ROWS = Form(
