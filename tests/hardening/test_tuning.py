@@ -1,10 +1,14 @@
 """Fine-tuning: paint moves the controller less, the bare road is answered as before, the rest stays as it was."""
 
+import dataclasses
+import shutil
+
 import pytest
 import torch
 
 from hardening_road import SPACE, RampNet
 from painted_ground import RampFollower
+from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.errors import ControllerError, TrainingError
 from roadproof.hardening import Tuning, TuningBatch
 from roadproof.hardening.tuning import training_step, tune
@@ -57,16 +61,15 @@ def test_an_interrupted_tuning_goes_on_to_the_same_weights(street, tmp_path, fro
             raise KeyboardInterrupt
 
     tuning, seen = Tuning(steps=25, repeats=2, batch=4), []
+    kept = Checkpoint(tmp_path / "learning.safetensors", "this one")
     whole = tuned(street, tuning=tuning, step=step)
     with pytest.raises(KeyboardInterrupt):
-        tuned(street, tuning=tuning, step=step, checkpoint=tmp_path / "learning.safetensors", on_step=stop)
-    again = tuned(
-        street,
-        tuning=tuning,
-        step=step,
-        checkpoint=tmp_path / "learning.safetensors",
-        on_step=lambda done, loss: seen.append(done),
-    )
+        tuned(street, tuning=tuning, step=step, checkpoint=kept, on_step=stop)
+    another = dataclasses.replace(kept, path=shutil.copy(kept.path, tmp_path / "other.safetensors"), identity="another")
+    tuned(street, tuning=tuning, step=step, checkpoint=another, on_step=lambda done, loss: seen.append(done))
+    assert seen == [10, 20, 25], "one of another tuning begins anew"
+    seen.clear()
+    again = tuned(street, tuning=tuning, step=step, checkpoint=kept, on_step=lambda done, loss: seen.append(done))
     assert seen == [25]
     assert torch.equal(again.weight, whole.weight)
     assert torch.equal(again.bias, whole.bias)

@@ -10,6 +10,7 @@ from typing import TypeAlias
 import torch
 from torch import nn
 
+from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import CIL, ConditionalPilotNet, Controller
 from roadproof.controllers.loading import load_trainable, runs_code, save_controller
 from roadproof.controllers.steering import NetworkController
@@ -21,6 +22,8 @@ from roadproof.hardening.town import Town
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.views import Street
 from roadproof.io.files import write_tensors
+from roadproof.io.identity import stated
+from roadproof.io.known import known_by
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stress_test import OnProgress, StressTest
 from roadproof.processes import spread, stopping
@@ -81,6 +84,7 @@ class Stages:
         network = load_trainable(run.spec_of(number - 1))
         # It learns from paint of all kinds, also where attacks are limited.
         space = run.space.unlimited
+        told: list[object] = [network, tuning, run.seed_of(number), self.step, space.stated]
         streets: list[Street] = []
         found: list[torch.Tensor] = []
         for past, attacked in enumerate(tests):
@@ -92,7 +96,8 @@ class Stages:
                 street.add_ways(driver, space.pattern(points.to(run.device)))
                 streets.append(street)
                 found.append(points)
-        title, checkpoint = f"Round {number}: learning", run.round(number) / "learning.safetensors"
+                told += [recordings.digest(), points]
+        title, path = f"Round {number}: learning", run.round(number) / "learning.safetensors"
         with self.ledger.stage("learn"):
             tune(
                 network,
@@ -105,11 +110,11 @@ class Stages:
                 seed=run.seed_of(number),
                 device=run.device,
                 step=self.step,
-                checkpoint=checkpoint,
+                checkpoint=Checkpoint(path, stated(known_by(told))),
                 on_step=lambda step, loss: self.tell(title, step, tuning.steps, f"loss {loss:.4f}"),
             )
         _save(network, run, number)
-        checkpoint.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
     def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
         """Judge the controllers before and after on other streets."""

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeAlias, cast
 
 import torch
@@ -117,7 +116,7 @@ def tune(
     seed: int,
     device: torch.device | str = "cpu",
     step: TrainingStep = training_step,
-    checkpoint: Path | None = None,
+    checkpoint: Checkpoint | None = None,
     on_step: OnStep = lambda _step, _loss: None,
 ) -> None:
     """Fine-tune a controller in place.
@@ -133,7 +132,8 @@ def tune(
         seed: the seed of everything drawn.
         device: the torch device on which the controller learns.
         step: the function that gives the loss of a batch.
-        checkpoint: the file that keeps an interrupted tuning, which goes on from there; None for none.
+        checkpoint: the file that keeps an interrupted tuning, which goes on from there if its identity is the same;
+            None for none.
         on_step: called at every tenth step and at the last with the step and the mean loss since the call before.
 
     Raises:
@@ -174,17 +174,17 @@ def tune(
             total = 0.0
 
 
-def _keep(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, path: Path, steps: int) -> None:
+def _keep(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, checkpoint: Checkpoint, steps: int) -> None:
     """Keep the parameters and AdamW's moments after so many steps."""
     kept = {"steps": torch.tensor(steps)}
     for k, each in enumerate(parameters):
         kept |= {f"{k}.value": each} | {f"{k}.{name}": moment for name, moment in optimiser.state[each].items()}
-    Checkpoint(path, "").save(kept)
+    checkpoint.save(kept)
 
 
-def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, path: Path) -> int:
-    """Put back what a file keeps, where there is one that is whole; the number of steps done."""
-    kept = Checkpoint(path, "").load(parameters[0].device)
+def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, checkpoint: Checkpoint) -> int:
+    """Put back what a file keeps, where there is one that is whole and of this tuning; the number of steps done."""
+    kept = checkpoint.load(parameters[0].device)
     if kept is None:
         return 0
     for k, each in enumerate(parameters):
