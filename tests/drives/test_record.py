@@ -10,7 +10,7 @@ from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window, record, record_along
 from roadproof.drives.folder import write_settings
-from roadproof.errors import OutputError, RecordingError, ScenarioError
+from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.homographies import apply_homography
 from roadproof.recordings import Side
@@ -163,6 +163,9 @@ def test_a_drive_made_before_is_recorded_over_the_bare_road(drives, town, tmp_pa
     kept = (tmp_path / "round-1" / "drive.npz").stat().st_mtime_ns
     again = record_along(town, PaintShy(), drives, right.episode, name="round-1", folder=tmp_path)
     assert (tmp_path / "round-1" / "drive.npz").stat().st_mtime_ns == kept
+    with pytest.raises(RoadproofError, match="a drive along another one than was chosen; remove that folder") as other:
+        record_along(town, PaintShy(), drives, drives.drives[2].episode, name="round-1", folder=tmp_path)
+    assert not isinstance(other.value, RecordingError), "which would end the rounds in silence"
     np.testing.assert_array_equal(again.frames, along.frames)
 
 

@@ -139,11 +139,19 @@ def record_along(
 
     Raises:
         RecordingError: the canvas never comes into view, or the drive in the folder is damaged.
+        RoadproofError: the drive in the folder is along another one.
         SimulatorError, ScenarioError, ControllerError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
     kept = None if folder is None else read_drive(name, folder)
     if kept is not None:
+        again, given = ([e.steer, e.throttle, e.brake] for e in (kept.episode, episode))
+        steps = min(again[0].size, given[0].size)
+        if not all(np.allclose(one[:steps], other[:steps], atol=1e-4) for one, other in zip(again, given, strict=True)):
+            # No `RecordingError`, with which re-recording rounds would end as if the road showed too little.
+            raise RoadproofError(
+                f"{folder} holds a drive along another one than was chosen; remove that folder, and it is driven again"
+            )
         return kept
     settings, clean = drives.settings, drives.drives[0]
     path = CleanPath.of(clean.episode)
