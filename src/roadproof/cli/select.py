@@ -63,7 +63,11 @@ def select(
             on_drive=show,
         )
     keep_command(run / "selection")
+    before = (run / "pattern.json").read_bytes() if (run / "pattern.json").exists() else b""
     save_pattern(selection.pattern, run / "pattern.json")
+    if (run / "pattern.json").read_bytes() != before:
+        # It is of another pattern; the stress test makes it again.
+        (run / "prediction.npz").unlink(missing_ok=True)
     _summarise(selection, found, run)
     answer(stored(run / "selection" / "selection.json"))
 

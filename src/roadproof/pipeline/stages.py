@@ -13,14 +13,14 @@ from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import own_objective, variation_of
 from roadproof.calibration import Calibrated, calibrate, replays_needed
 from roadproof.controllers import Controller
-from roadproof.controllers.identity import parts_of
+from roadproof.controllers.identity import identity_of, parts_of
 from roadproof.drives import Drives, record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.files import write_json
-from roadproof.io.identity import digest, require_same
-from roadproof.io.known import without_addresses
+from roadproof.io.identity import digest, require_told, stated
+from roadproof.io.known import known_by, without_addresses
 from roadproof.io.text import read_json
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
@@ -190,12 +190,14 @@ class Stages:
     ) -> tuple[Cheapest, Selection] | None:
         """The least paint for a deviation, and the drive over it; None if nothing found reaches that deviation."""
         folder, total = self.folder / CHEAPEST, MOST_LEVELS + 1
-        made_of = {"wanted_m": wanted_m, "strongest": digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]}
+        boxes = digest(repr(cast("object", found.pattern.boxes.tolist())))[:16]
+        made_of = {"wanted_m": wanted_m, "strongest": boxes, "pattern": digest(stated(known_by(found.pattern)))[:16]}
         none = folder / "none.json"
         if none.exists() and read_json(none, *_NONE, RoadproofError)["made_of"] == made_of:
             return None
         if (folder / "cheapest.json").exists():
-            require_same(folder, "a search", FILE.content(folder / "cheapest.json")["made_of"], made_of, RoadproofError)
+            before = FILE.content(folder / "cheapest.json").get("made_of")
+            require_told(folder, "a search", before, made_of, RoadproofError)
             less = Cheapest.load(folder)
         else:
             less = cheapest(
@@ -233,13 +235,18 @@ class Stages:
         if chosen is None or not self.budget.is_predicted:
             return None
         path = self.folder / "prediction.npz"
-        if path.exists():
-            return Prediction.load(path)
+        size = self.simulator.input.height_px, self.simulator.input.width_px
+        driven = [chosen.driven[chosen.chosen].trial.clean, chosen.driven[chosen.chosen].trial.painted]
+        told = [known_by(pattern), driven, recordings.digest(), identity_of(self.controller, size)]
+        made_of = digest(stated(told))[:16]
+        if path.exists() and (kept := Prediction.load(path)).made_of == made_of:
+            return kept
         done = enumerate(() if rounds is None else rounds.done, 1)
         number = next((k for k, each in done if each.selection is chosen), 0)
         place = self.folder / f"round-{number}" if number else self.folder
         clean, painted = chosen.episodes(place / "selection")
         prediction = predict(recordings, self.controller, pattern, clean, painted, device=self.device)
+        prediction = replace(prediction, made_of=made_of)
         prediction.save(path)
         return prediction
 
