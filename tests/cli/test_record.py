@@ -91,7 +91,12 @@ def test_what_an_attack_found_is_driven_over_and_the_strongest_is_kept(run, call
     chosen = place / "attack" / "candidates" / f"{selection.driven[selection.chosen].rank}.json"
     assert (place / "pattern.json").read_text() == chosen.read_text()
     before = {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")}
+    (place / "prediction.npz").write_bytes(b"")
     assert call(*select) == said
+    assert (place / "prediction.npz").exists()
+    (place / "pattern.json").write_text("{}")
+    assert call(*select) == said
+    assert not (place / "prediction.npz").exists(), "it was of another pattern"
     assert all("steering shift " in line for line in said.splitlines()[:2])
     assert answered(call(*select, "--json")) == stored(place / "selection" / "selection.json")
     assert {path: path.stat().st_mtime_ns for path in (place / "selection").rglob("*.npz")} == before

@@ -54,15 +54,15 @@ class Follower(Base):
 """
 
 
-def loaded(folder: Path, source: str) -> ModuleType:
+def loaded(folder: Path, source: str, name: str = "users_own") -> ModuleType:
     """A module of a user's, read from a file of its own, under one and the same name."""
     path = folder / f"m{len(list(folder.iterdir()))}.py"
     path.write_text(source)
-    spec = importlib.util.spec_from_file_location("users_own", path)
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     made = importlib.util.module_from_spec(spec)
-    sys.modules["users_own"] = made
+    sys.modules[name] = made
     spec.loader.exec_module(made)
     return made
 
@@ -103,6 +103,27 @@ def test_arguments_and_closures_count(own: Callable[..., Any]) -> None:
     two(1.0)
     assert known_by(two) == known == known_by(module.made(2.0)), "nor does a count"
     assert known_by(module.Follower(2.0).act) != known_by(module.Follower(3.0).act)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "import users_helper as h\ndef drive(x): return h.bent(x)",
+        "from users_helper import bent\ndef drive(x): return bent(x)",
+    ],
+)
+def test_what_it_uses_of_the_users_other_modules_counts(tmp_path: Path, how: str) -> None:
+    known: list[Any] = []
+    for edit in ("x + 1.0", "x + 1.0", "x + 2.0"):
+        loaded(tmp_path, f"def bent(x): return {edit}", "users_helper")
+        known.append(known_by(loaded(tmp_path, how).drive))
+    assert known[0] == known[1] != known[2]
+
+
+def test_many_functions_that_call_each_other_are_told_once_each(tmp_path: Path) -> None:
+    every = " + ".join(f"f{k}(x)" for k in range(40))
+    module = loaded(tmp_path, "\n".join(f"def f{k}(x): return {every}" for k in range(40)))
+    assert len(str(known_by(module.f0))) < 400_000
 
 
 def test_an_object_is_its_class_with_its_source_and_its_settings(own: Callable[..., Any]) -> None:

@@ -13,7 +13,7 @@ from enum import Enum
 from functools import cache, partial
 from pathlib import PurePath
 from types import CodeType, FunctionType, MethodType, ModuleType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from roadproof.io.identity import digest, stated
 _DEEPEST = 8
 _CHANGING = (list, dict, set, bytearray, ModuleType)
 """What a function's surroundings may hold as a memory of its calls."""
-_NOT_THE_USERS = sys.stdlib_module_names | {"torch", "numpy"}
+_NOT_THE_USERS = sys.stdlib_module_names | {"torch", "numpy", __name__.partition(".")[0]}
 
 
 def without_addresses(text: str) -> str:
@@ -30,31 +30,42 @@ def without_addresses(text: str) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
 
+class _Within(NamedTuple):
+    """The ids of what lies around a value, and of the functions and classes that were told before it."""
+
+    above: tuple[int, ...]
+    told: set[int]
+
+
 def known_by(thing: object) -> Any:  # noqa: ANN401
     """What tells a value, an object or a function from others, in any process: as JSON has it.
 
-    A function is known by its name and source, and by what it was given: defaults, the arguments of a partial one, the
-    constants and functions of its module and of its closure that it uses, but no lists or dicts, which may grow as it
-    is called. An object is known by its class with its source, and by what its constructor takes, where it keeps that
-    under the same name; a dataclass by its fields; a network by its weights too. Roadproof's own functions and classes
-    have no source here: their version and their answers tell. A path tells nothing, as a folder may be moved.
+    A function is known by its name and source, and by what it was given: defaults, the arguments of a partial one, and
+    what it uses of the user's modules and of its closure, but no lists or dicts, which may grow as it is called. An
+    object is known by its class with its source, and by what its constructor takes, where it keeps that under the same
+    name; a dataclass by its fields; a network by its weights too. Roadproof's own functions and classes have no source
+    here: their version and their answers tell. A path tells nothing, as a folder may be moved.
     """
-    return _known(thing, ())
+    return _known(thing, _Within((), set()))
 
 
 def plain_fields(thing: object) -> dict[str, Any]:
     """The numbers, texts and arrays that an object keeps, by name, as `known_by` has them."""
     usual = _kept(_torch().nn.Module()) if _is_module(thing) else {}
     kept = {name: value for name, value in _kept(thing).items() if name not in usual}
-    return {name: _known(value, ()) for name, value in kept.items() if _is_plain(value)}
+    return {name: known_by(value) for name, value in kept.items() if _is_plain(value)}
 
 
-def _known(thing: Any, within: tuple[int, ...]) -> Any:  # noqa: ANN401
+def _known(thing: Any, within: _Within) -> Any:  # noqa: ANN401
     if thing is None or isinstance(thing, bool | int | float | str):
         return thing.value if isinstance(thing, Enum) else thing
-    if id(thing) in within or len(within) > _DEEPEST:
+    if id(thing) in within.above or len(within.above) > _DEEPEST:
         return type(thing).__name__
-    within = (*within, id(thing))
+    if isinstance(thing, FunctionType | type):
+        if id(thing) in within.told:
+            return _name(thing)
+        within.told.add(id(thing))
+    within = _Within((*within.above, id(thing)), within.told)
     if isinstance(thing, PurePath):
         return "a path"
     if isinstance(thing, Enum):
@@ -80,8 +91,8 @@ def _known(thing: Any, within: tuple[int, ...]) -> Any:  # noqa: ANN401
     return _object(thing, within)
 
 
-def _function(function: FunctionType, within: tuple[int, ...]) -> dict[str, Any]:
-    told: dict[str, Any] = {"function": _name(function)}
+def _function(function: FunctionType, within: _Within) -> dict[str, Any]:
+    told: dict[str, Any] = {"function": _label(function)}
     if _is_ours(function):
         function = inspect.unwrap(function)
         told["uses"] = _uses(function, within, {})
@@ -92,11 +103,14 @@ def _function(function: FunctionType, within: tuple[int, ...]) -> dict[str, Any]
     return {name: value for name, value in told.items() if value}
 
 
-def _uses(function: FunctionType, within: tuple[int, ...], around: Mapping[str, object]) -> dict[str, Any]:
+def _uses(function: FunctionType, within: _Within, around: Mapping[str, object]) -> dict[str, Any]:
     """The constants and functions around a function, and in its closure, that it names and does not set."""
     code = function.__code__
     read, written = _names(code)
     found = {name: around[name] for name in read if name in around}
+    for module, its in [(name, value) for name, value in found.items() if isinstance(value, ModuleType)]:
+        if _is_the_users(its.__name__):
+            found |= {f"{module}.{name}": vars(its)[name] for name in read if name in vars(its)}
     for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
         try:
             found[name] = cell.cell_contents
@@ -106,10 +120,8 @@ def _uses(function: FunctionType, within: tuple[int, ...], around: Mapping[str, 
     for name, value in sorted(found.items()):
         if name in written or name.startswith("__") or isinstance(value, _CHANGING):
             continue
-        if isinstance(value, FunctionType | type) and value.__module__ != function.__module__:
-            told[name] = _name(cast("type", value))
-        else:
-            told[name] = _known(value, within)
+        foreign = isinstance(value, FunctionType | type) and not _is_the_users(value.__module__)
+        told[name] = _name(cast("type", value)) if foreign else _known(value, within)
     return told
 
 
@@ -125,22 +137,22 @@ def _names(code: CodeType) -> tuple[set[str], set[str]]:
     return read, written
 
 
-def _class(kind: type, within: tuple[int, ...]) -> dict[str, Any]:
+def _class(kind: type, within: _Within) -> dict[str, Any]:
     """A class with those that it inherits from in its package, each with what its methods use."""
-    package, told = kind.__module__.partition(".")[0], dict[str, Any]()
-    if _is_ours(kind):
+    package, told = str(kind.__module__).partition(".")[0], dict[str, Any]()
+    if _is_ours(kind) or package in _NOT_THE_USERS:
         return {"class": _name(kind)}
     for each in kind.__mro__:
-        if each.__module__.partition(".")[0] == package and package not in _NOT_THE_USERS:
+        if str(each.__module__).partition(".")[0] == package or _is_the_users(each.__module__):
             methods = [value for value in vars(each).values() if isinstance(value, FunctionType)]
             uses = {
                 name: value for method in methods for name, value in _uses(method, within, method.__globals__).items()
             }
-            told[_name(each)] = [_source(each), uses]
-    return {"class": _name(kind), "source": told}
+            told[_label(each)] = [_source(each), uses]
+    return {"class": _label(kind), "source": told}
 
 
-def _object(thing: Any, within: tuple[int, ...], *, weights: bool = True) -> dict[str, Any]:  # noqa: ANN401
+def _object(thing: Any, within: _Within, *, weights: bool = True) -> dict[str, Any]:  # noqa: ANN401
     kind = cast("type[Any]", type(thing))
     told: dict[str, Any] = _class(kind, within)
     kept = _kept(thing)
@@ -202,8 +214,22 @@ def _name(thing: FunctionType | type) -> str:
     return f"{thing.__module__}:{thing.__qualname__}"
 
 
+def _label(thing: FunctionType | type) -> str:
+    """The name without the module where the source tells: run as a script, it is another module."""
+    return _name(thing) if _is_ours(thing) or not _source(thing) else thing.__qualname__
+
+
+@cache
+def _is_the_users(module: str | None) -> bool:
+    """Whether a module is one that its user may edit: not ours, not Python's, not installed."""
+    if not module:
+        return False
+    file = getattr(sys.modules.get(module), "__file__", None) or ""
+    return module.partition(".")[0] not in _NOT_THE_USERS and "-packages" not in file
+
+
 def _is_ours(thing: FunctionType | type) -> bool:
-    return thing.__module__.partition(".")[0] == __name__.partition(".")[0]
+    return str(thing.__module__).partition(".")[0] == __name__.partition(".")[0]
 
 
 @cache
