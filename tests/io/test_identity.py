@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from roadproof.errors import RecordingError, RoadproofError
-from roadproof.io.identity import ANSWERS, digest, require_same, stated
+from roadproof.io.identity import ANSWERS, CONTROLLER, digest, require_same, require_told, stated
 
 NOW: dict[str, Any] = {
     "scenario": {"name": "left-03", "goal_m": (1.0, 2.0), "note": None},
@@ -52,6 +52,30 @@ def test_a_folder_of_other_parts_is_refused_in_one_line(message: str) -> None:
         require_same(Path("out"), "a run", BEFORE | OTHERS[message], NOW, RecordingError)
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 250
+
+
+def test_a_controller_is_compared_by_its_digest_where_it_was_kept() -> None:
+    """Folders older than that part are gone on with where the answers of old are the same."""
+    now = NOW | {CONTROLLER: "89ab"}
+    require_same(Path("out"), "a run", BEFORE, now, RoadproofError)
+    with pytest.raises(
+        RoadproofError, match="out holds a run of another controller, whose weights, settings or source"
+    ):
+        require_same(Path("out"), "a run", BEFORE | {CONTROLLER: "cdef"}, now, RoadproofError)
+    with pytest.raises(RoadproofError, match="which answers otherwise"):
+        require_same(Path("out"), "a run", BEFORE | {ANSWERS: "4567"}, now, RoadproofError)
+
+
+def test_what_says_nothing_is_refused_unless_it_is_older_than_the_word() -> None:
+    """None stands for a file without the word."""
+    require_told(Path("out"), "a search", None, NOW, RoadproofError)
+    require_told(Path("out"), "a search", BEFORE, NOW, RoadproofError)
+    with pytest.raises(
+        RoadproofError, match="out holds a search that does not say what it was made of; choose another"
+    ):
+        require_told(Path("out"), "a search", {}, NOW, RoadproofError)
+    with pytest.raises(RoadproofError, match="with seed 4, now it is 3"):
+        require_told(Path("out"), "a search", BEFORE | {"seed": 4}, NOW, RoadproofError)
 
 
 def test_the_same_parts_have_one_digest() -> None:
