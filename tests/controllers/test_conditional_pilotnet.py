@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from roadproof.controllers import ConditionalPilotNet, check_controller, load_controller, save_controller
-from roadproof.controllers.loading import load_network
+from roadproof.controllers.weights_file import load_network
 from roadproof.errors import ControllerError
 
 

@@ -1,16 +1,13 @@
 """Specs: every kind loads and answers as the network it was made from; every mistake gets one clear line."""
 
-import shutil
 import sys
 
-import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from roadproof.controllers import (
     CIL,
-    ControllerCard,
     CruiseControl,
     FramePreparation,
     SteeringController,
@@ -20,17 +17,12 @@ from roadproof.controllers import (
     save_controller,
 )
 from roadproof.controllers.loading import load_trainable
-from roadproof.errors import ControllerError, DeviceError, OutputError
+from roadproof.errors import ControllerError, DeviceError
 
 
 def drive(height: int = 88, width: int = 200) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     frames = torch.rand(4, 3, height, width, generator=torch.Generator().manual_seed(0))
     return frames, torch.tensor([0.0, 3.0, 6.0, 9.0]), torch.tensor([2, 3, 4, 5])
-
-
-@pytest.fixture
-def cil() -> CIL:
-    return CIL(width=0.1, seed=5).eval()
 
 
 def test_cil_is_saved_and_loaded_folded_and_frozen(cil, tmp_path):
@@ -60,28 +52,6 @@ def test_a_spec_may_name_the_architecture_of_bare_weights(pilotnet_data):
     assert controller.input_size == (88, 200)
     report = check_controller(controller)
     assert report.passed, report.failures
-
-
-def test_a_card_beside_bare_weights_says_the_rest(pilotnet_data, tmp_path):
-    weights = tmp_path / "net.safetensors"
-    shutil.copy(pilotnet_data / "pilotnet.safetensors", weights)
-    with pytest.raises(ControllerError, match=r"says nothing about its architecture.*pilotnet:.*net\.json"):
-        load_controller(weights)
-    rows = FramePreparation(frame_size=(88, 200), rows=(10, 76), network_size=(66, 200))
-    card = ControllerCard(architecture="pilotnet", activation="relu", preparation=rows)
-    weights.with_suffix(".json").write_text(card.to_json())
-    controller = load_controller(weights)
-    assert isinstance(controller, SteeringController)
-    assert controller.preparation == rows
-    assert controller.network.activation == "relu"
-
-
-def test_bare_cil_weights_are_the_published_size(tmp_path):
-    save_file(CIL(seed=1).state_dict(), tmp_path / "cil.safetensors")
-    assert load_controller(f"cil:{tmp_path / 'cil.safetensors'}").input_size == (88, 200)
-    save_file(CIL(width=0.1).state_dict(), tmp_path / "small.safetensors")
-    with pytest.raises(ControllerError, match=r"tensor .* has shape .*, expected .* for this CIL"):
-        load_controller(f"cil:{tmp_path / 'small.safetensors'}")
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-5), ("bfloat16", 0.03)])
@@ -200,26 +170,6 @@ def test_a_missing_file_is_named(name, tmp_path, monkeypatch):
         load_controller(name)
 
 
-def test_damaged_and_unfitting_weights_are_refused(cil, tmp_path):
-    path = tmp_path / "net.safetensors"
-    path.write_bytes(b"not tensors")
-    with pytest.raises(ControllerError, match="not a safetensors file or is damaged"):
-        load_controller(path)
-    save_controller(cil, path)
-    state = load_file(path)
-    spec = f"cil:{path}"
-
-    def refused(changed, message):
-        save_file(changed, path)
-        with pytest.raises(ControllerError, match=message):
-            load_controller(spec)
-
-    refused({name: value for name, value in state.items() if name != "join.0.bias"}, r"lacks tensor join\.0\.bias")
-    refused(state | {"extra": torch.zeros(1)}, "has an unexpected tensor extra")
-    full = CIL().state_dict()
-    refused(full | {"join.0.bias": torch.full((512,), np.nan)}, r"join\.0\.bias has NaN")
-
-
 def test_devices_and_precisions_that_are_not_there_are_refused(cil, tmp_path):
     save_controller(cil, tmp_path / "cil.safetensors")
     for device, message in (
@@ -231,18 +181,6 @@ def test_devices_and_precisions_that_are_not_there_are_refused(cil, tmp_path):
             load_controller(tmp_path / "cil.safetensors", device=device)
     with pytest.raises(DeviceError, match="dtype 'int8' is unknown, expected one of float32"):
         load_controller(tmp_path / "cil.safetensors", dtype="int8")
-
-
-def test_what_cannot_be_saved_is_said(cil, tmp_path):
-    with pytest.raises(ControllerError, match="folded CIL"):
-        save_controller(cil.folded(), tmp_path / "x.safetensors")
-    with pytest.raises(ControllerError, match="cannot save a Identity"):
-        controller = SteeringController(torch.nn.Identity(), preparation=FramePreparation())
-        save_controller(controller, tmp_path / "x.safetensors")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write"):
-        save_controller(cil, tmp_path / "file" / "x.safetensors")
-    assert not list(tmp_path.glob("*.part"))
 
 
 @pytest.mark.gpu

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from published_checkpoint import DENSE_AND_BIASES, KERNELS, made_up_checkpoint
 from roadproof.controllers import check_controller, convert_cil, load_controller
 from roadproof.controllers.cards import read_card
-from roadproof.controllers.loading import load_network
+from roadproof.controllers.weights_file import load_network
 from roadproof.errors import ControllerError, OutputError
 
 STRIDES = (2, 1, 2, 1, 2, 1, 1, 1)

@@ -10,7 +10,6 @@ from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet as Co
 from roadproof.controllers.frames import FramePreparation as FramePreparation
 from roadproof.controllers.history import HistoryController as HistoryController
 from roadproof.controllers.loading import load_controller as load_controller
-from roadproof.controllers.loading import save_controller as save_controller
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA as PILOTNET_ON_CARLA
 from roadproof.controllers.pilotnet import PilotNet as PilotNet
 from roadproof.controllers.pilotnet import pilotnet_controller as pilotnet_controller
@@ -31,3 +30,4 @@ from roadproof.controllers.trajectory import Plan as Plan
 from roadproof.controllers.trajectory import TrajectoryController as TrajectoryController
 from roadproof.controllers.waypoint import WaypointNet as WaypointNet
 from roadproof.controllers.waypoint import waypoint_controller as waypoint_controller
+from roadproof.controllers.weights_file import save_controller as save_controller

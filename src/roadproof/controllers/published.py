@@ -23,7 +23,7 @@ from torch import Tensor
 
 from roadproof.controllers.cil import CIL
 from roadproof.controllers.conditional import BRANCHES
-from roadproof.controllers.loading import save_controller
+from roadproof.controllers.weights_file import save_controller
 from roadproof.errors import ControllerError, OutputError
 from roadproof.io.arrays import archive_names, read_archive
 from roadproof.io.files import one_line

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from roadproof.attacks.checkpoint import Checkpoint
-from roadproof.controllers import CIL, ConditionalPilotNet, Controller
-from roadproof.controllers.loading import load_trainable, runs_code, save_controller
+from roadproof.controllers import CIL, ConditionalPilotNet, Controller, save_controller
+from roadproof.controllers.loading import load_trainable, runs_code
 from roadproof.controllers.steering import NetworkController
 from roadproof.errors import TrainingError
 from roadproof.hardening.judgement import Clean, Judge, Judged, clean_drives

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, temporal_controller, waypoint_controller
-from roadproof.controllers.loading import load_network
 from roadproof.controllers.shipped import shipped_weights
+from roadproof.controllers.weights_file import load_network
 from roadproof.errors import TrainingError
 from roadproof.io.files import write_text
 from roadproof.io.text import read_json

@@ -1,0 +1,72 @@
+"""Weights files: saved, read with their card, refused where they do not fit."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from roadproof.controllers import (
+    CIL,
+    ControllerCard,
+    FramePreparation,
+    SteeringController,
+    load_controller,
+    save_controller,
+)
+from roadproof.errors import ControllerError, OutputError
+
+
+def test_a_card_beside_bare_weights_says_the_rest(pilotnet_data, tmp_path):
+    weights = tmp_path / "net.safetensors"
+    shutil.copy(pilotnet_data / "pilotnet.safetensors", weights)
+    with pytest.raises(ControllerError, match=r"says nothing about its architecture.*pilotnet:.*net\.json"):
+        load_controller(weights)
+    rows = FramePreparation(frame_size=(88, 200), rows=(10, 76), network_size=(66, 200))
+    card = ControllerCard(architecture="pilotnet", activation="relu", preparation=rows)
+    weights.with_suffix(".json").write_text(card.to_json())
+    controller = load_controller(weights)
+    assert isinstance(controller, SteeringController)
+    assert controller.preparation == rows
+    assert controller.network.activation == "relu"
+
+
+def test_bare_cil_weights_are_the_published_size(tmp_path):
+    save_file(CIL(seed=1).state_dict(), tmp_path / "cil.safetensors")
+    assert load_controller(f"cil:{tmp_path / 'cil.safetensors'}").input_size == (88, 200)
+    save_file(CIL(width=0.1).state_dict(), tmp_path / "small.safetensors")
+    with pytest.raises(ControllerError, match=r"tensor .* has shape .*, expected .* for this CIL"):
+        load_controller(f"cil:{tmp_path / 'small.safetensors'}")
+
+
+def test_damaged_and_unfitting_weights_are_refused(cil, tmp_path):
+    path = tmp_path / "net.safetensors"
+    path.write_bytes(b"not tensors")
+    with pytest.raises(ControllerError, match="not a safetensors file or is damaged"):
+        load_controller(path)
+    save_controller(cil, path)
+    state = load_file(path)
+    spec = f"cil:{path}"
+
+    def refused(changed, message):
+        save_file(changed, path)
+        with pytest.raises(ControllerError, match=message):
+            load_controller(spec)
+
+    refused({name: value for name, value in state.items() if name != "join.0.bias"}, r"lacks tensor join\.0\.bias")
+    refused(state | {"extra": torch.zeros(1)}, "has an unexpected tensor extra")
+    full = CIL().state_dict()
+    refused(full | {"join.0.bias": torch.full((512,), np.nan)}, r"join\.0\.bias has NaN")
+
+
+def test_what_cannot_be_saved_is_said(cil, tmp_path):
+    with pytest.raises(ControllerError, match="folded CIL"):
+        save_controller(cil.folded(), tmp_path / "x.safetensors")
+    with pytest.raises(ControllerError, match="cannot save a Identity"):
+        controller = SteeringController(torch.nn.Identity(), preparation=FramePreparation())
+        save_controller(controller, tmp_path / "x.safetensors")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        save_controller(cil, tmp_path / "file" / "x.safetensors")
+    assert not list(tmp_path.glob("*.part"))
