@@ -60,33 +60,41 @@ def recorded(world, folder, controller=straight_on, on_drive=lambda _: None):
     )
 
 
+DOOMED, KILLED_S = [], []
+"""Servers that the next step of `straight_on_for_a_while` kills, and when it did."""
+
+
+def straight_on_for_a_while(scenario):
+    steer = straight_on(scenario)
+
+    def act(seen):
+        if DOOMED:
+            KILLED_S.append(time.monotonic())
+            DOOMED.pop().kill()
+        return steer(seen)
+
+    return act
+
+
 @pytest.mark.slow
 def test_a_server_killed_in_mid_episode_keeps_the_recordings_so_far_and_the_rest_is_recorded_later(street, tmp_path):
     threads = threading.active_count()
     with serving("--map", street) as (process, port):
-        done, killed = [], []
 
-        def until_killed(scenario):
-            steer = straight_on(scenario)
-
-            def act(seen):
-                if 1 in done and not killed:
-                    killed.append(time.monotonic())
-                    process.kill()
-                return steer(seen)
-
-            return act
+        def doom(done):
+            if done == 1:
+                DOOMED.append(process)
 
         with pytest.raises(SimulatorError, match=r"did not answer|sent no picture"), small(port) as world:
-            recorded(world, tmp_path, until_killed, done.append)
+            recorded(world, tmp_path, straight_on_for_a_while, doom)
         # The call that found nobody, and the farewells.
-        assert time.monotonic() - killed[0] < 5 * PATIENCE_S
+        assert time.monotonic() - KILLED_S.pop() < 5 * PATIENCE_S
     (kept,) = tmp_path.rglob("episode.npz")
     before = kept.stat().st_mtime_ns
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
     assert threading.active_count() <= threads + 1
     with serving("--map", street) as (_, port), small(port) as world:
-        drives = recorded(world, tmp_path)
+        drives = recorded(world, tmp_path, straight_on_for_a_while)
     assert [drive.name for drive in drives.drives] == ["clean", "right", "left"]
     assert kept.stat().st_mtime_ns == before
     assert len(Drives.load(tmp_path).drives) == 3
