@@ -9,8 +9,7 @@ from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 needs.town()
 from roadproof.simulators.town import physics
 from roadproof.simulators.town.simulator import TownSimulator
-from roadproof.training import expert as driver
-from roadproof.training.expert import Expert
+from roadproof.training.expert import MAX_STEER_RAD, WHEELBASE_M, Expert
 
 SCENARIOS = builtin_scenarios()
 FEW = [find_scenario(name, SCENARIOS) for name in ("straight-16", "left-03", "right-11")]
@@ -46,5 +45,5 @@ def test_the_expert_completes_scenarios_of_every_kind_among_cars_and_people(town
 
 
 def test_the_expert_knows_the_car_it_drives() -> None:
-    assert driver.WHEELBASE_M == physics.WHEELBASE_M
-    assert driver.MAX_STEER_RAD == physics.MAX_STEER_RAD
+    assert WHEELBASE_M == physics.WHEELBASE_M
+    assert MAX_STEER_RAD == physics.MAX_STEER_RAD
