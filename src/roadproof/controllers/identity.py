@@ -66,16 +66,21 @@ def identity_of(driver: object, size: tuple[int, int]) -> str:
     Raises:
         ControllerError: the controller raises, or answers with something that is no control.
     """
+    return told_of(driver, size)[1]
+
+
+def told_of(driver: object, size: tuple[int, int]) -> tuple[Answers, str]:
+    """What `answers_of` and `identity_of` give for a driver, which is asked once; a function has no answers."""
     if not isinstance(driver, Controller):
         told = known_by(driver)
-        return "" if set(told) == {"function"} else digest(stated(told))[:16]
+        return [], "" if set(told) == {"function"} else digest(stated(told))[:16]
     # Whatever it makes when it is first asked is there then.
     first = answers_of(driver, size)
     before = plain_fields(driver)
     asked = _answers_to_all(driver, size)
     after = plain_fields(driver)
     steady = {name: value for name, value in before.items() if after.get(name) == value}
-    return digest(stated([known_by(driver), steady, first, asked]))[:16]
+    return first, digest(stated([known_by(driver), steady, first, asked]))[:16]
 
 
 class Parts(TypedDict):
@@ -87,8 +92,8 @@ class Parts(TypedDict):
 
 def parts_of(driver: object, size: tuple[int, int]) -> Parts:
     """The parts by which a folder knows a driver, by name; arguments and errors are those of `identity_of`."""
-    answers = digest(stated(answers_of(driver, size)))[:16] if isinstance(driver, Controller) else ""
-    return {"answers": answers, "controller_digest": identity_of(driver, size)}
+    answers, which = told_of(driver, size)
+    return {"answers": digest(stated(answers))[:16] if answers else "", "controller_digest": which}
 
 
 def _answers_to_all(controller: Controller, size: tuple[int, int]) -> list[tuple[float, ...] | None]:

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias, cast
 
 import roadproof
 from roadproof.controllers import Controller
-from roadproof.controllers.identity import answers_of, identity_of
+from roadproof.controllers.identity import told_of
 from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, rollout
@@ -178,15 +178,13 @@ def driver_in_words(driver: AnyDriver) -> str:
 def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[str, object]:
     """Everything that all drives depend on, by name."""
     view = simulator.input
-    size = view.height_px, view.width_px
-    answers = answers_of(driver, size) if isinstance(driver, Controller) else []
     parts: dict[str, object] = {
         "version": roadproof.__version__,
         "simulator": f"{type(simulator).__module__}.{type(simulator).__qualname__}",
         "camera": simulator.camera.stated,
         "input": asdict(view),
         "dt_s": simulator.dt_s,
-        "driver": [driver_in_words(driver), answers, identity_of(driver, size)],
+        "driver": [driver_in_words(driver), *told_of(driver, (view.height_px, view.width_px))],
         "scenario": identity_of_scenario(scenario),
     }
     if simulator.paint is not PaintKind.RENDERED:
