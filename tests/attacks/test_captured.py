@@ -68,7 +68,7 @@ class Dense(Surrogate):
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
-        self._replayed = True
+        vars(self).update(vars(self.replayable()), frames_evaluated=self.frames_evaluated)
 
 
 class Drawn(Surrogate):

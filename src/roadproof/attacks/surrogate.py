@@ -115,7 +115,8 @@ class Surrogate:
         if self.variation is not None:
             return None
         same = copy.copy(self)
-        vars(same).update(_kept={}, _replayed=True, frames_evaluated=0)
+        views = [replace(view, runs=None) for view in self.views]
+        vars(same).update(views=views, _kept={}, _replayed=True, frames_evaluated=0)
         return same
 
     def redraw(self, seed: int) -> None:
@@ -216,7 +217,7 @@ class Surrogate:
         if copies not in self._kept:
             if not self._replayed:
                 self._kept.clear()
-            self._kept[copies] = Compositor(self.views, copies, dense=self._replayed)
+            self._kept[copies] = Compositor(self.views, copies)
         return self._kept[copies]
 
     def steer_of(self, frames: Float[Tensor, "f 3 h w"], group: int) -> Float[Tensor, " f"]:

@@ -52,12 +52,10 @@ class Compositor:
     Args:
         views: sets of frames with their view of the canvas, all frames of one size.
         copies: number of patterns painted into each view.
-        dense: whether to paint by plain tensor operations alone, whose shapes do not depend on where figures are.
     """
 
-    def __init__(self, views: Sequence[CanvasView], copies: int, *, dense: bool = False) -> None:
+    def __init__(self, views: Sequence[CanvasView], copies: int) -> None:
         self._views = tuple(views)
-        self._dense = dense
         self._copies = copies
         self._frames = torch.cat([view.frames.repeat(copies, 1, 1, 1) for view in views])
 
@@ -68,8 +66,7 @@ class Compositor:
             patterns: one batch of `copies` patterns for each view.
             looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
         """
-        paint = dense_colours if self._dense else canvas_colours
-        colours = [paint(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
+        colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
         if looks is not None:
             colours = [
                 _worn(colour, view.clean, looks.left(view.footprints.centre[None], self._copies))

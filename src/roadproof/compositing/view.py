@@ -71,10 +71,51 @@ class OwnViews(CanvasPixels):
     pixel: Int[Tensor, "b p"]
     valid: Bool[Tensor, "b p"]
 
+    @staticmethod
+    def lit(
+        frames: Float[Tensor, "b 3 h w"],
+        pixel: Int[Tensor, "b p"],
+        valid: Bool[Tensor, "b p"],
+        footprints: Footprints,
+        light: tuple[Float[Tensor, "b p #3"], Float[Tensor, "b p 1"], Float[Tensor, "b p 3"] | float],
+        response: Response,
+        *,
+        dense: bool = False,
+    ) -> OwnViews:
+        """Pixels of pictures in a light.
+
+        Args:
+            frames: bare pictures in [0, 1].
+            pixel: index of each pixel in its flattened picture.
+            valid: which pixels are not copies that fill up a row.
+            footprints: footprints of the pixels on the canvas.
+            light: A = s·gain, the share s, and the offset.
+            response: response from painted to seen colour.
+            dense: whether every figure is painted in every pixel.
+        """
+        gain, share, offset = light
+        clean = picked_pixels(frames.flatten(2), pixel).mT
+        gain, bias = gain.expand_as(clean), share * (offset - clean)
+        return OwnViews(
+            pixel=pixel,
+            valid=valid,
+            footprints=footprints,
+            clean=clean,
+            gain=gain,
+            bias=bias,
+            response=response,
+            runs=None if dense else Runs.of(footprints.features[:, 0], clean, gain, bias),
+        )
+
     def pasted(self, frames: Float[Tensor, "b 3 h w"], colours: Float[Tensor, "b p 3"]) -> Float[Tensor, "b 3 h w"]:
         """The pictures with other colours in the canvas' pixels; the rest is copied bit for bit."""
         place = self.pixel[:, None].expand(-1, 3, -1)
         return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+
+
+def picked_pixels(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
+    """The pixels of each picture at the given indices."""
+    return planes.gather(2, index[:, None].expand(-1, planes.shape[1], -1))
 
 
 def view_canvas(

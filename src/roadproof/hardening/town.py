@@ -9,20 +9,17 @@ from __future__ import annotations
 import math
 from typing import cast
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.compositing.runs import Runs
-from roadproof.compositing.view import OwnViews
+from roadproof.compositing.view import OwnViews, picked_pixels
 from roadproof.coverage import Footprints, canvas_share
-from roadproof.datatypes import VehicleState
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.hardening.views import Views
 from roadproof.photometry.responses import AffineResponse
 from roadproof.training.dataset import Dataset
-from roadproof.training.pasting import ground_seen, light_on_paint
+from roadproof.training.pasting import ground_from_input, ground_seen, light_on_paint
 
 AHEAD_M, ASIDE_M, TURNED_RAD = (-1.0, 22.0), 1.5, math.radians(20.0)
 """Where the middle of a canvas lies, from the car, and how far it may be turned."""
@@ -45,8 +42,7 @@ class Town:
     ) -> None:
         self._drives, self._view, self._device = drives, view, torch.device(device)
         self._weights = drives.weights()
-        input_from_ground = view.input_from_camera @ camera.image_from_world(VehicleState(0.0, 0.0, 0.0, 0.0, 0.0))
-        self._ground_from_input = self._exact(np.linalg.inv(input_from_ground[:, [0, 1, 3]]))
+        self._ground_from_input = torch.tensor(ground_from_input(camera, view), device=self._device)
         self._inside = ground_seen(camera, view)[0].to(self._device)
         rows, columns = torch.div(self._inside, view.width_px, rounding_mode="floor"), self._inside % view.width_px
         self._pixels = torch.stack([columns, rows, torch.ones_like(rows)]).double()
@@ -73,23 +69,10 @@ class Town:
         footprints = Footprints.made(
             at.mT[:, None].float(), jacobian.permute(0, 3, 1, 2)[:, None].float(), self._view.resampling
         )
-        road = frames.flatten(2)[:, :, self._inside]
-        share, clean = canvas_share(footprints)[:, 0, :, None], road.mT.contiguous()
-        gain, bias = (share * light_on_paint(road).mT).expand_as(clean).contiguous(), -share * clean
-        pixel = self._inside.expand(len(frames), -1)
-        return OwnViews(
-            pixel=pixel,
-            valid=torch.ones_like(pixel, dtype=torch.bool),
-            footprints=footprints,
-            clean=clean,
-            gain=gain,
-            bias=bias,
-            response=AffineResponse.identity(),
-            runs=Runs.of(footprints.features[:, 0], clean, gain, bias),
-        )
-
-    def _exact(self, values: Float[np.ndarray, "3 3"]) -> Float[Tensor, "3 3"]:
-        return torch.tensor(values, dtype=torch.float64, device=self._device)
+        share, pixel = canvas_share(footprints)[:, 0, :, None], self._inside.expand(len(frames), -1)
+        light = (share * light_on_paint(picked_pixels(frames.flatten(2), pixel)).mT, share, 0.0)
+        valid = torch.ones_like(pixel, dtype=torch.bool)
+        return OwnViews.lit(frames, pixel, valid, footprints, light, AffineResponse.identity())
 
 
 def _canvas_from_ground(count: int, generator: torch.Generator) -> Float[Tensor, "b 3 3"]:

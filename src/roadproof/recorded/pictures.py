@@ -21,17 +21,17 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from roadproof.compositing.runs import Runs
-from roadproof.compositing.view import OwnViews, dilated
+from roadproof.compositing.view import OwnViews, dilated, picked_pixels
 from roadproof.coverage import Footprints
 from roadproof.errors import RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
 from roadproof.photometry.responses import response_on
 from roadproof.recorded.light import Light
+from roadproof.recorded.packing import all_pixels, packed_pixels
 from roadproof.recordings import RecordingSet
 
 
@@ -306,11 +306,11 @@ class FrameBank:
         middle = (CANVAS_SIZE_PX - 1) / 2
         inside = ((seen - middle).abs_().amax(1) < CANVAS_SIZE_PX / 2) & ahead
         touches = dilated(inside.view(len(inside), -1, width)).flatten(1) & ahead
-        packed = _everything(touches) if self._replayed else _packed(touches)
+        packed = all_pixels(touches) if self._replayed else packed_pixels(touches)
         if packed is None:
             return None
         own, valid, real = packed
-        at = torch.where(real[:, None], _picked(seen, own), 1.0)
+        at = torch.where(real[:, None], picked_pixels(seen, own), 1.0)
         scale = torch.where(real, depth.gather(1, own), 1.0)
         flat = own + first
         straight = self.camera.lens is None
@@ -318,20 +318,10 @@ class FrameBank:
         jacobian = ((by[:, :2] - at[:, :, None] * by[:, 2:]) / scale[:, None, None]).permute(0, 3, 1, 2)
         jacobian = jacobian if straight else jacobian @ self._bend[flat]
         footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
-        gain, offset, share = self._light.at(flat, _picked(source, flat).mT, gap.frame, footprints)
+        gain, offset, share = self._light.at(flat, picked_pixels(source, flat).mT, gap.frame, footprints)
         share = torch.where(real, share, 0.0)[..., None]
-        clean = _picked(frames.flatten(2), flat).mT
-        gain, bias = share * gain, share * (offset - clean)
-        return OwnViews(
-            pixel=flat,
-            valid=valid,
-            footprints=footprints,
-            clean=clean,
-            gain=gain,
-            bias=bias,
-            response=self._response,
-            runs=None if self._replayed else Runs.of(footprints.features[:, 0], clean, gain, bias),
-        )
+        light = (share * gain, share, offset)
+        return OwnViews.lit(frames, flat, valid, footprints, light, self._response, dense=self._replayed)
 
     @property
     def _ground_rows(self) -> slice | None:
@@ -379,46 +369,6 @@ class Views(NamedTuple):
 
     frames: Float[Tensor, "r 3 h w"]
     canvas: OwnViews | None
-
-
-class _Packed(NamedTuple):
-    """Which of their pixels are computed of R pictures.
-
-    Args:
-        own: index of each pixel among those asked about, (R, P).
-        valid: which of them are to be painted, (R, P).
-        real: which of them lie where paint could be, so that their numbers mean something, (R, P) or (R, 1).
-    """
-
-    own: Int[Tensor, "r p"]
-    valid: Bool[Tensor, "r p"]
-    real: Bool[Tensor, "r _"]
-
-
-def _packed(touches: Bool[Tensor, "r n"]) -> _Packed | None:
-    """The pixels that show the canvas, as many as the picture has that shows most; None if none shows any."""
-    counts = touches.sum(1)
-    most = int(counts.max())
-    if most == 0:
-        return None
-    _, pixel = touches.nonzero(as_tuple=True)
-    # Rows are filled up with copies of their last pixel, which are painted as it is.
-    start = counts.cumsum(0) - counts
-    number = torch.arange(most, device=touches.device)
-    place = start[:, None] + torch.minimum(number, (counts[:, None] - 1).clamp_min(0))
-    # A picture without any canvas has no pixel to copy: what stands for it must only be finite.
-    return _Packed(pixel[place.clamp_max(len(pixel) - 1)], number < counts[:, None], (counts > 0)[:, None])
-
-
-def _everything(touches: Bool[Tensor, "r n"]) -> _Packed:
-    """All pixels, whether they show the canvas or not."""
-    own = torch.arange(touches.shape[1], device=touches.device).expand_as(touches)
-    return _Packed(own, touches, touches)
-
-
-def _picked(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
-    """The pixels of each picture at the given indices."""
-    return planes.gather(2, index[:, None].expand(-1, planes.shape[1], -1))
 
 
 def _ground_from_car(poses: Poses) -> Float[Tensor, "r 3 3"]:

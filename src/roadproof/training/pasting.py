@@ -15,6 +15,7 @@ from torch import Tensor
 
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CropResize, sight
+from roadproof.homographies import Homography
 from roadproof.training.augmentation import some
 
 FARTHEST_M = 40.0
@@ -89,10 +90,14 @@ def light_on_paint(road: Float[Tensor, "b 3 p"]) -> Float[Tensor, "b 1 p"]:
     return (bright / 0.45).clamp(0.3, 1.2) * (0.8 + 0.2 * grain / bright.clamp_min(0.05))
 
 
+def ground_from_input(camera: CameraModel, view: CropResize) -> Homography:
+    """Ground (x, y, 1) in the frame of the car from the input's px."""
+    camera_from_ground = camera.image_from_world(VehicleState(0.0, 0.0, 0.0, 0.0, 0.0))[:, [0, 1, 3]]
+    return np.linalg.inv(view.input_from_camera @ camera_from_ground)
+
+
 def ground_seen(camera: CameraModel, view: CropResize) -> tuple[Int[Tensor, " p"], Float[Tensor, "p 2"]]:
     """Which pixels of the input see the ground up to `FARTHEST_M`, as flat indices, and where."""
-    camera_from_ground = camera.image_from_world(VehicleState(0.0, 0.0, 0.0, 0.0, 0.0))[:, [0, 1, 3]]
-    ground_from_input = np.linalg.inv(view.input_from_camera @ camera_from_ground)
-    ground, _ = sight(view, camera).on(ground_from_input)
+    ground, _ = sight(view, camera).on(ground_from_input(camera, view))
     seen = np.isfinite(ground).all(axis=1) & (ground[:, 0] > 0) & (ground[:, 0] < FARTHEST_M)
     return torch.from_numpy(np.flatnonzero(seen)), torch.from_numpy(ground[seen]).float()
