@@ -6,7 +6,7 @@ import dataclasses
 import pytest
 import torch
 
-from painted_ground import CANVAS, MIDDLE, RampFollower, known_vehicle, recorded_road
+from painted_ground import CANVAS, Careful, RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import GradOpt, PathDeviation, SpeedChange, attack, captured
 from roadproof.attacks.captured import Replay, replay_of
 from roadproof.attacks.gradopt import Rung, gradopt
@@ -38,15 +38,6 @@ def vehicle():
 @pytest.fixture(scope="module")
 def road():
     return recorded_road(every=2)
-
-
-class Careful(RampFollower):
-    """Brakes for bright paint."""
-
-    def controls(self, frames, speed_mps, command):
-        bright = frames[:, 2, 50:].mean((1, 2)) - MIDDLE
-        effort = 0.1 + 0.2 * (6.0 - speed_mps) - 3.0 * bright
-        return torch.stack([4.0 * bright, effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0)], 1)
 
 
 class Breaking(RampFollower):

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from painted_ground import MIDDLE, RampFollower, known_vehicle, recorded_road
+from painted_ground import Careful, RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import GradOpt, PathDeviation, RandomSearch, SpeedChange, attack, cheapest, kept_attack
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.result import AttackResult
 from roadproof.compositing import Variation
-from roadproof.datatypes import Control
 from roadproof.errors import ControllerError, RecordingError, RoadproofError
 from roadproof.recorded import RecordedWorld, Start
 from roadproof.recorded.world import UNSURE
@@ -19,19 +18,6 @@ from roadproof.search_space import SearchSpace
 
 SPACE = SearchSpace(figures=1)
 SHORT = GradOpt(iterations=4, restarts=2, halving=False)
-
-
-class Careful(RampFollower):
-    """Keeps to the middle of the road at 6 m/s, brakes for bright paint and goes faster over dark paint."""
-
-    def controls(self, frames, speed_mps, command):
-        bright = frames[:, 2, 50:].mean((1, 2)) - MIDDLE
-        effort = 0.1 + 0.2 * (6.0 - speed_mps) - 3.0 * bright
-        return torch.stack([0.0 * effort, effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0)], 1)
-
-    def act(self, frame, speed_mps, command):
-        frames = torch.tensor(frame).permute(2, 0, 1)[None] / 255
-        return Control(*map(float, self.controls(frames, torch.tensor([speed_mps]), None)[0]))
 
 
 @pytest.fixture(scope="module", autouse=True)
