@@ -7,7 +7,6 @@ road is for the simulator that knows the map to say.
 from __future__ import annotations
 
 import difflib
-import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import AnyPath, as_path, check_name, inside, write_text
+from roadproof.io.identity import digest
 from roadproof.io.tables import build, first_twice
 from roadproof.io.text import read_toml
 
@@ -87,7 +87,7 @@ def identity(scenario: Scenario) -> dict[str, Any]:
         OSError: the file of the map cannot be read.
     """
     file = Path(scenario.map_name)
-    content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+    content = digest(file.read_bytes()) if file.is_file() else ""
     return asdict(scenario) | {"map_name": file.name, "map": content}
 
 

@@ -9,7 +9,6 @@ positive in the group's direction.
 from __future__ import annotations
 
 import copy
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from threading import Lock
@@ -24,6 +23,7 @@ from roadproof.attacks.groups import Group, Points, Values, to_side
 from roadproof.attacks.surrogate import FIXED, Surrogate
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
+from roadproof.io.identity import digest
 from roadproof.patterns import Pattern
 from roadproof.recorded.world import UNSURE, Foretold, RecordedWorld, Rolled, Start
 from roadproof.recordings import RecordingSet
@@ -181,7 +181,7 @@ class ClosedLoopMeasure(ABC):
         # The variation is in the fingerprint of the steering shift.
         worlds = [(each.vehicle, each.recordings.obstacles) for each in self.worlds]
         more = repr((*self.told(), worlds))
-        return hashlib.sha256((more + self._steering.fingerprint()).encode()).hexdigest()
+        return digest(more, self._steering.fingerprint())
 
     def told(self) -> tuple[object, ...]:
         """What tells this measure from others on the same drives."""

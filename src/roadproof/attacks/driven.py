@@ -11,7 +11,6 @@ Both are taken of every drive; the objective asked for is the value.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +126,7 @@ class DrivenMeasure:
     def effect(self, pattern: Pattern) -> Effect:
         """The effect of a pattern, from one drive over it or from the file of drives."""
         paint = raster(pattern)
-        key = hashlib.sha256(paint.tobytes()).hexdigest()[:24]
+        key = digest(paint)[:24]
         if key not in self._known:
             self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._place.scenario.canvas)
             if self._place.keep is not None:
@@ -140,7 +139,7 @@ class DrivenMeasure:
 
     def _told(self) -> str:
         """A digest of the clean drive."""
-        return hashlib.sha256(path_of(self.clean).tobytes() + self.clean.steer.tobytes()).hexdigest()
+        return digest(path_of(self.clean), self.clean.steer)
 
     def _enough(self) -> Callable[[Observation], bool]:
         """A condition that ends a drive after the last frame that either effect needs, for a car off the road."""

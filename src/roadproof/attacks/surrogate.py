@@ -6,7 +6,6 @@ Its numbers are predictions for drives near the recorded ones; what a car really
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -22,6 +21,7 @@ from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.errors import ControllerError
+from roadproof.io.identity import digest
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
 from roadproof.recordings import Recording, RecordingSet
@@ -199,11 +199,12 @@ class Surrogate:
     def fingerprint(self) -> str:
         """A digest of drives, calibration and the controller's clean answers that tells this surrogate from others."""
         told = (self.groups, self.lengths) if self.variation is None else (self.groups, self.lengths, self.variation)
-        digest = hashlib.sha256(repr(told).encode())
-        for view, steer in zip(self.views, self.clean_steer, strict=True):
-            for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer):
-                digest.update(tensor.cpu().numpy().tobytes())
-        return digest.hexdigest()
+        seen = [
+            tensor.cpu().numpy()
+            for view, steer in zip(self.views, self.clean_steer, strict=True)
+            for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer)
+        ]
+        return digest(repr(told), *seen)
 
     def _batches(self, unit: Points) -> tuple[Tensor, ...]:
         """Parts of at most MAX_FRAMES frames, as even as can be; at least one pattern a group each."""

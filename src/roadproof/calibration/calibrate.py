@@ -19,7 +19,7 @@ from roadproof.calibration.published import (
     homographies_from_points,
     point_targets,
 )
-from roadproof.calibration.replays import Replays, Wanted, drive_digest, replay_in
+from roadproof.calibration.replays import Replays, Wanted, replay_in, told_apart
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
 from roadproof.calibration.two_paint import TARGETS, Paints, look_at_paints
 from roadproof.datatypes import Weather
@@ -29,7 +29,7 @@ from roadproof.geometry import homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import table
-from roadproof.io.identity import require_same
+from roadproof.io.identity import digest, require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.processes import Pool
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
@@ -138,7 +138,7 @@ def _same_frames(recording: Recording, drives: Drives) -> bool:
 
 
 def _parts(drives: Drives, method: Method) -> dict[str, object]:
-    return {"method": str(method), "drives": {drive.name: drive_digest(drive)[:16] for drive in drives.drives}}
+    return {"method": str(method), "drives": {drive.name: digest(*told_apart(drive))[:16] for drive in drives.drives}}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.homographies import Homographies
 from roadproof.io.arrays import read_record, write_archive
+from roadproof.io.identity import digest
 from roadproof.processes import Pool
 from roadproof.simulators.protocol import PatternImage, Simulator
 
@@ -86,12 +86,12 @@ class Replays:
             CalibrationError: the replay goes another way than the drive.
         """
         path = None if self._folder is None else self._folder / f"{drive.name}-{target.name}.npz"
-        digest = _digest(self._drives, drive, target.paint)
-        kept = None if path is None else _read(path, digest)
+        made_of = digest(repr((self._drives.settings, drive.name)), *told_apart(drive), target.paint)
+        kept = None if path is None else _read(path, made_of)
         if kept is None:
             kept = self._drive_again(drive, target)
             if path is not None:
-                write_archive(path, kept, {"of": digest})
+                write_archive(path, kept, {"of": made_of})
         self.calls += 1
         self.seconds += float(kept["seconds"])
         self._stated[drive.name] = kept["stated"]
@@ -176,22 +176,13 @@ def _check_same_way(name: str, step: int, state: VehicleState, wanted: VehicleSt
         )
 
 
-def drive_digest(drive: Drive, before: bytes = b"", after: bytes = b"") -> str:
-    """A digest that tells a drive from others by its controls, its kept frames' steps, and the given extra bytes."""
-    episode, digest = drive.episode, hashlib.sha256(before)
-    for values in (episode.steer, episode.throttle, episode.brake, drive.frame_number):
-        digest.update(np.ascontiguousarray(values).tobytes())
-    digest.update(after)
-    return digest.hexdigest()
+def told_apart(drive: Drive) -> tuple[np.ndarray, ...]:
+    """What tells a drive from others: its controls, and the steps of its kept frames."""
+    episode = drive.episode
+    return episode.steer, episode.throttle, episode.brake, drive.frame_number
 
 
-def _digest(drives: Drives, drive: Drive, paint: PatternImage) -> str:
-    """A digest that tells replays apart by scenario, controls, kept frames and paint."""
-    where = repr((drives.settings, drive.name)).encode()
-    return drive_digest(drive, where, np.ascontiguousarray(paint).tobytes())
-
-
-def _read(path: Path, digest: str) -> dict[str, Any] | None:
+def _read(path: Path, made_of: str) -> dict[str, Any] | None:
     """The stored result of a replay; None if there is none that can be used."""
     names = ("seen", "stated", "seconds")
     try:
@@ -199,4 +190,4 @@ def _read(path: Path, digest: str) -> dict[str, Any] | None:
     except CalibrationError:
         # Driving it again costs seconds and mends whatever it was.
         return None
-    return arrays if of == {"of": digest} else None
+    return arrays if of == {"of": made_of} else None

@@ -8,7 +8,6 @@ again, and one of other inputs is never mistaken for it.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -86,12 +85,11 @@ class Episodes:
         folder: Path,
     ) -> Episodes:
         """The store of the drives that a driver makes in a simulator."""
-        hashed = {name: paint.tobytes() for name, paint in paints.items()} | {CLEAN: b""}
         return Episodes(
             driver=driver,
             scenario=scenario,
             paints=paints,
-            digests={name: hashlib.sha256(content).hexdigest() for name, content in hashed.items()},
+            digests={name: digest(paint) for name, paint in paints.items()} | {CLEAN: digest()},
             folder=folder,
             parts=_parts(simulator, driver, scenario),
         )

@@ -12,7 +12,6 @@ None of the first four is there before all cases are judged.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -37,6 +36,7 @@ from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_ref
 from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
+from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
@@ -118,7 +118,7 @@ def architecture_of(controller: Controller) -> str:
     if not isinstance(controller, nn.Module):
         return name
     shapes = {key: list(value.shape) for key, value in controller.state_dict().items()}
-    return f"{name}-{hashlib.sha256(json.dumps(shapes).encode()).hexdigest()[:8]}"
+    return f"{name}-{digest(json.dumps(shapes))[:8]}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

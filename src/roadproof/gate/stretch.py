@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,6 +19,7 @@ from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
 from roadproof.gate.verdict import Kind, Measures, median_95, share_95
+from roadproof.io.identity import digest
 from roadproof.paint import Site
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.simulator import RecordedSimulator
@@ -170,7 +170,7 @@ class Stretch:
             asdict(plan.starts),
             world,
         ]
-        return hashlib.sha256(json.dumps(told, default=str).encode()).hexdigest()[:16]
+        return digest(json.dumps(told, default=str))[:16]
 
     def _alone(self, weather: Weather) -> dict[tuple[int, int], Conditions]:
         plan = self.plan

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
 from roadproof.errors import RoadproofError
 
 ANSWERS = "answers"
@@ -28,9 +30,15 @@ def stated(parts: object) -> str:
     return json.dumps(parts, sort_keys=True, default=str)
 
 
-def digest(text: str) -> str:
-    """SHA-256 of a text, 64 hexadecimal digits."""
-    return hashlib.sha256(text.encode()).hexdigest()
+def digest(*contents: str | bytes | bytearray | np.ndarray) -> str:
+    """SHA-256 of texts, bytes and the bytes of arrays, one after another; 64 hexadecimal digits."""
+    found = hashlib.sha256()
+    for content in contents:
+        if isinstance(content, np.ndarray):
+            found.update(np.ascontiguousarray(content).tobytes())
+        else:
+            found.update(content.encode() if isinstance(content, str) else content)
+    return found.hexdigest()
 
 
 def require_same(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dis
-import hashlib
 import inspect
 import re
 import sys
@@ -71,7 +70,7 @@ def _known(thing: Any, within: _Within) -> Any:  # noqa: ANN401
     if isinstance(thing, Enum):
         return thing.name
     if isinstance(thing, bytes | bytearray):
-        return hashlib.sha256(thing).hexdigest()
+        return digest(thing)
     if isinstance(thing, np.ndarray | np.generic) or _is_tensor(thing):
         return _array(thing)
     if isinstance(thing, Mapping):
@@ -190,11 +189,11 @@ def _array(values: Any) -> list[Any]:  # noqa: ANN401
             values = values.detach().cpu()
             content = values.contiguous().flatten().view(_torch().uint8).numpy()
         except (RuntimeError, TypeError, NotImplementedError):  # sparse, or without memory
-            content = np.frombuffer(str(values).encode(), np.uint8)
+            content = str(values)
     else:
         values = np.asarray(values)
-        content = np.ascontiguousarray(values) if values.dtype != object else np.frombuffer(repr(values).encode(), "u1")
-    return [str(values.dtype), list(values.shape), hashlib.sha256(content.tobytes()).hexdigest()]
+        content = repr(values) if values.dtype == object else values
+    return [str(values.dtype), list(values.shape), digest(content)]
 
 
 def _torch() -> Any:  # noqa: ANN401

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import hashlib
 import os
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from filelock import FileLock, Timeout
 
 from roadproof.errors import OutputError
 from roadproof.io.files import check_writable, kept_inside, write_text
+from roadproof.io.identity import digest
 
 _held = ExitStack()
 atexit.register(_held.close)
@@ -79,7 +79,7 @@ def _place(folder: Path) -> Path:
     # Where every process looks, whatever its TMPDIR says.
     shared = Path("/tmp")  # noqa: S108  # the folder in it is the user's own
     locks = own_folder(shared if shared.is_dir() else Path(tempfile.gettempdir()), "locks")
-    return locks / hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:32]
+    return locks / digest(str(folder.resolve()))[:32]
 
 
 def own_folder(shared: Path, purpose: str) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -17,6 +16,7 @@ from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.homographies import check_image_from_canvas
 from roadproof.io.files import check_name
+from roadproof.io.identity import digest
 from roadproof.io.records import plain
 from roadproof.paint.site import LaneMark
 from roadproof.photometry import ColourTransform, PixelMaps
@@ -182,20 +182,20 @@ class RecordingSet:
 
     def digest(self) -> str:
         """SHA-256 of what a drive in these recordings depends on, not marks; the same for a set that was loaded."""
-        found = hashlib.sha256(_as_read((self.camera, self.view, self.colour.to_dict(), self.canvas, self.obstacles)))
+        told = _as_read((self.camera, self.view, self.colour.to_dict(), self.canvas, self.obstacles))
+        contents: list[str | np.ndarray] = []
         for drive in self.recordings:
-            found.update(f"{drive.side} {drive.weather}".encode())
+            contents.append(f"{drive.side} {drive.weather}")
             small = [getattr(drive, name) for name in PER_FRAME]
             small += [] if drive.track is None else [getattr(drive.track, field.name) for field in fields(drive.track)]
             large: list[Any] = [drive.frames]
             large += [] if drive.maps is None else [drive.maps.gain, drive.maps.offset, drive.maps.visible]
-            for values in [*(np.asarray(each, np.float64) for each in small), *map(np.ascontiguousarray, large)]:
-                found.update(values.tobytes())
-        return found.hexdigest()
+            contents += [*(np.asarray(each, np.float64) for each in small), *map(np.asarray, large)]
+        return digest(told, *contents)
 
     def marks_digest(self) -> str:
         """SHA-256 of the lane marks, which limits on paint depend on; the same for a set that was loaded."""
-        return hashlib.sha256(_as_read(self.marks)).hexdigest()
+        return digest(_as_read(self.marks))
 
     def by_weather(self) -> tuple[RecordingSet, ...]:
         """The drives of each weather as a set of their own, in the order of their first drives."""
@@ -205,9 +205,9 @@ class RecordingSet:
         return tuple(replace(self, recordings=tuple(some)) for some in found.values())
 
 
-def _as_read(told: object) -> bytes:
+def _as_read(told: object) -> str:
     """Values as they are in a file: a number that was given as an integer is read as a float."""
-    return repr(json.loads(json.dumps(plain(told)), parse_int=float)).encode()
+    return repr(json.loads(json.dumps(plain(told)), parse_int=float))
 
 
 def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass, fields
 from itertools import product
 from pathlib import Path
@@ -287,5 +286,5 @@ def _digest(controller: str) -> str:
     """
     shipped = installed_weights(controller) if controller in shipped_names() else None
     contents = [file.read_bytes() for file in (files_of(controller) if shipped is None else (shipped,))]
-    found = hashlib.sha256(b"".join(contents)).hexdigest()[:16] if contents else ""
+    found = digest(*contents)[:16] if contents else ""
     return "" if found == _FIRST_WEIGHTS.get(controller) else found
