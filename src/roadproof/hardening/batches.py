@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from roadproof.controllers import Controller
@@ -58,18 +58,22 @@ def mixed_precision(place: torch.device) -> torch.autocast:
 
 
 class Shown(NamedTuple):
-    """Pictures of one place, what should be answered to them, and a pattern for each of those that are painted."""
+    """Pictures of one place, what should be answered to them, and patterns for those of them that are painted.
 
+    Args:
+        batch: all pictures, not painted yet; first those that stay bare.
+        views: the pictures to paint.
+        unit: the pattern of each of those.
+    """
+
+    batch: TuningBatch
     views: Views
-    target: Float[Tensor, "b c"]
-    bare: Bool[Tensor, " b"]
     unit: Float[Tensor, "b k n"]
 
     def painted(self, pattern: Pattern) -> TuningBatch:
         """What is learnt from, differentiable in the patterns."""
-        views = self.views
-        frames = torch.where(self.bare[:, None, None, None], views.frames, views.painted(pattern))
-        return TuningBatch(frames, views.speed_mps, views.command, self.target)
+        bare = self.batch.frames[: -len(self.unit)]
+        return self.batch._replace(frames=torch.cat([bare, self.views.painted(pattern)]))
 
     def climbed(self, space: SearchSpace, step: float) -> Shown:
         """The same pictures with their patterns a step up their gradient, where they have one.
@@ -99,15 +103,21 @@ class Pictures:
     bare: float
 
     def of(self, source: Street | Town, count: int, draw: torch.Generator) -> Shown:
-        """Pictures of a street or of the town, most of them to be painted."""
-        views = source.draw(count, draw)
+        """Pictures of a street or of the town, most of them to be painted; one at the least."""
+        bare = min(round(self.bare * count), count - 1)
+        views = source.draw(count - bare, draw)
+        drawn = [self._answered(source, source.draw(bare, draw, to_paint=False))] if bare else []
+        drawn.append(self._answered(source, views))
+        batch = TuningBatch(*(torch.cat(columns) for columns in zip(*drawn, strict=True)))
+        return Shown(batch, views, self._drawn(len(views.frames), draw))
+
+    def _answered(self, source: Street | Town, views: Views) -> TuningBatch:
+        """Bare pictures with what should be answered to them."""
         with torch.no_grad():
             target = answers(self.teacher, views.frames, views.speed_mps, views.command)
             if isinstance(source, Street) and views.place is not None:
                 target[:, 0] = source.returning(views.place, target[:, 0])
-        unit = self._drawn(len(views.frames), draw)
-        bare = (torch.rand(len(unit), generator=draw) < self.bare).to(unit.device)
-        return Shown(views, target, bare, unit)
+        return TuningBatch(views.frames, views.speed_mps, views.command, target)
 
     def _drawn(self, count: int, generator: torch.Generator) -> Float[Tensor, "b k n"]:
         """Points of the search space: some found ones, slightly moved, some random ones."""

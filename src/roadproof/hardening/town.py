@@ -47,18 +47,21 @@ class Town:
         rows, columns = torch.div(self._inside, view.width_px, rounding_mode="floor"), self._inside % view.width_px
         self._pixels = torch.stack([columns, rows, torch.ones_like(rows)]).double()
 
-    def draw(self, count: int, generator: torch.Generator) -> Views:
+    def draw(self, count: int, generator: torch.Generator, *, to_paint: bool = True) -> Views:
         """Draw so many pictures, and a place for a canvas in each.
 
         Args:
             count: how many pictures to draw, at least 1.
             generator: where the randomness comes from, on the CPU.
+            to_paint: False for pictures without a canvas.
         """
         chosen = torch.multinomial(self._weights, count, replacement=True, generator=generator)
         seen = self._drives.batch(chosen, self._device)
-        canvas_from_input = _canvas_from_ground(count, generator).to(self._device)
-        views = self._laid(seen.frames, canvas_from_input @ self._ground_from_input)
-        return Views(seen.frames, seen.speed_mps, seen.command, None, views)
+        canvas = None
+        if to_paint:
+            canvas_from_input = _canvas_from_ground(count, generator).to(self._device)
+            canvas = self._laid(seen.frames, canvas_from_input @ self._ground_from_input)
+        return Views(seen.frames, seen.speed_mps, seen.command, None, canvas)
 
     def _laid(self, frames: Float[Tensor, "b 3 h w"], canvas_from_input: Float[Tensor, "b 3 3"]) -> OwnViews:
         """The pixels of the ground, with all that painting a canvas there needs."""

@@ -52,7 +52,7 @@ class Tuning:
         repeats: how often it learns from each in a row, while the patterns climb.
         batch: how many pictures there are in a batch.
         learning_rate: AdamW's largest; it rises over the first steps and falls along a cosine to almost nothing.
-        bare: share of the pictures that stay without paint.
+        bare: share of the pictures that stay without paint; one is painted at the least.
         found: share of the painted patterns that attacks found; the others are random.
         climb: length of a pattern's step between two repeats, in units of each parameter's range.
 

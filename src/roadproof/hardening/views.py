@@ -85,12 +85,13 @@ class Street:
                 way = (rolled.x_m - canvas.x_m, rolled.y_m - canvas.y_m, rolled.yaw_rad, rolled.speed_mps)
                 self._poses = torch.cat([self._poses, torch.stack([column.flatten() for column in way], 1)])
 
-    def draw(self, count: int, generator: torch.Generator) -> Views:
+    def draw(self, count: int, generator: torch.Generator, *, to_paint: bool = True) -> Views:
         """Draw so many pictures, or a few less: poses far from every recorded one are left out.
 
         Args:
             count: how many pictures to draw, at least 1.
             generator: where the randomness comes from, on the CPU.
+            to_paint: False for pictures without a canvas.
         """
         chosen = self._poses[torch.randint(len(self._poses), (count,), generator=generator).to(self._poses.device)]
         spread = torch.tensor([MOVED_M, TURNED_RAD, FASTER_MPS], dtype=torch.float64)
@@ -104,7 +105,7 @@ class Street:
         kept = (far <= far.min().clamp_min(1.0)).nonzero()[:, 0]
         moved, gap = moved.picked(kept), type(gap)(*(column[kept] for column in gap))
         with torch.no_grad():
-            shown = self.world.bank.show(moved, gap)
+            shown = self.world.bank.show(moved, gap, to_paint=to_paint)
         speed_mps = (speed + faster).clamp_min(0.0)[kept].float()
         command = self.world.bank.command[gap.frame]
         return Views(shown.frames, speed_mps, command, self.world.course.locate(moved), shown.canvas)
