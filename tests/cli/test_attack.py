@@ -8,14 +8,14 @@ import textwrap
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 from typer.testing import CliRunner
 
 from command import stored
 from roadproof.attacks import AttackResult, Published, methods
 from roadproof.attacks.gradopt import Rung
 from roadproof.cli import app
-from roadproof.patterns import load_pattern
+from roadproof.patterns import load_pattern, raster
 from roadproof.recordings import save_recordings
 from scenes import recording_set
 
@@ -60,6 +60,10 @@ def here(workplace, monkeypatch):
     return workplace
 
 
+def has_colour(picture, name):
+    return (picture == ImageColor.getrgb(name)).all(-1).any()
+
+
 def command(*options, recordings="set", controller="own_controller:Linear"):
     quick = ["--figures", "2", "--iterations", "4", "--restarts", "2", "--random-patterns", "3"]
     return ["attack", str(recordings), "--controller", controller, *quick, *options]
@@ -78,9 +82,13 @@ def test_an_attack_leaves_its_pattern_result_and_pictures(here, tmp_path, invoke
     assert result.history.shape == (4, 2, 2)
     assert len(load_pattern(tmp_path / "out" / "pattern.json").shapes) == 2
     assert stored(tmp_path / "out" / "result.json")["kind"].startswith("surrogate")
-    for picture in (tmp_path / "out").glob("*.png"):
-        pixels = np.asarray(Image.open(picture).convert("RGB"))
-        assert pixels.std() > 5, picture
+    pictures = {path.stem: np.asarray(Image.open(path).convert("RGB")) for path in (tmp_path / "out").glob("*.png")}
+    assert np.array_equal(pictures["pattern"], raster(result.pattern)[..., :3])
+    assert has_colour(pictures["search"], "#0b6fa4")
+    assert has_colour(pictures["film-clean"], "#c8501e"), "the painted drive's steering"
+    frame = recording_set(frames=3).recordings[0].frames[0]
+    corner = tuple(frame[0, 0])
+    assert (pictures["film-clean"] == corner).all(-1).any(), "what the controller saw"
 
 
 @pytest.mark.parametrize(
@@ -173,10 +181,10 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(here, tmp_path, invoke, nam
 
 
 def test_cuda_that_is_absent_is_named(here, tmp_path, invoke, monkeypatch):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
     code, printed = invoke(*command("--out", str(tmp_path), "--device", "cuda"))
     assert code == 2
-    assert "cuda" in printed.err
+    assert "device 'cuda' is not there: this torch sees 0 CUDA devices; use cpu" in printed.err
 
 
 def test_an_output_folder_that_cannot_be_made_is_named_before_the_search(here, tmp_path, invoke):

@@ -28,6 +28,9 @@ MOVED_M, TURNED_RAD, FASTER_MPS = 0.4, 0.06, 0.7
 AHEAD_M, LEFT_M, TURN_RAD = 1.5, 1.5, 0.4
 """A pose further from every recorded one is left out: its picture says little."""
 
+LEAST_COVER = 0.05
+"""Of the pictures to paint, one whose canvas is out of sight is drawn as often as one with so much of it."""
+
 RECORDED_M = 1.5
 """How far aside drives are recorded; the law of steering is not believed beyond."""
 
@@ -71,6 +74,7 @@ class Street:
         self.world = RecordedWorld(recordings, device=device)
         self.world.fit(teacher)
         self._poses = torch.empty(0, 4, dtype=torch.float64, device=self.world.device)
+        self._covers = torch.empty(0)
 
     def add_ways(self, driver: Controller, patterns: Pattern) -> None:
         """Drive over the bare road and over each pattern of a batch; later poses are drawn from these drives too.
@@ -83,17 +87,30 @@ class Street:
             for pattern in (None, patterns):
                 rolled = self.world.roll(driver, pattern)
                 way = (rolled.x_m - canvas.x_m, rolled.y_m - canvas.y_m, rolled.yaw_rad, rolled.speed_mps)
-                self._poses = torch.cat([self._poses, torch.stack([column.flatten() for column in way], 1)])
+                poses = torch.stack([column.flatten() for column in way], 1)
+                covers = [self._covered(Poses(*part[:, :3].unbind(1))) for part in poses.split(128)]
+                self._poses, self._covers = torch.cat([self._poses, poses]), torch.cat([self._covers, *covers])
+
+    def _covered(self, poses: Poses) -> Float[Tensor, " r"]:
+        """Which share of the picture at each pose the canvas covers, on the CPU."""
+        canvas = self.world.bank.show(poses, self.world.bank.nearest(poses)).canvas
+        view = self.world.bank.view
+        shown = torch.zeros(len(poses.x_m)) if canvas is None else canvas.valid.sum(1).cpu()
+        return shown / (view.height_px * view.width_px)
 
     def draw(self, count: int, generator: torch.Generator, *, to_paint: bool = True) -> Views:
         """Draw so many pictures, or a few less: poses far from every recorded one are left out.
+
+        The more of a picture the canvas covers, the more often it is painted: there paint has most to say.
 
         Args:
             count: how many pictures to draw, at least 1.
             generator: where the randomness comes from, on the CPU.
             to_paint: False for pictures without a canvas.
         """
-        chosen = self._poses[torch.randint(len(self._poses), (count,), generator=generator).to(self._poses.device)]
+        weights = self._covers + LEAST_COVER if to_paint else torch.ones(len(self._poses))
+        number = torch.multinomial(weights, count, replacement=True, generator=generator)
+        chosen = self._poses[number.to(self._poses.device)]
         spread = torch.tensor([MOVED_M, TURNED_RAD, FASTER_MPS], dtype=torch.float64)
         noise = torch.randn(count, 3, generator=generator, dtype=torch.float64) * spread
         right, turned, faster = noise.to(chosen).unbind(1)
