@@ -41,6 +41,15 @@ def test_paint_changes_the_canvas_alone(street):
     assert not changed[:, : street.world.bank.horizon_row].any()
 
 
+def test_pictures_to_paint_are_those_where_the_canvas_is_large(street):
+    painted, bare = (street.draw(200, seeded(5), to_paint=to_paint) for to_paint in (True, False))
+    assert bare.canvas is None
+    # Its shares of the picture fall with the square of the distance; 10 m and more before it, it is a strip.
+    near = [float((32.0 - views.place.s_m < 10.0).double().mean()) for views in (painted, bare)]
+    assert near[0] > 1.5 * near[1]
+    assert 0.02 < 1.0 - near[0], "what is far is painted too"
+
+
 def test_labels_are_the_teachers_near_the_path_and_lead_back_far_from_it(street):
     right = torch.tensor([-3.0, -0.5, 0.0, 0.5, 3.0], dtype=torch.float64)
     place = Place(torch.zeros(5, dtype=torch.int64), torch.full((5,), 20.0).double(), right, torch.zeros(5).double())
