@@ -37,7 +37,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
 from roadproof.errors import ControllerError, RoadproofError
 from roadproof.io.files import AnyPath, as_path
-from roadproof.io.identity import digest, require_told
+from roadproof.io.identity import digest, require_same
 from roadproof.io.identity import stated as as_text
 from roadproof.io.known import known_by
 from roadproof.io.records import plain
@@ -229,7 +229,7 @@ def kept_attack(
     checkpoint, path = folder / "search.safetensors", folder / "result.json"
     if path.exists():
         made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts)
-        require_told(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
+        require_same(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
     else:
         attack(
             recordings,

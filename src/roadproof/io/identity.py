@@ -49,14 +49,17 @@ def require_same(
     Args:
         folder: the folder in which something was begun.
         what: what the folder holds, for the message, such as "a run".
-        before: the parts that were kept there, as JSON has them. A part of `now` that is not among them is not
-            compared: the folder is older than that part's name.
+        before: the parts that were kept there, as JSON has them; None where the file is older than such parts. A part
+            of `now` that is not among them is not compared: the folder is older than that part's name.
         now: the parts of what is to be done in the folder.
         error: the type of error to raise.
 
     Raises:
-        error: a part differs; the message names the first, with what it was and what it is.
+        error: the file might have said what it was made of and does not, or a part differs; the message names the
+            first, with what it was and what it is.
     """
+    if before == {}:
+        raise error(f"{folder} holds {what} that does not say what it was made of; choose another folder, or remove it")
     known = cast("dict[str, object]", before) if isinstance(before, dict) else {}
     for part, value in cast("dict[str, object]", json.loads(json.dumps(now, default=str))).items():
         if part not in known or known[part] == value:
@@ -67,26 +70,6 @@ def require_same(
             )
         name, was, now_is = _first_difference(part, known[part], value)
         raise error(f"{folder} holds {what} with {name} {was}, now it is {now_is}; choose another folder, or remove it")
-
-
-def require_told(
-    folder: Path, what: str, before: object, now: Mapping[str, object], error: type[RoadproofError]
-) -> None:
-    """`require_same`, and refuse what was kept without saying what it was made of, but for what is older than the word.
-
-    Args:
-        folder: the folder in which something was begun.
-        what: what the folder holds, for the message, such as "a run".
-        before: the parts that were kept there; None where the file is older than the word.
-        now: the parts of what is to be done in the folder.
-        error: the type of error to raise.
-
-    Raises:
-        error: a part differs, or there is none.
-    """
-    if before is not None and not before:
-        raise error(f"{folder} holds {what} that does not say what it was made of; choose another folder, or remove it")
-    require_same(folder, what, before, now, error)
 
 
 def _first_difference(name: str, before: object, now: object) -> tuple[str, str, str]:

@@ -46,9 +46,9 @@ class _Run:
     paint: str = PaintKind.RENDERED
 
     @property
-    def parts(self) -> dict[str, Any]:
+    def parts(self) -> dict[str, Any] | None:
         if not self.identity:
-            return self.made_of
+            return self.made_of or None
         names = ("scenario", "budget", "space", "seed", "controller")
         parts = dict(zip(names, json.loads(self.identity), strict=True)) | {"paint": self.paint}
         return parts if self.controller is None else parts | {ANSWERS: self.controller}

@@ -19,7 +19,7 @@ from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.files import write_json
-from roadproof.io.identity import digest, require_told, stated
+from roadproof.io.identity import digest, require_same, stated
 from roadproof.io.known import known_by, without_addresses
 from roadproof.io.text import read_json
 from roadproof.patterns import Pattern, raster
@@ -197,7 +197,7 @@ class Stages:
             return None
         if (folder / "cheapest.json").exists():
             before = FILE.content(folder / "cheapest.json").get("made_of")
-            require_told(folder, "a search", before, made_of, RoadproofError)
+            require_same(folder, "a search", before, made_of, RoadproofError)
             less = Cheapest.load(folder)
         else:
             less = cheapest(
