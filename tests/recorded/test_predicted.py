@@ -35,6 +35,11 @@ def recordings():
     return drivable_set()
 
 
+def briefly(world):
+    """The recorded scenario, in which who stops need not stand for long."""
+    return dataclasses.replace(world.scenario, time_limit_s=8.0)
+
+
 @pytest.fixture(scope="module")
 def predicted(recordings, tmp_path_factory):
     """A run that holds nothing but an evaluation in recordings, filmed and reported."""
@@ -131,9 +136,8 @@ def test_a_selection_in_recordings_is_called_predicted(recordings, tmp_path):
 
 def test_the_speed_foretold_in_a_batch_is_that_of_a_drive_step_by_step(recordings):
     with RecordedSimulator(recordings) as simulator:
-        clean, painted = (
-            rollout(simulator, BrakeShy(), simulator.scenario, pattern=pattern) for pattern in (None, BAR)
-        )
+        scenario = briefly(simulator)
+        clean, painted = (rollout(simulator, BrakeShy(), scenario, pattern=pattern) for pattern in (None, BAR))
     driven = speed_difference(clean, painted, CANVAS)
     world = RecordedWorld(recordings)
     world.fit(BrakeShy())
@@ -152,7 +156,7 @@ def test_what_was_searched_to_change_the_speed_is_chosen_by_it(recordings, tmp_p
 
         def chosen(candidates, folder):
             given = {"best": 2, "folder": folder, "on_drive": lambda *progress: told.append(progress)}
-            return select_by_driving(world, BrakeShy(), world.scenario, candidates, **given)
+            return select_by_driving(world, BrakeShy(), briefly(world), candidates, **given)
 
         found = chosen(slower, tmp_path / "one")
         changes = [each.trial.speed_change_mps for each in found.driven]
