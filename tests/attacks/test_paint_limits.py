@@ -42,7 +42,7 @@ def test_whatever_the_search_its_patterns_obey(word, monkeypatch, tmp_path):
     asked = {"iterations": 4, "restarts": 2, "halving": False} if kind is GradOpt else {"calls": 8}
     if word == "published-bo":
         asked["random_calls"] = 6
-    recordings = drivable_set(marks=MARKS)
+    recordings = drivable_set(12.0, marks=MARKS)
     space = SearchSpace(figures=3, family=getattr(kind, "family", "published"), limits=LIMITS)
     result = attack(recordings, PullsToBrightPaint(), space, method=method_of(word, **asked), seed=3)
     site = site_of(recordings)
@@ -61,7 +61,7 @@ def test_whatever_the_search_its_patterns_obey(word, monkeypatch, tmp_path):
 
 
 def test_a_limited_search_by_gradient_beats_random_patterns_of_the_same_limits():
-    recordings, controller = drivable_set(marks=MARKS), PullsToBrightPaint()
+    recordings, controller = drivable_set(12.0, marks=MARKS), PullsToBrightPaint()
     space = SearchSpace(figures=3, limits=LIMITS)
     climbed = attack(recordings, controller, space, method=GradOpt(iterations=20, restarts=2, halving=False))
     drawn = attack(recordings, controller, space, method=method_of("random", calls=60))
@@ -103,7 +103,7 @@ def test_a_deviation_search_obeys_too(monkeypatch):
     method = GradOpt(iterations=2, restarts=1, halving=False)
     space = SearchSpace(figures=2, limits=LIMITS)
     result = attack(
-        drivable_set(marks=MARKS), PullsToBrightPaint(), space, method=method, objective=PathDeviation(every=8)
+        drivable_set(12.0, marks=MARKS), PullsToBrightPaint(), space, method=method, objective=PathDeviation(every=8)
     )
     assert result.conspicuousness is not None
     assert result.conspicuousness.area_m2 <= 1.5

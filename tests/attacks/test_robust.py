@@ -37,7 +37,7 @@ def known_vehicle(monkeypatch):
 
 @pytest.fixture(scope="module")
 def road():
-    whole = drivable_set()
+    whole = drivable_set(12.0)
     return replace(whole, recordings=tuple(each.thinned(8) for each in whole.recordings))
 
 
