@@ -37,7 +37,7 @@ def vehicle():
 
 @pytest.fixture(scope="module")
 def road():
-    return recorded_road(every=2)
+    return recorded_road(every=2, from_m=-17.0)
 
 
 class Breaking(RampFollower):

@@ -38,7 +38,7 @@ def few_are_drawn(monkeypatch):
 
 @pytest.fixture(scope="module")
 def road():
-    return recorded_road(every=2)
+    return recorded_road(every=2, from_m=-17.0)
 
 
 def search(road, **options):

@@ -18,7 +18,7 @@ BOTH = (RIGHT_GROUP, LEFT_GROUP)
 
 @pytest.fixture(scope="module")
 def road():
-    return recorded_road(every=2)
+    return recorded_road(every=2, from_m=-17.0)
 
 
 @pytest.fixture(scope="module")

@@ -53,12 +53,14 @@ def picture(state, camera=CIL_CAMERA):
     return np.clip(np.round(shown), 0, 255).astype(np.uint8).T.reshape(VIEW.height_px, VIEW.width_px, 3)
 
 
-def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0, camera=CIL_CAMERA):
+def recorded(
+    side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, stands=0, camera=CIL_CAMERA, from_m=-29.0
+):
     """A straight drive past the canvas, so far to the left, looking that way; it may stand for some steps first."""
     speed = np.full(67, SPEED_MPS)
     if stands:
         speed = np.concatenate([np.zeros(stands), np.minimum(0.3 * np.arange(1, 80), SPEED_MPS)])
-    begin_m, shown_m = (-24.0, -25.0) if stands else (-32.0, -29.0)
+    begin_m, shown_m = (-24.0, -25.0) if stands else (from_m - 3.0, from_m)
     ahead = begin_m + np.concatenate([[0.0], np.cumsum(speed[1:] * DT_S)])
     steps = np.arange(len(ahead))
     shown = steps[(ahead > shown_m) & (ahead < -1.5)][::every]
@@ -87,12 +89,12 @@ def recorded(side=Side.CLEAN, left_m=0.0, *, yaw_rad=0.0, every=1, name=None, st
     )
 
 
-def recorded_road(*, every=1, camera=CIL_CAMERA):
-    """A clean drive and one a metre and a half to each side."""
+def recorded_road(*, every=1, camera=CIL_CAMERA, from_m=-29.0):
+    """A clean drive and one a metre and a half to each side, which show the canvas from so far before it."""
     drives = (
-        recorded(every=every, camera=camera),
-        recorded(Side.RIGHT, -1.5, every=every, camera=camera),
-        recorded(Side.LEFT, 1.5, every=every, camera=camera),
+        recorded(every=every, camera=camera, from_m=from_m),
+        recorded(Side.RIGHT, -1.5, every=every, camera=camera, from_m=from_m),
+        recorded(Side.LEFT, 1.5, every=every, camera=camera, from_m=from_m),
     )
     return RecordingSet(camera=camera, view=VIEW, colour=PLAIN, recordings=drives, canvas=CANVAS)
 
