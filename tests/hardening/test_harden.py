@@ -10,17 +10,22 @@ import torch
 import needs
 from carla_serving import straight_map
 from roadproof.attacks import GradOpt, RandomSearch
-from roadproof.controllers import ConditionalPilotNet, load_controller
+from roadproof.controllers import ConditionalPilotNet, load_controller, save_controller
+from roadproof.controllers.loading import load_trainable
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives import Trajectories, Window
 from roadproof.errors import RoadproofError, TrainingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
-from roadproof.hardening.harden import harden
+from roadproof.hardening.harden import STAGES, harden
 from roadproof.hardening.page import write_hardening
-from roadproof.hardening.tuning import Tuning
+from roadproof.hardening.run import Run
+from roadproof.hardening.stages import Stages
+from roadproof.hardening.tuning import Tuning, training_step
+from roadproof.pipeline.stage_costs import Ledger
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
+from roadproof.training.shards import Shard
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
@@ -70,6 +75,36 @@ def run(town, folder, **options):
 
 class StoppedError(Exception):
     """The plug is pulled."""
+
+
+def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
+    budget = dataclasses.replace(TINY, town_drives=1)
+    asked = Run(
+        spec="pilotnet",
+        scenarios=(street(tmp_path, "near", 15.0),),
+        folder=tmp_path / "out",
+        budget=budget,
+        space=SearchSpace(figures=1),
+        seed=0,
+        device="cpu",
+    )
+    spoilt = load_trainable("pilotnet")
+    with torch.no_grad():
+        for weights in spoilt.parameters():
+            weights.mul_(0.5)
+    asked.round(1).mkdir(parents=True)
+    save_controller(spoilt, asked.weights(1), origin="spoilt")
+    ledger = Ledger(asked.folder, {}, STAGES)
+    stages = Stages(asked, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
+    first = stages.town(1).draw(500, torch.Generator().manual_seed(0), to_paint=False)
+    assert not (asked.round(1) / "town").exists()
+    both = stages.town(2).draw(500, torch.Generator().manual_seed(0), to_paint=False)
+    assert ledger.cost["town"].simulator_calls == 2
+    drives = [Shard.load(asked.town(number) / "drive-00000.npz") for number in (0, 1)]
+    seen = [{int(frame.sum()) for frame in drive.frames} for drive in drives]
+    shown = [{round(255 * float(frame.double().sum())) for frame in views.frames} for views in (first, both)]
+    assert shown[0] <= seen[0]
+    assert shown[1] & (seen[1] - seen[0]), "where the controller of round 1 went"
 
 
 @pytest.mark.slow

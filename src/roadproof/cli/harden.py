@@ -113,7 +113,7 @@ def _estimate(
 
     learnt = Estimate(seconds=budget.tuning.pictures * frame_seconds(who))
     whole = of_run(budget.attack, who, film=False).times((rounds + 1) * training) + learnt.times(rounds)
-    whole += of_drives(budget.town_drives)
+    whole += of_drives(budget.town_drives * rounds)
     if judging:
         found = of_search(budget.unseen, budget.judge.objective, 0, who)
         again = of_search(budget.judge.method, budget.judge.objective, budget.judge.window.frames, who)

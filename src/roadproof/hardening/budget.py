@@ -32,8 +32,8 @@ class HardeningBudget:
     Args:
         attack: the attack on each street for training, in each round; its evaluation is the round's re-test.
         tuning: the fine-tuning in each round, after the attacks.
-        town_drives: drives of the controller through the built-in town, whose frames keep clean driving as it was;
-            none are made in another simulator.
+        town_drives: drives through the built-in town before each tuning, by the controller as it is then, whose frames
+            keep clean driving as it was; none are made in another simulator.
         judge: the fresh attack on each street for judging.
         unseen: a method that training did not use, for judging; its patterns are tried in the recorded world.
         unseen_shape: a shape that training did not use, for judging.

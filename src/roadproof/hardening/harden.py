@@ -1,7 +1,7 @@
 """Hardening a controller: attack, fine-tune on what was found, attack afresh; then the judgement on other streets.
 
     OUT/run.json                       what was asked for, and what the stages took (`pipeline.stage_costs`)
-    OUT/town/drive-00000.npz           clean drives through the town
+    OUT/town/drive-00000.npz           drives through the town over bare roads; later rounds have their own
     OUT/round-0/SCENARIO/              the attack on the controller as it came (`pipeline.stress_test`)
     OUT/round-1/hardened.safetensors   the controller after the first tuning
     OUT/round-1/SCENARIO/              the attack afresh on it: its re-test, and what round 2 learns from

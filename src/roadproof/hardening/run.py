@@ -48,6 +48,10 @@ class Run:
         """The folder of a round; 0 is the controller as it came."""
         return self.folder / f"round-{number}"
 
+    def town(self, number: int) -> Path:
+        """The folder of the drives through the town by a round's controller."""
+        return (self.round(number) if number else self.folder) / "town"
+
     def judged(self, number: int, scenario: Scenario) -> Path:
         """The folder of the judgement of a round's controller on one street."""
         return self.round(number) / "judged" / scenario.name

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TypeAlias
 
 import torch
@@ -58,10 +59,10 @@ class Stages:
 
     def rounds(self, count: int) -> tuple[Round, ...]:
         """Attack, then tune and attack afresh for so many rounds."""
-        tests, town = list[list[StressTest]](), self.town()
+        tests = list[list[StressTest]]()
         for number in range(count + 1):
             if number:
-                self.tune(number, tests, town)
+                self.tune(number, tests)
             tests.append(self.attack(number))
         costs = [cost for each in tests for test in each for cost in test.cost.values()]
         self.ledger.calls("attack", sum(cost.simulator_calls for cost in costs))
@@ -76,12 +77,12 @@ class Stages:
                 for each in self.run.scenarios
             ]
 
-    def tune(self, number: int, tests: Sequence[Sequence[StressTest]], town: Town | None) -> None:
+    def tune(self, number: int, tests: Sequence[Sequence[StressTest]]) -> None:
         """Tune on what all attacks so far found, from the weights of the round before."""
         run, tuning = self.run, self.run.budget.tuning
         if run.weights(number).exists():
             return
-        network = load_trainable(run.spec_of(number - 1))
+        network, town = load_trainable(run.spec_of(number - 1)), self.town(number)
         # It learns from paint of all kinds, also where attacks are limited.
         space = run.space.unlimited
         told: list[object] = [network, tuning, run.seed_of(number), self.step, space.stated]
@@ -147,20 +148,26 @@ class Stages:
             self.ledger.calls("bare road", before.drives + after.drives)
         return before, after
 
-    def town(self) -> Town | None:
-        """The controller's clean drives through the town, where there is one."""
-        drives = self.run.budget.town_drives
+    def town(self, number: int) -> Town | None:
+        """Drives over the town's bare roads by the controllers of all rounds before, where there is a town.
+
+        A tuned controller drives elsewhere than the one before, and learns there what that one would do.
+        """
+        run, drives = self.run, self.run.budget.town_drives
         if not drives or not isinstance(self.simulator, TownSimulator):
             return None
-        plan = CollectionPlan(drives=drives, seed=self.run.seed, controller=self.run.spec)
-        paths = [self.run.folder / "town" / f"drive-{number:05d}.npz" for number in range(drives)]
+        paths: list[Path] = []
         with self.ledger.stage("town"):
-            for number, path in enumerate(paths):
-                if not path.exists():
-                    record_drive(self.simulator, plan, number, self.teacher).save(path)
-                self.tell("Driving through the town", number + 1, drives, "drives")
-            self.ledger.calls("town", drives)
-        return Town(Dataset.load(paths), self.simulator.camera, self.simulator.input, device=self.run.device)
+            for past in range(number):
+                driver = run.controller(past)
+                plan = CollectionPlan(drives=drives, seed=run.seed_of(past) if past else run.seed)
+                for k in range(drives):
+                    paths.append(run.town(past) / f"drive-{k:05d}.npz")
+                    if not paths[-1].exists():
+                        record_drive(self.simulator, plan, k, driver).save(paths[-1])
+                    self.tell(f"Round {past}: driving through the town", k + 1, drives, "drives")
+            self.ledger.calls("town", len(paths))
+        return Town(Dataset.load(paths), self.simulator.camera, self.simulator.input, device=run.device)
 
     def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
         """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""

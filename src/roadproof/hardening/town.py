@@ -1,4 +1,4 @@
-"""Pictures of clean drives through the town, each with a canvas laid somewhere on the road ahead.
+"""Pictures of drives over the town's bare roads, each with a canvas laid somewhere on the road ahead.
 
 So any frame of any drive is a street to learn on, without recordings or calibration of its own. What light does to
 paint there is not measured, as it is in calibrated recordings: paint is taken to be as bright as the road is.

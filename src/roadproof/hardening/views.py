@@ -7,7 +7,7 @@ pattern can be painted there, whichever street it was found on.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -88,7 +88,8 @@ class Street:
                 rolled = self.world.roll(driver, pattern)
                 way = (rolled.x_m - canvas.x_m, rolled.y_m - canvas.y_m, rolled.yaw_rad, rolled.speed_mps)
                 poses = torch.stack([column.flatten() for column in way], 1)
-                covers = [self._covered(Poses(*part[:, :3].unbind(1))) for part in poses.split(128)]
+                parts = cast("tuple[Tensor, ...]", poses[:, :3].split(128))
+                covers = [self._covered(Poses(*part.unbind(1))) for part in parts]
                 self._poses, self._covers = torch.cat([self._poses, poses]), torch.cat([self._covers, *covers])
 
     def _covered(self, poses: Poses) -> Float[Tensor, " r"]:
