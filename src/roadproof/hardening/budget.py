@@ -45,7 +45,7 @@ class HardeningBudget:
 
     attack: Budget = field(default_factory=lambda: replace(ALONE, method=GradOpt(restarts=1)))
     tuning: Tuning = field(default_factory=Tuning)
-    town_drives: int = 40
+    town_drives: int = 80
     judge: Budget = field(default_factory=lambda: replace(ALONE, starts=4))
     unseen: Method = field(default_factory=lambda: TPE(calls=100))
     unseen_shape: Shape = Shape.ELLIPSE
@@ -92,7 +92,7 @@ HARDENING_BUDGETS = {
     "full": HardeningBudget(
         attack=replace(ALONE, method=GradOpt(restarts=6), select=3),
         tuning=Tuning(steps=10_000),
-        town_drives=80,
+        town_drives=160,
         judge=replace(QUICK, select=4, starts=2),
         unseen=TPE(calls=400),
     ),

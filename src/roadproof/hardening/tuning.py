@@ -64,7 +64,7 @@ class Tuning:
     repeats: int = 8
     batch: int = 48
     learning_rate: float = 1e-3
-    bare: float = 1 / 3
+    bare: float = 0.4
     found: float = 0.5
     climb: float = 0.1
 
