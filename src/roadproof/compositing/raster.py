@@ -55,7 +55,7 @@ def _averaged(levels: Float[Tensor, "n 4"], views: OwnViews) -> Float[Tensor, "b
     points = footprints.centre[:, 0, :, None] + offsets @ footprints.jacobian[:, 0].mT
     x, y = points.round().long().clamp(0, CANVAS_SIZE_PX - 1).unbind(-1)
     at = y * CANVAS_SIZE_PX + x
-    return levels.index_select(0, at.flatten()).unflatten(0, at.shape).mean(2)
+    return levels.index_select(0, at.flatten()).view(*at.shape, 4).mean(2)
 
 
 def _tent_points(count: int) -> Float[Tensor, " n"]:
