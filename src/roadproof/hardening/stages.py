@@ -160,7 +160,8 @@ class Stages:
         with self.ledger.stage("town"):
             for past in range(number):
                 driver = run.controller(past)
-                plan = CollectionPlan(drives=drives, seed=run.seed_of(past) if past else run.seed)
+                seed = run.seed_of(past) if past else run.seed
+                plan = CollectionPlan(drives=drives, seed=seed, controller=run.spec_of(past))
                 for k in range(drives):
                     paths.append(run.town(past) / f"drive-{k:05d}.npz")
                     if not paths[-1].exists():
