@@ -9,7 +9,6 @@ from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from roadproof.calibration.published import (
     PAINTS,
@@ -20,13 +19,12 @@ from roadproof.calibration.published import (
     point_targets,
 )
 from roadproof.calibration.replays import Replays, Wanted, replay_in, told_apart
-from roadproof.calibration.report import CalibrationReport, DriveReport, Spread, stated_errors_px
-from roadproof.calibration.two_paint import TARGETS, Paints, look_at_paints
+from roadproof.calibration.report import CalibrationReport, DriveReport, Geometry, Spread, stated_errors_px
+from roadproof.calibration.two_paint import TARGETS, look_at_paints
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import homography_from_pose
-from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import table
 from roadproof.io.identity import digest, require_same
@@ -141,15 +139,6 @@ def _parts(drives: Drives, method: Method) -> dict[str, object]:
     return {"method": str(method), "drives": {drive.name: digest(*told_apart(drive))[:16] for drive in drives.drives}}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Geometry:
-    """Homographies of the frames of one drive that have one, and how well they fit."""
-
-    found: dict[int, Homography]
-    dropped: dict[int, str]
-    residuals_px: Float[np.ndarray, " n"]
-
-
 def replays_needed(count: int, method: Method) -> int:
     """Number of replays in the simulator that a calibration of so many recorded drives takes on top of them."""
     return RUNS * count + len(PAINTS) if method is Method.PUBLISHED else len(TARGETS) * count
@@ -205,13 +194,12 @@ def calibrate(
     else:
         replays = Replays(simulator, drives, folder, on_call)
     if method is Method.PUBLISHED:
-        geometry = [_Geometry(*homographies_from_points(replays, drive, settings.camera)) for drive in drives.drives]
+        geometry = [homographies_from_points(replays, drive, settings.camera) for drive in drives.drives]
         maps: list[PixelMaps | None] = [None] * len(geometry)
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
-        paints = [_look(replays, drives, drive, refine=method is Method.TWO_PAINT) for drive in drives.drives]
-        geometry = [_from_paints(paint) for paint in paints]
-        maps = [paint.maps.at(list(g.found)) for paint, g in zip(paints, geometry, strict=True)]
+        looks = [_look(replays, drives, drive, refine=method is Method.TWO_PAINT) for drive in drives.drives]
+        geometry, maps = [found for found, _ in looks], [shading for _, shading in looks]
         colour, residual = ColourTransform(AffineResponse.identity()), None
     for drive, found in zip(drives.drives, geometry, strict=True):
         _check(drive, found)
@@ -238,19 +226,13 @@ def calibrate(
     return Calibrated(recordings, report, _parts(drives, method))
 
 
-def _look(replays: Replays, drives: Drives, drive: Drive, *, refine: bool) -> Paints:
+def _look(replays: Replays, drives: Drives, drive: Drive, *, refine: bool) -> tuple[Geometry, PixelMaps]:
     camera, view, canvas = drives.settings.camera, drives.settings.view, drives.settings.scenario.canvas
     poses = np.stack([homography_from_pose(camera, state, canvas) for state in drive.states])
     return look_at_paints(replays, drive, poses, camera, view, refine=refine)
 
 
-def _from_paints(paints: Paints) -> _Geometry:
-    found = {k: homography for k, homography in enumerate(paints.image_from_canvas) if k not in paints.dropped}
-    errors = paints.outline_px[list(found)]
-    return _Geometry(found, paints.dropped, errors[np.isfinite(errors)])
-
-
-def _check(drive: Drive, geometry: _Geometry) -> None:
+def _check(drive: Drive, geometry: Geometry) -> None:
     """Refuse a drive's calibration on which an attack should not be built."""
     count, left = len(drive.frames), len(geometry.found)
     if left < LEAST_SHARE * count:
@@ -267,7 +249,7 @@ def _check(drive: Drive, geometry: _Geometry) -> None:
         )
 
 
-def _report(replays: Replays, drives: Drives, drive: Drive, geometry: _Geometry) -> DriveReport:
+def _report(replays: Replays, drives: Drives, drive: Drive, geometry: Geometry) -> DriveReport:
     stated = replays.stated(drive)
     kept = list(geometry.found)
     homographies = np.stack(list(geometry.found.values()))
@@ -282,7 +264,7 @@ def _report(replays: Replays, drives: Drives, drive: Drive, geometry: _Geometry)
     )
 
 
-def _recording(drive: Drive, geometry: _Geometry, maps: PixelMaps | None, weather: Weather) -> Recording:
+def _recording(drive: Drive, geometry: Geometry, maps: PixelMaps | None, weather: Weather) -> Recording:
     kept = list(geometry.found)
     steps = drive.frame_number[kept]
     return Recording(

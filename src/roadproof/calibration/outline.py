@@ -19,7 +19,6 @@ little of its own, both with a prior: what some frames show carries over to the 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -54,20 +53,9 @@ OWN_DOUBT = (0.001, 0.0005, 0.0005, 0.002, 0.002, 0.002)
 """The same of each frame by itself."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OutlineFit:
-    """Homographies fitted to the edges of canvas and squares.
-
-    Args:
-        image_from_canvas: one fitted homography per frame, canvas px to camera px, (F, 3, 3).
-        outline_px: mean distance of predicted from measured edges per frame, camera px, (F,); NaN if none is in view.
-    """
-
-    image_from_canvas: Homographies
-    outline_px: Float[np.ndarray, " f"]
-
-
-def fit_outline(prior: Homographies, contrast: Pictures, camera: CameraModel, view: CropResize) -> OutlineFit:
+def fit_outline(
+    prior: Homographies, contrast: Pictures, camera: CameraModel, view: CropResize
+) -> tuple[Homographies, Float[np.ndarray, " f"]]:
     """Move homographies until canvas and squares lie where they are seen.
 
     Args:
@@ -75,6 +63,9 @@ def fit_outline(prior: Homographies, contrast: Pictures, camera: CameraModel, vi
         contrast: D: light minus dark frames, mean over channels, 1 for white minus black, (F, H, W).
         camera: camera of the frames.
         view: crop and resize that make the controller's input from the camera picture.
+
+    Returns:
+        The moved homographies, (F, 3, 3), and what `outline_errors_px` says of them, (F,).
     """
     common, own = (np.diag(1 / np.square(doubt)) for doubt in (COMMON_DOUBT, OWN_DOUBT))
     moves = np.zeros((len(prior), 6))
@@ -83,7 +74,7 @@ def fit_outline(prior: Homographies, contrast: Pictures, camera: CameraModel, vi
         for _ in range(steps):
             moves = problem.step(moves, common, own)
     finest = _Outline(prior, contrast, camera, view, 0, moves)
-    return OutlineFit(moved(prior, moves, camera), finest.outline_px(moves))
+    return moved(prior, moves, camera), finest.outline_px(moves)
 
 
 def outline_errors_px(

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from roadproof.calibration.replays import Replays, Target, uniform
+from roadproof.calibration.report import Geometry
 from roadproof.datatypes import Observation
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError, ColourError, GeometryError
@@ -95,10 +96,8 @@ def _points_seen(seen: Observation) -> Float[np.ndarray, "5 2"]:
     return detect_points(seen.picture)
 
 
-def homographies_from_points(
-    replays: Replays, drive: Drive, camera: CameraModel
-) -> tuple[dict[int, Homography], dict[int, str], Float[np.ndarray, " n"]]:
-    """Homographies of the frames that allow one, reasons for the others, and residuals in camera px.
+def homographies_from_points(replays: Replays, drive: Drive, camera: CameraModel) -> Geometry:
+    """Where the frames of a drive see the canvas, from the points seen on it.
 
     Args:
         replays: replays of the recorded drives.
@@ -130,7 +129,7 @@ def homographies_from_points(
         errors = reprojection_errors_px(homography, points[there], straight[there])
         found[k] = homography
         residuals.append(errors[errors < _OUTLIER_PX])
-    return found, dropped, np.concatenate([np.empty(0), *residuals])
+    return Geometry(found, dropped, np.concatenate([np.empty(0), *residuals]))
 
 
 def colours_from_paints(

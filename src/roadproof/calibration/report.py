@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel
-from roadproof.homographies import Homographies, homogeneous
+from roadproof.homographies import Homographies, Homography, homogeneous
 from roadproof.io.records import RecordFile, Saved
 
 _GRID = 9
+
+
+class Geometry(NamedTuple):
+    """Where the frames of one drive see the canvas, and how well that fits what they show.
+
+    Args:
+        found: homography of each frame that has one, canvas px to camera px, by the frame's index.
+        dropped: index of each other frame, and why it has none.
+        residuals_px: by how much the homographies miss points or outline, camera px, (N,).
+    """
+
+    found: dict[int, Homography]
+    dropped: dict[int, str]
+    residuals_px: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True)

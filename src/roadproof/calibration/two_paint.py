@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from roadproof.calibration.outline import GREY, SQUARES, fit_outline, outline_errors_px, predicted_contrast
 from roadproof.calibration.replays import Replays, Target, uniform
+from roadproof.calibration.report import Geometry
 from roadproof.drives import Drive
 from roadproof.errors import CalibrationError, ColourError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
@@ -18,23 +16,6 @@ from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
 from roadproof.simulators.protocol import PatternImage
 
 LEAST_PX = 20
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Paints:
-    """What two paints show of one drive.
-
-    Args:
-        maps: gain, offset and visibility of every pixel of the drive's frames.
-        image_from_canvas: one homography per frame, canvas px to camera px, (F, 3, 3).
-        outline_px: distance by which each homography misses the seen edges, camera px, (F,); NaN if none is in view.
-        dropped: index of each frame that shows too little of the canvas, and why.
-    """
-
-    maps: PixelMaps
-    image_from_canvas: Homographies
-    outline_px: Float[np.ndarray, " f"]
-    dropped: dict[int, str]
 
 
 def dark_target() -> PatternImage:
@@ -50,8 +31,8 @@ TARGETS = Target("light", uniform(255, 255, 255)), Target("dark", dark_target())
 
 def look_at_paints(
     replays: Replays, drive: Drive, prior: Homographies, camera: CameraModel, view: CropResize, *, refine: bool
-) -> Paints:
-    """Replay a drive over a light and a dark canvas.
+) -> tuple[Geometry, PixelMaps]:
+    """Where the frames of a drive see the canvas, and how paint looks there, from a light and a dark canvas.
 
     Args:
         replays: replays of the recorded drives.
@@ -68,12 +49,11 @@ def look_at_paints(
     difference = light.astype(np.float64) - dark
     contrast = difference.mean(-1) / 255
     if refine:
-        fit = fit_outline(prior, contrast, camera, view)
-        found, errors = fit.image_from_canvas, fit.outline_px
+        fitted, errors = fit_outline(prior, contrast, camera, view)
     else:
-        found, errors = prior, outline_errors_px(prior, contrast, camera, view)
+        fitted, errors = prior, outline_errors_px(prior, contrast, camera, view)
     # What the dark frame would be without its squares: they took the known share 1 − p / s of the difference.
-    share, expected = predicted_contrast(found, view, camera)
+    share, expected = predicted_contrast(fitted, view, camera)
     whole = np.where(share > 0.01, share / np.maximum(expected, 1e-6), 1.0).clip(1.0, 1.0 / (1.0 - GREY))
     black = np.clip(np.round(light - difference * whole[..., None]), 0, 255).astype(np.uint8)
     try:
@@ -86,4 +66,7 @@ def look_at_paints(
         for k in range(len(seen_px))
         if seen_px[k] < LEAST_PX
     }
-    return Paints(maps, found, errors, dropped)
+    found = {k: homography for k, homography in enumerate(fitted) if k not in dropped}
+    kept = list(found)
+    residuals_px = errors[kept]
+    return Geometry(found, dropped, residuals_px[np.isfinite(residuals_px)]), maps.at(kept)
