@@ -301,7 +301,7 @@ def test_two_paints_foretell_a_third_in_shadow_at_edges_and_behind_a_post():
     road = ShadowedRoad()
     maps = pixel_maps_from_two_paints(road.painted(1, 1, 1), road.painted(0, 0, 0))
     colour = torch.tensor([0.8, 0.3, 0.1])
-    paint = maps.gain * maps.response(colour) + maps.offset
+    paint = maps.gain * colour + maps.offset
     composite = road.clean + maps.visible[..., None] * (paint - road.clean)
     error = 255 * (composite - road.painted(*colour.tolist()).float() / 255).abs()
     assert error[maps.visible == 1].mean() < 0.6  # all of it from rounding three pictures
@@ -311,17 +311,6 @@ def test_two_paints_foretell_a_third_in_shadow_at_edges_and_behind_a_post():
     assert (maps.visible - road.share).abs().mean() < 0.01
 
 
-def test_pixel_maps_stand_on_a_response_that_bends():
-    road = ShadowedRoad()
-    white, black = (FILM(torch.full((3,), value)) for value in (1.0, 0.0))
-    light, dark = road.painted(*white.tolist()), road.painted(*black.tolist())
-    maps = pixel_maps_from_two_paints(light, dark, response=FILM)
-    inside = maps.visible == 1
-    paint = maps.gain * FILM(torch.tensor([0.6, 0.5, 0.4])) + maps.offset
-    truth = road.gain * FILM(torch.tensor([0.6, 0.5, 0.4])) + road.offset
-    assert (255 * (paint - truth).abs())[inside].mean() < 1.0
-
-
 def test_paints_that_show_nothing_are_refused():
     road = ShadowedRoad()
     light, dark = road.painted(1, 1, 1), road.painted(0, 0, 0)
@@ -329,8 +318,6 @@ def test_paints_that_show_nothing_are_refused():
         pixel_maps_from_two_paints(light, dark[:1])
     with pytest.raises(ColourError, match="do not differ"):
         pixel_maps_from_two_paints(light, light)
-    with pytest.raises(ColourError, match="differ too little"):
-        pixel_maps_from_two_paints(light, dark, dark=(0.95, 0.0, 0.0))
     with pytest.raises(ColourError, match="saturated"):
         pixel_maps_from_two_paints(torch.full_like(light, 255), dark)
 

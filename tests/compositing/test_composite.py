@@ -157,7 +157,7 @@ def test_pixel_maps_give_every_pixel_its_own_light():
     count = 2
     gain = torch.full((count, 88, 200, 3), 0.5)
     gain[:, :, 100:] = 0.25
-    maps = PixelMaps(gain, torch.zeros_like(gain), torch.ones(count, 88, 200), PLAIN.response)
+    maps = PixelMaps(gain, torch.zeros_like(gain), torch.ones(count, 88, 200))
     view = make_view(count, dtype=torch.float32, colour=PLAIN, maps=maps)
     frames = composite(whole_canvas([1.0, 1.0, 1.0]), view)
     row = frames[-1, 0, 60]

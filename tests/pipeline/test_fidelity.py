@@ -13,7 +13,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.rollout import rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.patterns import Pattern
-from roadproof.photometry import ColourTransform, pixel_maps_from_two_paints
+from roadproof.photometry import AffineResponse, ColourTransform, pixel_maps_from_two_paints
 from roadproof.pipeline.fidelity import (
     Fidelity,
     compare_with_rendered,
@@ -60,7 +60,9 @@ def drive():
         steer=episode.steer[STEPS],
         maps=maps,
     )
-    recordings = RecordingSet(camera=camera, view=view, colour=ColourTransform(maps.response), recordings=(recording,))
+    recordings = RecordingSet(
+        camera=camera, view=view, colour=ColourTransform(AffineResponse.identity()), recordings=(recording,)
+    )
     return episode, recordings, rendered
 
 

@@ -16,7 +16,7 @@ from roadproof.errors import RoadproofError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.lens import Lens
 from roadproof.patterns import Pattern
-from roadproof.photometry import AffineResponse, PixelMaps
+from roadproof.photometry import PixelMaps
 from roadproof.recorded.light import Light
 from roadproof.recorded.pictures import FrameBank, Poses
 from roadproof.search_space import SearchSpace
@@ -104,7 +104,7 @@ def test_what_hides_the_canvas_is_measured_through_the_lens():
     visible = torch.zeros(drive.frames.shape[:3])
     visible.view(-1)[view.index] = view.gain[:, 0]
     shape = drive.frames.shape
-    maps = PixelMaps(torch.ones(shape), torch.zeros(shape), visible, AffineResponse.identity())
+    maps = PixelMaps(torch.ones(shape), torch.zeros(shape), visible)
     seen = dataclasses.replace(road, recordings=(dataclasses.replace(drive, maps=maps),))
     free = Light(seen, torch.device("cpu"))._maps[:, 6]
     # Nothing hides it, so all of it is seen: through a pinhole, its outline would seem hidden.

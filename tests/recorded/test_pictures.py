@@ -127,12 +127,12 @@ def test_no_pixel_of_a_picture_depends_on_what_else_is_in_the_batch(bank):
 
 
 def test_light_of_the_recorded_frame_moves_with_the_ground():
-    from roadproof.photometry import AffineResponse, PixelMaps
+    from roadproof.photometry import PixelMaps
 
     road = recorded_road()
     drive = road.recordings[0]
     shape = drive.frames.shape
-    maps = PixelMaps(torch.full(shape, 0.5), torch.full(shape, 0.2), torch.ones(shape[:3]), AffineResponse.identity())
+    maps = PixelMaps(torch.full(shape, 0.5), torch.full(shape, 0.2), torch.ones(shape[:3]))
     lit = RecordingSet(
         camera=road.camera,
         view=road.view,

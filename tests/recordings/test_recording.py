@@ -15,7 +15,7 @@ from roadproof.geometry import CanvasPlacement
 from roadproof.paint.site import LaneMark
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.recordings import RecordingSet, Side, Track, load_recordings, pooled, save_recordings
-from scenes import PLAIN, recording, recording_set
+from scenes import recording, recording_set
 
 PER_FRAME = ("frames", "frame_number", "image_from_canvas", "speed_mps", "command", "steer")
 
@@ -112,7 +112,7 @@ def test_pinholes_are_kept_as_before_there_were_lenses(saved):
 
 def test_pixel_maps_travel_with_their_drive(tmp_path):
     drive = recording(Side.CLEAN, frames=2)
-    maps = PixelMaps(torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200), PLAIN.response)
+    maps = PixelMaps(torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200))
     one = replace(recording_set(), recordings=(replace(drive, maps=maps),))
     save_recordings(one, tmp_path / "set")
     loaded = load_recordings(tmp_path / "set").recordings[0].maps
@@ -121,7 +121,7 @@ def test_pixel_maps_travel_with_their_drive(tmp_path):
 
 
 def test_a_thinned_drive_ends_with_the_same_frame_and_keeps_what_belongs_to_each():
-    maps = PixelMaps(torch.rand(8, 88, 200, 3), torch.zeros(8, 88, 200, 3), torch.ones(8, 88, 200), PLAIN.response)
+    maps = PixelMaps(torch.rand(8, 88, 200, 3), torch.zeros(8, 88, 200, 3), torch.ones(8, 88, 200))
     drive = replace(recording(Side.CLEAN, frames=8), maps=maps)
     few = drive.thinned(3)
     assert few.frame_number.tolist() == [11, 14, 17]

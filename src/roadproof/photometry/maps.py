@@ -1,8 +1,8 @@
 """Per-pixel gain and offset of a drive, from two drives over uniformly painted canvases.
 
 What a smooth model cannot know, such as the shadow of a tree across the canvas, two pictures of every frame show: with
-one light and one dark paint all over, seen = gain ⊙ response(painted) + offset has two equations a pixel. The same
-two pictures show where the canvas is seen, occlusion included.
+one light and one dark paint all over, seen = gain ⊙ painted + offset has two equations a pixel. The same two
+pictures show where the canvas is seen, occlusion included.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from roadproof.errors import ColourError
-from roadproof.photometry.responses import AffineResponse, Response
 
 _SEEN = 6 / 255
 _BORDER_PX = 2
@@ -24,19 +23,19 @@ _BORDER_PX = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelMaps:
-    """Colour of every pixel of a drive at the controller's input, seen = gain ⊙ response(painted) + offset.
+    """Light on every pixel of a drive at the controller's input, seen = gain ⊙ flat + offset.
+
+    The flat colour is what the response of the recordings' `ColourTransform` makes of the painted one.
 
     Args:
         gain: gain of every pixel, (F, H, W, 3); 1 where the canvas is not seen.
         offset: offset of every pixel, (F, H, W, 3); 0 where the canvas is not seen.
         visible: share of the pixel through which the canvas is seen, (F, H, W), in [0, 1].
-        response: response to whose value gain and offset apply.
     """
 
     gain: Float[Tensor, "f h w 3"]
     offset: Float[Tensor, "f h w 3"]
     visible: Float[Tensor, "f h w"]
-    response: Response
 
     def __post_init__(self) -> None:
         if self.gain.shape != self.offset.shape or self.gain.shape[:3] != self.visible.shape:
@@ -50,7 +49,7 @@ class PixelMaps:
 
     def at(self, frames: list[int] | slice) -> PixelMaps:
         """The maps of some frames, by their indices."""
-        return PixelMaps(self.gain[frames], self.offset[frames], self.visible[frames], self.response)
+        return PixelMaps(self.gain[frames], self.offset[frames], self.visible[frames])
 
     @staticmethod
     def joined(parts: Sequence[PixelMaps | None]) -> PixelMaps | None:
@@ -59,67 +58,55 @@ class PixelMaps:
         if len(maps) < len(parts):
             return None
         names = ("gain", "offset", "visible")
-        gain, offset, visible = (torch.cat([getattr(part, name) for part in maps]) for name in names)
-        return PixelMaps(gain, offset, visible, maps[0].response)
+        return PixelMaps(*(torch.cat([getattr(part, name) for part in maps]) for name in names))
 
 
 def pixel_maps_from_two_paints(
-    light_frames: UInt8[Tensor, "f h w 3"],
-    dark_frames: UInt8[Tensor, "g i j 3"],
-    *,
-    light: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    dark: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    response: Response | None = None,
+    light_frames: UInt8[Tensor, "f h w 3"], dark_frames: UInt8[Tensor, "g i j 3"]
 ) -> PixelMaps:
-    """Gain, offset and visibility of every pixel from two replays of one drive.
+    """Gain, offset and visibility of every pixel, for the painted colour itself, from two replays of one drive.
 
     Pixels that the canvas fills only in part take gain and offset from their neighbours inside it. Where the edge of
     a shadow meets the edge of the canvas, the two cannot be told apart, and a few pixels are off.
 
     Args:
-        light_frames: frames of the drive with the whole canvas painted `light`, (F, H, W, 3).
-        dark_frames: the same frames with the whole canvas painted `dark`, of the same shape.
-        light: RGB of the light paint in [0, 1]; light enough to be seen, not so light that it saturates.
-        dark: RGB of the dark paint in [0, 1]; darker than `light` in every channel.
-        response: response to whose value gain and offset apply; by default the painted colour itself.
+        light_frames: frames of the drive with the whole canvas painted white, (F, H, W, 3).
+        dark_frames: the same frames with the whole canvas painted black, of the same shape.
 
     Raises:
-        ColourError: frames of different shapes, no difference between them, paints too much alike, or a light paint
-            that saturates half of what is seen of it.
+        ColourError: frames of different shapes, no difference between them, or half of what is seen of the white paint
+            is saturated.
     """
     if light_frames.shape != dark_frames.shape:
         raise ColourError(
             f"light frames have shape {tuple(light_frames.shape)} and dark ones {tuple(dark_frames.shape)}; replay the "
             "same frames with both paints"
         )
-    response = AffineResponse.identity() if response is None else response
-    light_colour, dark_colour = response(torch.tensor([light, dark], dtype=torch.float64)).float()
-    if not bool((light_colour - dark_colour > 0.1).all()):
-        raise ColourError(f"light paint {light} and dark paint {dark} differ too little; use e.g. white and black")
     bright, dim = light_frames.float() / 255, dark_frames.float() / 255
-    apart = (bright - dim).mean(-1)
+    slope = bright - dim
+    apart = slope.mean(-1)
     seen = apart > _SEEN
     if not bool(seen.any()):
         raise ColourError(
             "light and dark frames do not differ anywhere; check that the paint shows, and the same frames"
         )
     if float((light_frames[seen] == 255).float().mean()) > 0.5:
-        raise ColourError(f"more than half of what is seen of the light paint {light} is saturated; use a darker one")
-    slope = (bright - dim) / (light_colour - dark_colour)
-    level = dim - slope * dark_colour
+        raise ColourError(
+            "more than half of what is seen of the white paint is saturated; choose a darker weather or expose less"
+        )
     inside = seen & ~_dilate(~seen)
     near = _dilate(inside, _BORDER_PX)
-    known = torch.where(inside[..., None], torch.cat([slope, level], -1), 0.0)
+    known = torch.where(inside[..., None], torch.cat([slope, dim], -1), 0.0)
     filled = _filled(known, inside)
-    expected = (filled[..., :3] * (light_colour - dark_colour)).mean(-1)
+    expected = filled[..., :3].mean(-1)
     # More contrast than the neighbours have cannot come from a part of the pixel: it is lit better, and seen whole.
     own = inside | (seen & (~near | (apart >= expected)))
     border = (near & ~own)[..., None]
     gain = torch.where(own[..., None], slope, torch.where(border, filled[..., :3], 1.0))
-    offset = torch.where(own[..., None], level, torch.where(border, filled[..., 3:], 0.0))
+    offset = torch.where(own[..., None], dim, torch.where(border, filled[..., 3:], 0.0))
     share = (apart / expected.clamp_min(_SEEN)).clamp(0.0, 1.0)
     visible = torch.where(own, 1.0, torch.where(border[..., 0], share, 0.0))
-    return PixelMaps(gain, offset, visible, response)
+    return PixelMaps(gain, offset, visible)
 
 
 def _dilate(mask: Tensor, radius_px: int = 1) -> Tensor:

@@ -30,7 +30,7 @@ from roadproof.io.files import AnyPath, as_path, check_closed, inside, write_fol
 from roadproof.io.pictures import read_picture
 from roadproof.io.records import Form, RecordFile
 from roadproof.paint.site import LaneMark
-from roadproof.photometry import ColourTransform, PixelMaps, Response
+from roadproof.photometry import ColourTransform, PixelMaps
 from roadproof.recordings.recording import Recording, RecordingSet, Side
 from roadproof.recordings.track import Track
 
@@ -197,7 +197,7 @@ def load_recordings(folder: AnyPath) -> RecordingSet:
         camera=manifest.camera,
         view=manifest.crop_resize,
         colour=manifest.colour,
-        recordings=tuple(_read_drive(folder, drive, manifest.colour.response) for drive in manifest.drives),
+        recordings=tuple(_read_drive(folder, drive) for drive in manifest.drives),
         origin=manifest.origin,
         canvas=manifest.canvas,
         marks=manifest.marks,
@@ -205,7 +205,7 @@ def load_recordings(folder: AnyPath) -> RecordingSet:
     )
 
 
-def _read_drive(root: Path, drive: _Drive, response: Response) -> Recording:
+def _read_drive(root: Path, drive: _Drive) -> Recording:
     folder = inside(root, drive.name, f"{root / 'recordings.json'}: drive", RecordingError)
     if not folder.is_dir():
         raise RecordingError(f"drive {drive.name} is listed in recordings.json but {folder} is missing")
@@ -216,7 +216,7 @@ def _read_drive(root: Path, drive: _Drive, response: Response) -> Recording:
         name=drive.name,
         side=drive.side,
         frames=_read_frames(folder, content["frame_number"]),
-        maps=_read_maps(folder / "shading.npz", response),
+        maps=_read_maps(folder / "shading.npz"),
         track=_read_track(folder / "track.npz", content["frame_number"]),
         weather=drive.weather,
     )
@@ -233,12 +233,12 @@ def _read_track(path: Path, frame_number: np.ndarray) -> Track | None:
     return track
 
 
-def _read_maps(path: Path, response: Response) -> PixelMaps | None:
+def _read_maps(path: Path) -> PixelMaps | None:
     if not path.exists():
         return None
     gain, offset, visible = read_archive(path, ("gain", "offset", "visible"), RecordingError, _AGAIN).values()
     try:
-        return PixelMaps(torch.tensor(gain), torch.tensor(offset), torch.tensor(visible), response)
+        return PixelMaps(torch.tensor(gain), torch.tensor(offset), torch.tensor(visible))
     except ColourError as error:
         raise RecordingError(f"{path}: {error}") from None
 
