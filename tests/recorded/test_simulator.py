@@ -143,7 +143,7 @@ def test_a_car_that_leaves_the_recorded_band_ends_its_drive(world, tmp_path, ste
 
 def test_the_gap_is_that_to_a_recorded_pose(world, recordings):
     world.reset(world.scenario)
-    assert dataclasses.astuple(world.gap) == pytest.approx((0, 0, 0), abs=1e-9)
+    assert world.gap == pytest.approx((0, 0, 0), abs=1e-9)
     for _ in range(25):
         state = world.step(Control(0.15)).state
     gap, states = world.gap, []
@@ -155,7 +155,7 @@ def test_the_gap_is_that_to_a_recorded_pose(world, recordings):
         (a @ forward, a @ (-forward[1], forward[0]), state.yaw_rad - each.yaw_rad)
         for a, each in zip(apart, states, strict=True)
     ]
-    assert min(np.abs(np.array(told) - dataclasses.astuple(gap)).max(1)) < 1e-9
+    assert min(np.abs(np.array(told) - gap).max(1)) < 1e-9
 
 
 def test_full_pictures_are_the_frame_in_its_place(world):

@@ -73,16 +73,23 @@ class Gap(NamedTuple):
     turned_rad: Float[Tensor, " r"]
 
 
-class Alike(NamedTuple):
-    """Differences of pose that count alike when a frame is chosen: along the heading, across it, and in heading."""
+class Apart(NamedTuple):
+    """How far one pose is from another.
+
+    Args:
+        ahead_m: distance along its heading, metres, positive where it is further on.
+        left_m: distance across its heading, metres, positive where it is further left.
+        turned_rad: difference of heading, radians, positive where it is turned to the left.
+    """
 
     ahead_m: float
     left_m: float
     turned_rad: float
 
 
-NEAREST = Alike(1.0, 0.5, 0.1)
-LOOKING_THE_SAME_WAY = Alike(4.0, 2.0, 0.02)
+NEAREST = Apart(1.0, 0.5, 0.1)
+LOOKING_THE_SAME_WAY = Apart(4.0, 2.0, 0.02)
+"""Distances that count alike when a frame is chosen."""
 
 MISSED = 0.04
 """A frame is helped out by another where the picture reaches so far beyond it, in halves of its width or height."""
@@ -198,7 +205,7 @@ class FrameBank:
         vars(same).update(_replayed=True)
         return same
 
-    def nearest(self, poses: Poses, alike: Alike = NEAREST) -> Gap:
+    def nearest(self, poses: Poses, alike: Apart = NEAREST) -> Gap:
         """The recorded frame that shows most of what is seen from each pose.
 
         Raises:

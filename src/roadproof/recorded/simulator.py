@@ -9,7 +9,7 @@ What comes of it is predicted: nothing is driven for real. There is no map eithe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +24,7 @@ from roadproof.geometry import CanvasPlacement, homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import is_plain_name
 from roadproof.io.identity import digest
-from roadproof.recorded.pictures import Gap, Poses
+from roadproof.recorded.pictures import Apart, Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recorded.world import RecordedWorld, Start
 from roadproof.recordings import RecordingSet
@@ -47,26 +47,6 @@ SLOWEST = 4.0
 
 TURNS_RAD = 0.35
 """A clean drive that turns by more than this goes to the left or to the right; else straight on."""
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedGap:
-    """How far the car is from the pose of the recorded frame that its picture is made from.
-
-    Args:
-        ahead_m: distance along the heading, metres, positive where the car is further on.
-        left_m: distance across the heading, metres, positive where the car is further left.
-        turned_rad: difference of heading, radians, positive where the car is turned to the left.
-    """
-
-    ahead_m: float
-    left_m: float
-    turned_rad: float
-
-    @property
-    def inside(self) -> bool:
-        """Whether a picture made over this gap can be trusted."""
-        return abs(self.left_m) <= FURTHEST_ASIDE_M and abs(self.turned_rad) <= FURTHEST_TURNED_RAD
 
 
 class _Drive(DriveTracker):
@@ -156,13 +136,14 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         return path.cpu().numpy()
 
     @property
-    def gap(self) -> RecordedGap:
+    def gap(self) -> Apart:
         """How far the car is from the recorded pose that its picture is made from.
 
         Raises:
             SimulatorError: no reset was made yet.
         """
-        return _gap_of(self._world.bank.nearest(Poses(*self._running().car[:3])))
+        gap = self._world.bank.nearest(Poses(*self._running().car[:3]))
+        return Apart(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
 
     def image_from_canvas(self) -> Homography:
         """The exact homography of the current state: canvas px to camera px.
@@ -204,7 +185,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
         turned = math.remainder(asked.yaw_rad - here.yaw_rad, 2 * math.pi)
         right_m = s * dx - c * dy
-        if abs(c * dx + s * dy) > SAME_PLACE_M or not RecordedGap(0.0, -right_m, turned).inside:
+        if abs(c * dx + s * dy) > SAME_PLACE_M or not _can_be_shown(right_m, turned):
             return Start()
         return Start(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
 
@@ -218,7 +199,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         nearest = self._world.bank.nearest(poses)
         frame = self._frame(poses, nearest, drive.pattern)
         ending = None
-        if not _gap_of(nearest).inside:
+        if not _can_be_shown(float(nearest.left_m), float(nearest.turned_rad)):
             ending = Ending.LEFT_RECORDED
         elif course.locate(poses).s_m >= course.arclength_m[course.first + course.count - 1]:
             ending = Ending.GOAL_REACHED
@@ -244,8 +225,9 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         return np.asarray(picture)
 
 
-def _gap_of(gap: Gap) -> RecordedGap:
-    return RecordedGap(float(gap.ahead_m), float(gap.left_m), float(gap.turned_rad))
+def _can_be_shown(aside_m: float, turned_rad: float) -> bool:
+    """Whether a picture made so far from the pose of its recorded frame can be trusted."""
+    return abs(aside_m) <= FURTHEST_ASIDE_M and abs(turned_rad) <= FURTHEST_TURNED_RAD
 
 
 def check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
