@@ -145,11 +145,11 @@ class _Examination:
         before, self._scenario = self._scenario, scenario
         try:
             views = [self._coloured()]
-            self._simulator.paint_by(PaintKind.NATIVE)
+            self._simulator.paint = PaintKind.NATIVE
             seen = self.paint()
             views.append(self._coloured())
         finally:
-            self._simulator.paint_by(PaintKind.INJECT)
+            self._simulator.paint = PaintKind.INJECT
             self._scenario = before
         off = np.abs(views[0].astype(float) - views[1]).mean(axis=-1)
         within = may_show(self._simulator.image_from_canvas(), off.shape)

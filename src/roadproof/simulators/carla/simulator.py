@@ -88,14 +88,10 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         super().__init__(camera, input, dt_s)
         self._host, self._port, self._patience_s, self._loading_s = host, port, patience_s, loading_s
         self._choice: PaintChoice = paint
-        self._paint = PaintKind.NATIVE if paint == "native" else PaintKind.INJECT
+        self.paint: PaintKind = PaintKind.NATIVE if paint == "native" else PaintKind.INJECT
+        """How patterns are put on the road from the next reset on; entering decides it where "auto" is asked for."""
         self._session: Session | None = None
         self._ground: tuple[str, CanvasPlacement, Ground] | None = None
-
-    @property
-    def paint(self) -> PaintKind:
-        """How patterns are put on the road; "auto" is decided when the simulator is entered."""
-        return self._paint
 
     @property
     def session(self) -> Session:
@@ -144,16 +140,6 @@ class CarlaSimulator(RouteSimulator[_Drive]):
                 raise
             return None
 
-    def paint_by(self, paint: PaintKind) -> None:
-        """Change how patterns are put on the road, from the next reset on.
-
-        Raises:
-            SimulatorError: a CARLA server has no such way.
-        """
-        if paint is PaintKind.RENDERED:
-            raise SimulatorError(f"paint is {paint}, expected {PaintKind.INJECT} or {PaintKind.NATIVE}")
-        self._paint = paint
-
     def prove_native(self) -> tuple[Scenario, Ground]:
         """Find a piece of road that can be painted, on a straight stretch of the map that is loaded.
 
@@ -185,11 +171,11 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         if self._choice == "auto":
             try:
                 self.prove_native()
-                self.paint_by(PaintKind.NATIVE)
+                self.paint = PaintKind.NATIVE
             except RoadproofError:
                 if self.session.lost:
                     raise
-                self.paint_by(PaintKind.INJECT)
+                self.paint = PaintKind.INJECT
 
     def _close(self) -> None:
         self._ground = None
@@ -203,9 +189,9 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         drive = _Drive(request, roads, self.dt_s)
         self._end_drive()
         session.clear()
-        if self._paint is PaintKind.INJECT and session.painted:
+        if self.paint is PaintKind.INJECT and session.painted:
             session.reload()
-        if self._paint is PaintKind.NATIVE:
+        if self.paint is PaintKind.NATIVE:
             # The bare road as well: what is painted is compared with asphalt of the same make.
             lay(session, self._ground_of(scenario), request.pattern)
         set_weather(session, request.weather)
@@ -219,7 +205,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
             self._order(session, drive, STOP)
             session.tick()
         drive.crowd = crowd
-        pattern = request.pattern if self._paint is PaintKind.INJECT else None
+        pattern = request.pattern if self.paint is PaintKind.INJECT else None
         drive.inject = None if pattern is None else Paint(pattern)
         kinds = ("rgb",) if pattern is None else ("rgb", "depth", "semantic_segmentation")
         drive.collisions = Collisions(session, drive.ego)

@@ -11,7 +11,6 @@ import numpy as np
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
-from roadproof.roads.roadmap import RoadMap
 from roadproof.roads.routes import Route, RoutePosition
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Pictures
@@ -165,12 +164,3 @@ class RouteSimulator(TrackedSimulator[RouteDriveT]):
     def pedestrians(self) -> Agents:
         """The people as they are now."""
         return self._running().pedestrians
-
-    @abstractmethod
-    def road_map(self, name: str) -> RoadMap:
-        """The map a scenario names; it needs no drive.
-
-        Raises:
-            ScenarioError: there is no such map, or it cannot be read.
-            SimulatorError: the simulator does not answer.
-        """
