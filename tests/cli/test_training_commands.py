@@ -105,7 +105,7 @@ def test_a_controller_is_trained_from_the_command_line(invoke, tmp_path):
     assert isinstance(load_controller(tmp_path / "cil.safetensors"), CIL)
     code, printed = invoke("train", *options[:-2], "--seed", 3)
     assert code == 2
-    assert "was begun with seed = 0, now it is 3" in printed.err
+    assert "holds a training with seed 0, now it is 3" in printed.err
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from roadproof.errors import TrainingError
 from roadproof.training.augmentation import Augmentation
 from roadproof.training.dataset import SHARES, Batch, Dataset
 from roadproof.training.imitation import (
-    LossWeights,
     TrainingPlan,
     imitate,
     imitation_loss,
@@ -119,10 +118,9 @@ def test_the_loss_is_hubers_weighted():
         torch.zeros(1, 3),
         torch.zeros(1, 8, 2),
     )
-    weights = LossWeights(steer=2.0, throttle=7.0, brake=3.0, speed=5.0)
     # Below 0.1: x² / 0.2; above: x − 0.05.
-    expected = 2.0 * 0.05**2 / 0.2 + 3.0 * (0.5 - 0.05) + 5.0 * (0.2 - 0.05)
-    assert float(imitation_loss(answer, batch, weights)) == pytest.approx(expected, rel=1e-5)
+    expected = 0.6 * 0.05**2 / 0.2 + 0.2 * (0.5 - 0.05) + 0.05 * (0.2 - 0.05)
+    assert float(imitation_loss(answer, batch)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_loss_of_a_plan_is_hubers_of_shares_of_the_distance_and_of_pedals():
@@ -130,13 +128,12 @@ def test_the_loss_of_a_plan_is_hubers_of_shares_of_the_distance_and_of_pedals():
     cruise = CruiseControl(gain_per_mps=0.5, hold=0.1)
     expert = torch.tensor([[0.0, 0.4, 0.0]])
     batch = Batch(torch.zeros(1, 3, 2, 2), torch.tensor([6.0]), torch.tensor([2]), expert, path)
-    weights = LossWeights(steer=2.0, throttle=0.3, brake=0.1)
     # One number of four is off by 0.5 m at 5 m; 6.6 m/s gives the expert's throttle, 7 m/s a fifth more.
     off = torch.tensor([[[0.5, 0.0], [0.0, 0.0]]])
-    expected = 3.0 * 2.0 * (0.1 - 0.015) / 4 + 0.4 * (0.2 - 0.05)
-    loss = plan_loss(Plan(path + off, torch.tensor([7.0])), batch, weights, cruise)
+    expected = 3.0 * 0.6 * (0.1 - 0.015) / 4 + 0.4 * (0.2 - 0.05)
+    loss = plan_loss(Plan(path + off, torch.tensor([7.0])), batch, cruise)
     assert float(loss) == pytest.approx(expected, rel=1e-5)
-    assert float(plan_loss(Plan(path, torch.tensor([6.6])), batch, weights, cruise)) == pytest.approx(0.0, abs=1e-6)
+    assert float(plan_loss(Plan(path, torch.tensor([6.6])), batch, cruise)) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_rate_rises_and_falls():

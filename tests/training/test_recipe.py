@@ -52,7 +52,7 @@ def test_a_folder_of_another_recipe_is_refused(tmp_path):
     (tmp_path / "recipe.json").write_text(
         json.dumps({"format": "roadproof-recipe", "version": 1, "recipe": {"network": "cil", "drives": 7}})
     )
-    with pytest.raises(TrainingError, match="was begun with drives = 7, now it is 1"):
+    with pytest.raises(TrainingError, match="holds a training with drives 7, now it is 1"):
         follow(TINY, tmp_path)
 
 

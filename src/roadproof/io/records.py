@@ -65,6 +65,7 @@ class RecordFile(Generic[T]):
         notes: what the file says besides the fields, for people, such as units.
         header: name of an archive's JSON header; None where all its fields are arrays and numbers.
         most_bytes: how many bytes an archive may unpack to, and JSON may have (`MOST_TEXT_BYTES` at most).
+        level: the compression level of an archive, 0 to 9; 1 where there is much data and time counts.
     """
 
     kind: type[T]
@@ -78,6 +79,7 @@ class RecordFile(Generic[T]):
     notes: Mapping[str, object] = field(default_factory=dict[str, object])
     header: str | None = HEADER
     most_bytes: int = MOST_BYTES
+    level: int = 6
 
     def write(self, path: Path, value: T, **more: object) -> None:
         """Write a record, whole or not at all.
@@ -98,7 +100,7 @@ class RecordFile(Generic[T]):
         arrays: dict[str, Any] = {name: getattr(value, name) for name in members}
         if self.header is not None:
             arrays[self.header] = np.array(json.dumps(content, ensure_ascii=False))
-        write_archive(path, arrays)
+        write_archive(path, arrays, level=self.level)
 
     def document(self, value: T, members: Sequence[str] = (), **more: object) -> dict[str, Any]:
         """All that a JSON file says of a record: format and version, notes, what is said besides, and its fields."""

@@ -42,6 +42,7 @@ COMMANDS = (Command.LEFT, Command.RIGHT, Command.STRAIGHT, Command.LEFT, Command
 WEATHERS = (*tuple(Weather)[:4] * 2, *tuple(Weather)[4:])
 """The paper's four weathers twice as often as the others."""
 
+MAP_NAME = "town"
 MOST_FIGURES = 5
 
 
@@ -52,7 +53,6 @@ class CollectionPlan:
     Args:
         drives: how many drives to record, at least 1.
         seed: the seed of everything drawn: scenarios, weathers, traffic, disturbances, paint.
-        map_name: the name of the map driven on.
         controller: spec of the controller that drives; None for the expert.
         disturbed: share of the drives that start beside the lane's middle and are disturbed, 0 to 1.
         traffic: share of the drives with others on the road, 0 to 1.
@@ -64,7 +64,6 @@ class CollectionPlan:
 
     drives: int
     seed: int
-    map_name: str = "town"
     controller: str | None = None
     disturbed: float = 0.7
     traffic: float = 0.4
@@ -188,8 +187,8 @@ def _conditions(plan: CollectionPlan, number: int, dt_s: float) -> _Conditions:
     weather = WEATHERS[int(generator.integers(len(WEATHERS)))]
     cars, pedestrians = (int(generator.integers(10, 41)) for _ in range(2))
     scenario = random_scenario(
-        load_map(plan.map_name),
-        plan.map_name,
+        load_map(MAP_NAME),
+        MAP_NAME,
         generator,
         name=f"drive-{number:05d}",
         command=COMMANDS[number % len(COMMANDS)],

@@ -36,21 +36,16 @@ Learner = CIL | ConditionalPilotNet | TrajectoryController
 """A network that can be trained: frames, speed and command in, `ConditionalOutput` or `Plan` out."""
 
 
+STEER_COUNTS, THROTTLE_COUNTS, BRAKE_COUNTS, SPEED_COUNTS = 0.6, 0.2, 0.2, 0.05
+"""How much each answer counts in the loss. Steering alone keeps a car in its lane, the pedals make it arrive.
+
+A path counts as steering does, by how far its points are off as a share of their distance; a planned speed as both
+pedals."""
+
 PATH_COUNTS = 3.0
 """A point that is off by a hundredth of its distance changes steering by about three hundredths."""
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LossWeights:
-    """How much each answer counts. Steering alone keeps a car in its lane, the pedals make it arrive.
-
-    A path counts as steering does, by how far its points are off as a share of their distance; a speed as both pedals.
-    """
-
-    steer: float = 0.6
-    throttle: float = 0.2
-    brake: float = 0.2
-    speed: float = 0.05
+WEIGHT_DECAY = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,11 +59,9 @@ class TrainingPlan:
         learning_rate: the largest learning rate; it rises over the first steps and then falls along a cosine to almost
             nothing.
         warm_up: share of the steps over which the learning rate rises, 0 to 1.
-        weight_decay: the weight decay of AdamW.
         averaging: decay of the running average of the weights; the average is what is kept.
         dropout: factor on the network's own dropout; short training learns more with less.
         pasted: share of the pictures with coloured rectangles pasted on the road, 0 to 1.
-        loss: how much each answer counts in the loss.
         augmentation: how the pictures are varied.
 
     Raises:
@@ -80,11 +73,9 @@ class TrainingPlan:
     seed: int = 0
     learning_rate: float = 1e-3
     warm_up: float = 0.04
-    weight_decay: float = 1e-2
     averaging: float = 0.997
     dropout: float = 0.4
     pasted: float = 0.0
-    loss: LossWeights = field(default_factory=LossWeights)
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self) -> None:
@@ -112,12 +103,11 @@ class TrainingPlan:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a training is: the step, of how many, and the mean loss and steering error since the last report."""
+    """How far a training is: the step, of how many, and the mean loss since the last report."""
 
     step: int
     steps: int
     loss: float
-    steer_error: float
 
 
 def imitate(
@@ -153,10 +143,10 @@ def imitate(
     network.to(device=place, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     scale_dropout(network, plan.dropout)
     average = copy.deepcopy(network).eval()
-    optimiser = torch.optim.AdamW(network.parameters(), plan.learning_rate, weight_decay=plan.weight_decay)
+    optimiser = torch.optim.AdamW(network.parameters(), plan.learning_rate, weight_decay=WEIGHT_DECAY)
     first = 0 if checkpoint is None else _resume(checkpoint, plan, network, average, optimiser)
     paste = PastedPaint(plan.pasted)
-    weights, sums, counted = data.weights(), torch.zeros(2), 0
+    weights, losses, counted = data.weights(), torch.zeros(()), 0
     for step in range(first, plan.steps):
         for group in optimiser.param_groups:
             group["lr"] = plan.rate(step)
@@ -166,17 +156,15 @@ def imitate(
         last = torch.multinomial(weights, plan.batch // window, replacement=True, generator=draw)
         batch = data.batch(data.windows(last, window), place)
         batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw, window=window))
-        found = _step(network, batch, plan, optimiser, step)
+        losses += _step(network, batch, plan, optimiser, step)
         _average(average, network, min(plan.averaging, (1 + step) / (10 + step)))
-        sums += found
         counted += 1
         if (step + 1) % every == 0 or step + 1 == plan.steps:
-            if not sums.isfinite().all():
-                raise TrainingError(f"the loss is {float(sums[0])} near step {step}; lower the learning rate")
+            if not losses.isfinite():
+                raise TrainingError(f"the loss is {float(losses)} near step {step}; lower the learning rate")
             if on_progress is not None:
-                mean = sums / counted
-                on_progress(Progress(step + 1, plan.steps, float(mean[0]), float(mean[1])))
-            sums, counted = torch.zeros(2), 0
+                on_progress(Progress(step + 1, plan.steps, float(losses / counted)))
+            losses, counted = torch.zeros(()), 0
         if checkpoint is not None and ((step + 1) % every == 0 or step + 1 == plan.steps):
             _keep(checkpoint, plan, step + 1, network, average, optimiser)
     return average
@@ -184,8 +172,8 @@ def imitate(
 
 def _step(
     network: Learner, batch: Batch, plan: TrainingPlan, optimiser: torch.optim.Optimizer, step: int
-) -> Float[Tensor, "2"]:
-    """Learn from one batch; its loss and its error of steering."""
+) -> Float[Tensor, ""]:
+    """Learn from one batch; its loss."""
     device = batch.frames.device
     mixed = torch.autocast(device.type, torch.bfloat16, enabled=multiplies_bfloat16(device))
     ask = network.along if isinstance(network, TemporalPlanner) else network
@@ -193,26 +181,25 @@ def _step(
         answer: ConditionalOutput | Plan = ask(batch.frames, batch.speed_mps, batch.command)
     if isinstance(network, TrajectoryController):
         assert isinstance(answer, Plan)
-        loss, steer = plan_loss(answer, batch, plan.loss, network.cruise), network.steer_along(answer, batch.speed_mps)
+        loss = plan_loss(answer, batch, network.cruise)
     else:
         assert isinstance(answer, ConditionalOutput)
-        loss, steer = imitation_loss(answer, batch, plan.loss), answer.controls[:, 0]
+        loss = imitation_loss(answer, batch)
     optimiser.zero_grad()
     loss.backward()
     nn.utils.clip_grad_norm_(network.parameters(), 5.0)
     optimiser.step()
-    return torch.stack([loss.detach(), (steer - batch.expert[:, 0]).detach().abs().mean()]).cpu()
+    return loss.detach().cpu()
 
 
-def imitation_loss(answer: ConditionalOutput, batch: Batch, weights: LossWeights) -> Float[Tensor, ""]:
+def imitation_loss(answer: ConditionalOutput, batch: Batch) -> Float[Tensor, ""]:
     """Huber's loss of each answer, weighted and added up; only the commanded branch has answered."""
     each = functional.smooth_l1_loss(answer.controls.float(), batch.expert, beta=0.1, reduction="none").mean(dim=0)
     speed = functional.smooth_l1_loss(answer.speed.float(), batch.speed_mps / SPEED_SCALE_MPS, beta=0.1)
-    parts = weights.steer * each[0] + weights.throttle * each[1] + weights.brake * each[2]
-    return parts + weights.speed * speed
+    return STEER_COUNTS * each[0] + THROTTLE_COUNTS * each[1] + BRAKE_COUNTS * each[2] + SPEED_COUNTS * speed
 
 
-def plan_loss(answer: Plan, batch: Batch, weights: LossWeights, cruise: CruiseControl) -> Float[Tensor, ""]:
+def plan_loss(answer: Plan, batch: Batch, cruise: CruiseControl) -> Float[Tensor, ""]:
     """Huber's loss of path and speed, weighted and added up.
 
     The speed to learn is the one for which `cruise` gives the expert's pedals; its error counts in units of them.
@@ -223,7 +210,7 @@ def plan_loss(answer: Plan, batch: Batch, weights: LossWeights, cruise: CruiseCo
     assert answer.target_mps is not None
     given = (answer.target_mps.float() - batch.speed_mps) * cruise.gain_per_mps
     speed = functional.smooth_l1_loss(given, effort, beta=0.1)
-    return PATH_COUNTS * weights.steer * path + (weights.throttle + weights.brake) * speed
+    return PATH_COUNTS * STEER_COUNTS * path + (THROTTLE_COUNTS + BRAKE_COUNTS) * speed
 
 
 def scale_dropout(network: nn.Module, factor: float) -> None:
@@ -262,7 +249,8 @@ def _resume(
     try:
         content: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         kept = content["plan"]
-        if kept == asdict(plan):
+        # Older checkpoints also say what all plans have in common today.
+        if kept == kept | asdict(plan):
             network.load_state_dict(content["network"])
             average.load_state_dict(content["average"])
             optimiser.load_state_dict(content["optimiser"])

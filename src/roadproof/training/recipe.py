@@ -18,17 +18,16 @@ References:
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, temporal_controller, waypoint_controller
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.weights_file import load_network
 from roadproof.errors import TrainingError
-from roadproof.io.files import write_text
+from roadproof.io.files import write_json
+from roadproof.io.identity import require_same
 from roadproof.io.text import read_json
 from roadproof.training.collection import CollectionPlan, collect
 from roadproof.training.dataset import Dataset
@@ -225,13 +224,7 @@ def _claim(recipe: Recipe, folder: Path) -> None:
     """Write the recipe into its folder, or refuse a folder that was begun with another."""
     path, asked = folder / "recipe.json", asdict(recipe)
     if path.exists():
-        kept: dict[str, Any] = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe", {})
-        for name in sorted(asked.keys() | kept.keys()):
-            if asked.get(name) != kept.get(name):
-                raise TrainingError(
-                    f"{folder} was begun with {name} = {kept.get(name)!r}, now it is {asked.get(name)!r}; "
-                    "give the same options again or choose another folder"
-                )
-        return
-    content = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked}, indent=1)
-    write_text(path, content + "\n")
+        kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe", {})
+        require_same(folder, "a training", kept, asked, TrainingError)
+    else:
+        write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked})

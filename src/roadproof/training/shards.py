@@ -7,22 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int8, UInt8
 
 from roadproof.errors import TrainingError
-from roadproof.io.arrays import read_record, write_archive
-
-FORMAT = "roadproof-shard"
-FORMAT_VERSION = 2
-_ARRAYS = ("frames", "speed_mps", "command", "expert", "lateral_m", "path_m")
+from roadproof.io.records import RecordFile, Saved
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Shard:
+class Shard(Saved):
     """What was seen on one drive, and the expert's answer to it.
 
     Args:
@@ -66,24 +61,8 @@ class Shard:
         """How many frames there are."""
         return len(self.frames)
 
-    def save(self, path: Path) -> None:
-        """Write the drive to one file, all or nothing.
 
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        header = {"format": FORMAT, "version": FORMAT_VERSION, "about": dict(self.about)}
-        # Full compression takes longer than the drive's pictures take to render.
-        write_archive(path, {name: getattr(self, name) for name in _ARRAYS}, header, level=1)
-
-    @classmethod
-    def load(cls, path: Path) -> Shard:
-        """Read a drive written by `save`.
-
-        Raises:
-            TrainingError: the file is missing, damaged, no shard, or of a newer version.
-        """
-        header, arrays = read_record(
-            path, _ARRAYS, TrainingError, "collect it again", format_version=(FORMAT, FORMAT_VERSION)
-        )
-        return cls(**arrays, about=header.get("about", {}))
+# Full compression takes longer than the drive's pictures take to render.
+Shard.FILE = RecordFile(
+    kind=Shard, name="roadproof-shard", version=2, error=TrainingError, remedy="collect it again", level=1
+)
