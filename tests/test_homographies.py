@@ -43,9 +43,9 @@ def test_outliers_are_left_out_when_asked():
     clean = apply_homography(ahead(), canvas)
     image[:12] += 80.0
     assert reprojection_errors_px(homography_from_points(canvas, image), canvas, clean).max() > 5
-    fitted = homography_from_points(canvas, image, outlier_px=2.0, seed=3)
+    fitted = homography_from_points(canvas, image, outlier_px=2.0)
     assert reprojection_errors_px(fitted, canvas, clean).max() < 0.6
-    np.testing.assert_array_equal(fitted, homography_from_points(canvas, image, outlier_px=2.0, seed=3))
+    np.testing.assert_array_equal(fitted, homography_from_points(canvas, image, outlier_px=2.0))
 
 
 def test_the_jacobian_is_the_derivative():

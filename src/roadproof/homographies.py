@@ -36,11 +36,7 @@ def apply_homography(b_from_a: Float[np.ndarray, "*b 3 3"], points: Float[np.nda
 
 
 def homography_from_points(
-    canvas: Float[np.ndarray, "n 2"],
-    image: Float[np.ndarray, "m 2"],
-    *,
-    outlier_px: float | None = None,
-    seed: int = 0,
+    canvas: Float[np.ndarray, "n 2"], image: Float[np.ndarray, "m 2"], *, outlier_px: float | None = None
 ) -> Homography:
     """`image_from_canvas` from corresponding points, by the normalised direct linear transform.
 
@@ -50,7 +46,6 @@ def homography_from_points(
             points lie in front of the camera.
         outlier_px: where given, correspondences further than this from the best of 500 seeded four-point fits are
             left out (RANSAC); otherwise all count, as in the paper.
-        seed: seed of the four-point draws.
 
     Returns:
         The homography, scaled to unit Frobenius norm, with a positive third coordinate at the points.
@@ -69,7 +64,7 @@ def homography_from_points(
     if not (np.isfinite(canvas).all() and np.isfinite(image).all()):
         raise GeometryError("a correspondence is NaN or infinite; drop points that were not detected before the fit")
     if outlier_px is not None:
-        keep = _ransac_inliers(canvas, image, outlier_px, np.random.default_rng(seed))
+        keep = _ransac_inliers(canvas, image, outlier_px, np.random.default_rng(0))
         canvas, image = canvas[keep], image[keep]
     fitted, well_posed = _direct_linear_transform(canvas[None], image[None])
     if not well_posed[0]:

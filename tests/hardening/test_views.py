@@ -52,7 +52,7 @@ def test_pictures_to_paint_are_those_where_the_canvas_is_large(street):
 
 def test_labels_are_the_teachers_near_the_path_and_lead_back_far_from_it(street):
     right = torch.tensor([-3.0, -0.5, 0.0, 0.5, 3.0], dtype=torch.float64)
-    place = Place(torch.zeros(5, dtype=torch.int64), torch.full((5,), 20.0).double(), right, torch.zeros(5).double())
+    place = Place(torch.full((5,), 20.0).double(), right, torch.zeros(5).double())
     answer = torch.tensor([9.0, 0.1, 0.0, -0.1, 9.0])
     label = street.returning(place, answer)
     assert label[1:4].tolist() == answer[1:4].tolist()

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives import Drive, Drives
@@ -27,11 +26,6 @@ from roadproof.simulators.protocol import PatternImage, Simulator
 ASTRAY_M, ASTRAY_RAD = 0.02, 0.003
 
 
-def frame_of(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
-    """The frame that the controller would get."""
-    return seen.frame
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
     """What a drive is replayed over, and what is kept of it. It travels between processes.
@@ -39,13 +33,13 @@ class Target:
     Args:
         name: name of what is painted and seen, for the file that keeps the result.
         paint: picture of the paint on the canvas.
-        see: function of a module that is called with the observation of each kept frame; the frame itself by default.
+        see: what is kept of the observation at each kept frame, such as a function of a module; by default the frame.
         full_pictures: whether `see` needs full camera pictures.
     """
 
     name: str
     paint: PatternImage
-    see: Callable[[Observation], np.ndarray] = frame_of
+    see: Callable[[Observation], np.ndarray] = attrgetter("frame")
     full_pictures: bool = False
 
 
@@ -67,7 +61,6 @@ class Replays:
         on_call: Callable[[int], object] = lambda _done: None,
     ) -> None:
         self.calls = 0
-        self.seconds = 0.0
         self._simulator, self._drives, self._folder, self._on_call = simulator, drives, folder, on_call
         self._stated: dict[str, Homographies] = {}
 
@@ -93,7 +86,6 @@ class Replays:
             if path is not None:
                 write_archive(path, kept, {"of": made_of})
         self.calls += 1
-        self.seconds += float(kept["seconds"])
         self._stated[drive.name] = kept["stated"]
         self._on_call(self.calls)
         return kept["seen"]
@@ -112,7 +104,7 @@ class Replays:
                 stated.append(self._simulator.image_from_canvas())
             step += 1
 
-        settings, began = self._drives.settings, time.perf_counter()
+        settings = self._drives.settings
         drive_again(
             self._simulator,
             drive.episode,
@@ -126,8 +118,7 @@ class Replays:
             raise CalibrationError(
                 f"a replay of drive {drive.name} ended after {step} steps, before step {last}; record it again"
             )
-        seconds = time.perf_counter() - began
-        return {"seen": np.stack(seen_there), "stated": np.stack(stated), "seconds": np.array(seconds)}
+        return {"seen": np.stack(seen_there), "stated": np.stack(stated)}
 
 
 Wanted: TypeAlias = tuple[Drive, Target]
@@ -184,9 +175,8 @@ def told_apart(drive: Drive) -> tuple[np.ndarray, ...]:
 
 def _read(path: Path, made_of: str) -> dict[str, Any] | None:
     """The stored result of a replay; None if there is none that can be used."""
-    names = ("seen", "stated", "seconds")
     try:
-        of, arrays = read_record(path, names, CalibrationError, "drive it again")
+        of, arrays = read_record(path, ("seen", "stated"), CalibrationError, "drive it again")
     except CalibrationError:
         # Driving it again costs seconds and mends whatever it was.
         return None

@@ -20,7 +20,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.driving.deviation import passage
@@ -37,13 +37,11 @@ class Place(NamedTuple):
     """Where R cars are beside the clean path.
 
     Args:
-        nearest: index of the nearest known point of the clean path, (R,).
         s_m: arclength s along the clean path, metres, (R,).
         right_m: offset d from the clean path, metres, right positive, (R,); differentiable in the pose.
         turned_rad: heading error e, radians, left positive, (R,); differentiable in the pose.
     """
 
-    nearest: Int[Tensor, " r"]
     s_m: Float[Tensor, " r"]
     right_m: Float[Tensor, " r"]
     turned_rad: Float[Tensor, " r"]
@@ -77,7 +75,7 @@ class Course:
         self.seen, self.dt_s = seen, track.dt_s
         self.first = max(seen.start, shown - int(track.step[rows][0]))
         self.count = seen.stop - self.first
-        self.canvas, self.rows = canvas, rows
+        self.canvas = canvas
 
         def on_device(values: Float[np.ndarray, " n"]) -> Float[Tensor, " n"]:
             return torch.tensor(values, dtype=torch.float64, device=device)
@@ -85,9 +83,7 @@ class Course:
         self.arclength_m = on_device(np.concatenate([[0.0], moved.cumsum()]))
         self.poses = Poses(on_device(x), on_device(y), on_device(np.unwrap(track.yaw_rad[rows])))
         self.speed_mps = on_device(track.speed_mps[rows])
-        self.steer, self.throttle, self.brake = (
-            on_device(getattr(track, name)[rows]) for name in ("steer", "throttle", "brake")
-        )
+        self.steer = on_device(track.steer[rows])
         self.curvature = on_device(np.concatenate([kappa[:1], kappa]))
         self._law = on_device(np.zeros(3))
 
@@ -100,7 +96,7 @@ class Course:
         dx, dy = poses.x_m - x, poses.y_m - y
         turned = poses.yaw_rad - yaw
         turned = turned - 2 * math.pi * torch.round(turned.detach() / (2 * math.pi))
-        return Place(index, self.arclength_m[index] + (c * dx + s * dy).detach(), s * dx - c * dy, turned)
+        return Place(self.arclength_m[index] + (c * dx + s * dy).detach(), s * dx - c * dy, turned)
 
     def at(self, values: Float[Tensor, " n"], s_m: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
         """Values given at the points of the path, interpolated at arclengths; beyond its ends the end's value holds."""

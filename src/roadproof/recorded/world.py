@@ -73,8 +73,8 @@ class Rolled:
         speed_mps: forward speed, m/s, (R, T).
         right_m: offset from the recorded clean path, metres, right positive, (R, T); differentiable in the patterns.
         steer: steer given at each instant, (R, T).
-        ahead_m: distance ahead of the recorded frame that the picture was made from, metres, (R, T); left_m and
-            turned_rad are the other parts of that gap (`pictures.Gap`).
+        left_m: distance to the left of the recorded frame that the picture was made from, metres, (R, T).
+        turned_rad: turn to the left from that frame, radians, (R, T).
     """
 
     x_m: Float[Tensor, "r t"]
@@ -83,7 +83,6 @@ class Rolled:
     speed_mps: Float[Tensor, "r t"]
     right_m: Float[Tensor, "r t"]
     steer: Float[Tensor, "r t"]
-    ahead_m: Float[Tensor, "r t"]
     left_m: Float[Tensor, "r t"]
     turned_rad: Float[Tensor, "r t"]
 
@@ -217,7 +216,7 @@ class RecordedWorld:
                 pedals = answer[:, 1:] if answer.shape[1] == 3 else self._recorded_pedals(place, car)
                 controls = torch.cat([steer[:, None], pedals], 1)
             here = (car.x_m, car.y_m, car.yaw_rad, car.speed_mps, place.right_m)
-            rows.append((*here, controls[:, 0], gap.ahead_m, gap.left_m, gap.turned_rad))
+            rows.append((*here, controls[:, 0], gap.left_m, gap.turned_rad))
             car = self.step(car, controls)
         columns = [torch.stack(each, 1) for each in zip(*rows, strict=True)]
         columns[0], columns[1] = columns[0] + course.canvas.x_m, columns[1] + course.canvas.y_m

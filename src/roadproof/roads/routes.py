@@ -22,11 +22,10 @@ TURN_RAD = math.radians(35.0)
 
 @dataclass(frozen=True, slots=True)
 class RoutePosition:
-    """Where something is along a route: how far, how much left of it, the route's heading and command there."""
+    """Where something is along a route: how far, how much left of it, and the route's command there."""
 
     arclength_m: float
     lateral_m: float
-    heading_rad: float
     command: Command
 
 
@@ -34,7 +33,6 @@ class RoutePosition:
 class Crossing:
     """A junction on a route: where along it the route enters and leaves, and a circle round all of its lanes."""
 
-    junction: str
     enters_m: float
     leaves_m: float
     command: Command
@@ -52,7 +50,6 @@ class Route:
         headings_rad: direction of travel at each point, unwrapped.
         arclengths_m: distance driven from the start up to each point.
         commands: codes of `Command`: a turn or straight on from 20 m before a junction to its end, else follow.
-        lanes: indices of the lanes it takes, in order.
         crossings: the junctions it crosses, in order.
     """
 
@@ -60,7 +57,6 @@ class Route:
     headings_rad: Float[np.ndarray, " n"]
     arclengths_m: Float[np.ndarray, " n"]
     commands: Int[np.ndarray, " n"]
-    lanes: tuple[int, ...]
     crossings: tuple[Crossing, ...]
 
     @property
@@ -89,12 +85,9 @@ class Route:
         off = reach - step * (along / length)[:, None]
         k = int(np.argmin((off * off).sum(axis=1)))
         ux, uy = step[k] / length[k]
-        share = float(along[k] / length[k])
-        heading = self.headings_rad[low + k] * (1.0 - share) + self.headings_rad[low + k + 1] * share
         return RoutePosition(
             arclength_m=float(self.arclengths_m[low + k] + along[k]),
             lateral_m=float(ux * reach[k, 1] - uy * reach[k, 0]),
-            heading_rad=float(heading),
             command=Command(int(self.commands[low + k])),
         )
 
@@ -165,7 +158,6 @@ def route_along(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, to_m
         headings_rad=np.unwrap(np.arctan2(along[:, 1], along[:, 0])),
         arclengths_m=polyline_stations(points),
         commands=_commands(crossings, at - from_m),
-        lanes=way,
         crossings=crossings,
     )
 
@@ -187,7 +179,7 @@ def _crossings(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, end_m
             low, high = np.concatenate(inside).min(axis=0), np.concatenate(inside).max(axis=0)
             x, y = (float(value) for value in 0.5 * (low + high))
             radius = 0.5 * float((high - low).max())
-            crossings.append(Crossing(junction, enters - from_m, float(ends[k]) - from_m, command, x, y, radius))
+            crossings.append(Crossing(enters - from_m, float(ends[k]) - from_m, command, x, y, radius))
         k += 1
     return tuple(crossings)
 

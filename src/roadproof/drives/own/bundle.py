@@ -41,7 +41,6 @@ _MOST_STEPS = 40
 _LEAST_NOISE_PX = 0.02  # no corner is found better; without noise nothing would seem open
 _STEP = 1e-6
 
-_linalg: Any = np.linalg
 _optimize: Any = optimize
 _rotation: Any = Rotation
 

@@ -28,7 +28,7 @@ class Camera:
     """
 
     def __init__(self, session: Session, kind: str, model: CameraModel, carrier: carla.Actor | VehicleState) -> None:
-        self._session, self._kind = session, kind
+        self._session = session
         self._name = f"the {kind} camera of the CARLA server at {session.where}"
         self._arrived: queue.SimpleQueue[carla.Image] = queue.SimpleQueue()
         blueprint = session.library().find(f"sensor.camera.{kind}")

@@ -47,12 +47,11 @@ class Solid:
 
 @dataclass(frozen=True, slots=True)
 class Tree:
-    """A tree: where, how tall, which picture."""
+    """A tree: where, and how tall."""
 
     x_m: float
     y_m: float
     height_m: float
-    kind: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -361,10 +360,9 @@ def _scattered_trees(site: _Site, bounds: tuple[float, float, float, float]) -> 
 
 def _plant(site: _Site, pose: Pose, height_m: float) -> None:
     rng = site.rng
-    kind = int(rng.integers(TREES))
+    builder = site.builder(f"tree{rng.integers(TREES)}")
     first = float(rng.uniform(0, math.pi))
     half = height_m * 0.5
-    builder = site.builder(f"tree{kind}")
     for k in range(3):
         turn = first + k * math.pi / 3
         dx, dy = math.cos(turn) * half, math.sin(turn) * half
@@ -374,5 +372,5 @@ def _plant(site: _Site, pose: Pose, height_m: float) -> None:
         )
         shade = np.array([[0.82], [0.82], [1.0], [1.0]]) * np.ones(3)
         builder.add(corners, np.array([0.0, 0.0, 1.0]), UNIT, shade, FACE)
-    site.trees.append(Tree(pose.x_m, pose.y_m, height_m, kind))
+    site.trees.append(Tree(pose.x_m, pose.y_m, height_m))
     site.take(edge_corners(pose, 1.2, 1.2))

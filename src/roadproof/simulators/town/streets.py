@@ -20,7 +20,7 @@ CROSSING_M = (1.6, 4.2)
 STOP_LINE_M = 5.2
 SLAB_TILE_M = 2.0
 
-PAINT = {"white": (0.87, 0.87, 0.85), "standard": (0.87, 0.87, 0.85), "yellow": (0.84, 0.66, 0.24)}
+PAINT = {"white": (0.87, 0.87, 0.85), "yellow": (0.84, 0.66, 0.24)}
 STONE = (0.70, 0.69, 0.67)
 
 Line = Float[np.ndarray, "n 3"]
