@@ -136,10 +136,13 @@ def looks(response, shading=None, noise: float = 0.0) -> ColourSamples:
 
 @pytest.mark.parametrize(("response", "name"), [(FILM, "film"), (AFFINE, "affine")])
 def test_cross_validation_chooses_the_model_that_made_the_colours(response, name):
-    fit = fit_colour(looks(response, SHADING, noise=1 / 255))
+    samples = looks(response, SHADING, noise=1 / 255)
+    fit = fit_colour(samples)
     assert fit.report.model == f"{name} + radial shading"
     assert fit.report.left_out < 1.1
-    assert min(report.left_out for report in fit.others) > fit.report.left_out
+    for kind, shading in itertools.product((FilmResponse, AffineResponse), (False, True)):
+        each = fit_colour(samples, response=kind, shading=shading).report
+        assert (each.left_out > fit.report.left_out) == (each.model != fit.report.model)
     elsewhere = torch.tensor([[75.0, 5.0]], dtype=F64).expand(27, 2)
     truth = ColourTransform(response, SHADING)(COLOURS, elsewhere)
     assert (fit.transform(COLOURS, elsewhere) - truth).abs().mean() < 1.5 / 255
@@ -170,7 +173,6 @@ def test_one_wild_picture_does_not_bend_the_film_response():
     fit = fit_colour(ColourSamples(samples.painted, seen, group=samples.group), response=FilmResponse)
     rest = samples.painted[9:]
     assert (fit.transform.response(rest) - FILM(rest)).abs().mean() < 2.5 / 255
-    assert fit.report.worst == pytest.approx(samples.painted[0].tolist())
 
 
 def test_left_out_errors_are_those_of_fits_without_the_group():
@@ -184,7 +186,6 @@ def test_left_out_errors_are_those_of_fits_without_the_group():
         fitted = fit_affine(samples.painted[~out], samples.seen[~out])
         errors[out] = 255 * (fitted(samples.painted[out]).clamp(0, 1) - samples.seen[out]).abs()
     assert report.left_out == pytest.approx(errors.mean().item())
-    assert report.left_out_channel == pytest.approx(errors.mean(0).tolist())
 
 
 def test_a_fit_that_cannot_be_cross_validated_says_so():
@@ -337,7 +338,7 @@ def test_unseen_hues_of_real_renders_are_foretold_within_three_and_a_half_levels
     samples = samples_from_pictures(painted, pictures, mask, group=torch.tensor(keys).add(1) // 2, patch_px=32)
     fit = fit_colour(samples, shading=True)
     assert fit.report.model == "film + radial shading"
-    assert fit.report.left_out < fit.others[0].left_out / 2
+    assert fit.report.left_out < fit_colour(samples, response=AffineResponse, shading=True).report.left_out / 2
     colours, renders = real_renders(folder, [5, 6, 11, 12])
     row, column = mask.nonzero(as_tuple=True)
     seen = fit.transform(

@@ -43,32 +43,23 @@ class FitReport:
     Args:
         model: name of the fitted model: "film" or "affine", with " + radial shading" where that was fitted.
         samples: number of samples it was fitted to.
-        saturated: share of the seen values that lay at the end of the scale, in [0, 1].
         residual: mean absolute error on the fitted samples, 8-bit levels.
         left_out: mean absolute error on groups left out of the fit in turn, in at most twelve folds, 8-bit levels; None
             if the rest of the groups does not determine the model.
-        left_out_channel: mean absolute error on left-out groups per channel, 8-bit levels; None if `left_out` is None.
-        worst: painted colour with the largest mean error, RGB in [0, 1]; judged on left-out groups if there are any.
-        worst_error: mean absolute error of that colour, 8-bit levels.
     """
 
     model: str
     samples: int
-    saturated: float
     residual: float
     left_out: float | None
-    left_out_channel: tuple[float, float, float] | None
-    worst: tuple[float, float, float]
-    worst_error: float
 
 
 @dataclass(frozen=True, slots=True)
 class ColourFit:
-    """A fitted colour transform, its report, and the reports of the models it was preferred to."""
+    """A fitted colour transform and its report."""
 
     transform: ColourTransform
     report: FitReport
-    others: tuple[FitReport, ...] = ()
 
 
 def fit_colour(
@@ -111,8 +102,7 @@ def _best(fits: list[ColourFit | ColourError]) -> ColourFit:
     def error(fit: ColourFit) -> tuple[bool, float]:
         return fit.report.left_out is None, fit.report.residual if fit.report.left_out is None else fit.report.left_out
 
-    done.sort(key=error)
-    return ColourFit(done[0].transform, done[0].report, tuple(fit.report for fit in done[1:]))
+    return min(done, key=error)
 
 
 def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | ColourError:
@@ -121,21 +111,12 @@ def _fit(samples: ColourSamples, kind: FittedKind, shade: bool) -> ColourFit | C
     except ColourError as error:
         return error
     transform = _transform(parameters, samples, kind, shade)
-    residual = _errors(transform, samples)
     left_out = _left_out_errors(samples, kind, shade, start=parameters)
-    shown = residual if left_out is None else left_out
-    colours, which = distinct(samples.painted)
-    by_colour = torch.zeros(len(colours), dtype=torch.float64).index_add(0, which, shown.mean(1)) / which.bincount()
-    worst = int(by_colour.argmax())
     report = FitReport(
         model=("film" if kind is FilmResponse else "affine") + (" + radial shading" if shade else ""),
         samples=len(samples),
-        saturated=float(saturated(samples.seen).double().mean()),
-        residual=float(residual.mean()),
+        residual=float(_errors(transform, samples).mean()),
         left_out=None if left_out is None else float(left_out.mean()),
-        left_out_channel=None if left_out is None else _triple(left_out.mean(0)),
-        worst=_triple(colours[worst]),
-        worst_error=float(by_colour[worst]),
     )
     return ColourFit(transform, report)
 
@@ -159,11 +140,6 @@ def _errors(transform: ColourTransform, samples: ColourSamples) -> Float[Tensor,
     """Absolute errors of the predicted colours in 8-bit levels."""
     pixel = torch.zeros(len(samples), 2, dtype=torch.float64) if samples.pixel is None else samples.pixel
     return 255 * (transform(samples.painted.double(), pixel.double()) - samples.seen).abs()
-
-
-def _triple(values: Tensor) -> tuple[float, float, float]:
-    red, green, blue = cast("list[float]", values.tolist())
-    return red, green, blue
 
 
 def _solve(samples: ColourSamples, kind: FittedKind, shade: bool, start: Tensor | None = None) -> Tensor:
