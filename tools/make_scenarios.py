@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.datatypes import VehicleState
-from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.roads.maps import check_canvas, load_map, scenario_route
+from roadproof.roads.maps import fitting_canvas, load_map, scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.roads.routes import Route
 from roadproof.scenarios import BUILTIN_FILE, Kind, Scenario, save_scenarios
 
 WIDTHS_M = (7.6, 7.2, 6.8, 6.4, 6.0)
+HAND_M = 0.1
 SHIFTS_M = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6)
 
 
@@ -98,22 +98,13 @@ def on_lane(draft: Draft, road_map: RoadMap) -> VehicleState:
 def lay_canvas(route: Route, road_map: RoadMap, at_m: float) -> CanvasPlacement:
     """A canvas across the road at a distance along the route: the widest that fits, the least shifted."""
     x, y, _, yaw = route.at(at_m)
-    found = road_map.nearest_lane(x, y, yaw)
-    to_centre = road_map.lanes[found.lane].width_m / 2
-    yaw = math.remainder(yaw, 2 * math.pi)
-    for width in WIDTHS_M:
-        for shift in SHIFTS_M:
-            left = to_centre + shift
-            placed = CanvasPlacement(
-                x_m=_r(x - left * math.sin(yaw)), y_m=_r(y + left * math.cos(yaw)), yaw_rad=_r(yaw), width_m=width
-            )
-            try:
-                # Tried a hand wider, so that rounding and the kerb's chord leave it on the road.
-                check_canvas(replace(placed, width_m=width + 0.1), road_map)
-            except ScenarioError:
-                continue
-            return placed
-    raise ScenarioError(f"no canvas fits at ({x:.1f}, {y:.1f})")
+    to_centre = road_map.lanes[road_map.nearest_lane(x, y, yaw).lane].width_m / 2
+    # Tried a hand wider, so that rounding and the kerb's chord leave it on the road.
+    tries = [(to_centre + shift_m, width_m + HAND_M) for width_m in WIDTHS_M for shift_m in SHIFTS_M]
+    found = fitting_canvas(CanvasPlacement(x, y, yaw_rad=math.remainder(yaw, 2 * math.pi)), tries, road_map)
+    return CanvasPlacement(
+        x_m=_r(found.x_m), y_m=_r(found.y_m), yaw_rad=_r(found.yaw_rad), width_m=_r(found.width_m - HAND_M)
+    )
 
 
 def drafted(kind: Kind, number: int, draft: Draft, road_map: RoadMap) -> Scenario:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -75,6 +78,31 @@ def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:
             f"the canvas at ({canvas.x_m:.1f}, {canvas.y_m:.1f}) is off the road at ({x:.1f}, {y:.1f}), where there is "
             f"{'no pavement' if what == 'other' else what}; move, turn or shrink it"
         )
+
+
+def fitting_canvas(at: CanvasPlacement, tries: Iterable[tuple[float, float]], road_map: RoadMap) -> CanvasPlacement:
+    """The first canvas of some that lies on the carriageway.
+
+    Args:
+        at: a canvas in the middle of the lane, whose place and length the others have.
+        tries: for each canvas, how far to the left its middle lies, and its width, metres; at least one.
+        road_map: the map that it must fit.
+
+    Raises:
+        ScenarioError: none fits; the message is that of the last.
+    """
+    problem: ScenarioError | None = None
+    for left_m, width_m in tries:
+        x_m, y_m = at.x_m - left_m * math.sin(at.yaw_rad), at.y_m + left_m * math.cos(at.yaw_rad)
+        canvas = replace(at, x_m=x_m, y_m=y_m, width_m=width_m)
+        try:
+            check_canvas(canvas, road_map)
+        except ScenarioError as error:
+            problem = error
+            continue
+        return canvas
+    assert problem is not None
+    raise problem
 
 
 def canvas_points(canvas: CanvasPlacement) -> Float[np.ndarray, "n 2"]:

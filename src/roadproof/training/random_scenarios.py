@@ -6,7 +6,9 @@ Convention:
 
 from __future__ import annotations
 
+import contextlib
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from roadproof.datatypes import Command, Control, VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
 from roadproof.roads.lanes import Lane
-from roadproof.roads.maps import check_canvas, scenario_route
+from roadproof.roads.maps import fitting_canvas, scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.roads.routes import Route
 from roadproof.scenarios import Kind, Scenario
@@ -159,18 +161,9 @@ def _lay_canvas(route: Route, roads: RoadMap, generator: np.random.Generator) ->
     for _ in range(20):
         at_m = float(generator.uniform(0.15, 0.9)) * route.length_m
         x, y, _, yaw = route.at(at_m)
-        half = roads.lanes[roads.nearest_lane(x, y, yaw).lane].width_m / 2
-        for width in WIDTHS_M:
-            left = 0.0 if width < 2 * half else half
-            canvas = CanvasPlacement(
-                x_m=x - left * math.sin(yaw),
-                y_m=y + left * math.cos(yaw),
-                yaw_rad=math.remainder(yaw, 2 * math.pi),
-                width_m=width,
-            )
-            try:
-                check_canvas(canvas, roads)
-            except ScenarioError:
-                continue
-            return canvas
+        lane_m = roads.lanes[roads.nearest_lane(x, y, yaw).lane].width_m
+        tries = [(0.0 if width_m < lane_m else lane_m / 2, width_m) for width_m in WIDTHS_M]
+        with contextlib.suppress(ScenarioError):
+            canvas = fitting_canvas(CanvasPlacement(x, y, yaw_rad=yaw), tries, roads)
+            return replace(canvas, yaw_rad=math.remainder(yaw, 2 * math.pi))
     raise ScenarioError("no canvas fits along the route")

@@ -7,15 +7,14 @@ import math
 from roadproof.datatypes import VehicleState
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
-from roadproof.roads.maps import check_canvas
+from roadproof.roads.maps import fitting_canvas
 from roadproof.roads.roadmap import RoadMap
-from roadproof.roads.routes import Route
+from roadproof.roads.routes import TURN_RAD, Route
 from roadproof.scenarios import Kind, Scenario
 from roadproof.simulators.carla.session import Session, carla
 
 CANVAS_LENGTH_M = 9.5
 EDGE_M = 0.2
-TURN_RAD = math.radians(35.0)
 CRUISE_MPS, SLACK_S = 4.0, 20.0
 
 
@@ -101,22 +100,5 @@ def _canvas(roads: RoadMap, route: Route, at_m: float) -> CanvasPlacement:
     """A canvas over both lanes of the road where there are two, else over the car's own."""
     x, y, z, heading = route.at(at_m)
     lane = roads.lanes[roads.nearest_lane(x, y, heading).lane]
-    half = lane.width_m / 2
-    problem: ScenarioError | None = None
-    for left_m, width_m in ((half, 2 * lane.width_m - 2 * EDGE_M), (0.0, lane.width_m - 2 * EDGE_M)):
-        canvas = CanvasPlacement(
-            x_m=x - left_m * math.sin(heading),
-            y_m=y + left_m * math.cos(heading),
-            z_m=z,
-            yaw_rad=heading,
-            width_m=width_m,
-            length_m=CANVAS_LENGTH_M,
-        )
-        try:
-            check_canvas(canvas, roads)
-        except ScenarioError as error:
-            problem = error
-            continue
-        return canvas
-    assert problem is not None
-    raise problem
+    tries = ((lane.width_m / 2, 2 * lane.width_m - 2 * EDGE_M), (0.0, lane.width_m - 2 * EDGE_M))
+    return fitting_canvas(CanvasPlacement(x, y, z, heading, length_m=CANVAS_LENGTH_M), tries, roads)
