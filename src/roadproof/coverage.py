@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.constants import constant
+from roadproof.constants import constant, placed
 from roadproof.geometry import CANVAS_SIZE_PX, Resampling
 
 FOOTPRINT_VARIANCE: dict[Resampling, float] = {"antialiased-bilinear": 1.0, "area": 0.5}
@@ -81,11 +81,7 @@ class Footprints:
         dtype: torch.dtype = torch.float32,
     ) -> Footprints:
         """Footprints from canvas coordinates and Jacobians, computed in float64 and stored as `dtype`."""
-        exact = Footprints.made(torch.tensor(centre), torch.tensor(jacobian), resampling)
-        centre_, jacobian_, features = (
-            part.to(device=device, dtype=dtype) for part in (exact.centre, exact.jacobian, exact.features)
-        )
-        return Footprints(centre_, jacobian_, features, exact.variance)
+        return placed(Footprints.made(torch.tensor(centre), torch.tensor(jacobian), resampling), device, dtype)
 
     @staticmethod
     def made(

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from roadproof.calibration.replays import Replays, Target, uniform
+from roadproof.calibration.replays import Replays, Target
 from roadproof.calibration.report import Geometry
 from roadproof.datatypes import Observation
 from roadproof.drives import Drive, Drives
@@ -23,7 +23,7 @@ from roadproof.errors import CalibrationError, ColourError, GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homography, check_image_from_canvas, homography_from_points, reprojection_errors_px
 from roadproof.photometry import ColourTransform, fit_affine
-from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.protocol import PatternImage, uniform
 
 POINTS, RUNS = 60, 12
 RADIUS_PX = 4

@@ -16,7 +16,6 @@ from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.drives import Drive, Drives
 from roadproof.driving.rollout import drive_again
 from roadproof.errors import CalibrationError
-from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.homographies import Homographies
 from roadproof.io.arrays import read_record, write_archive
 from roadproof.io.identity import digest
@@ -150,11 +149,6 @@ def _replay(drives: Drives, folder: Path, simulator: Simulator, wanted: tuple[st
     name, target = wanted
     drive = next(each for each in drives.drives if each.name == name)
     Replays(simulator, drives, folder).look(drive, target)
-
-
-def uniform(red: int, green: int, blue: int) -> PatternImage:
-    """A canvas painted all over with one colour, each channel in 0…255."""
-    return np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), (red, green, blue, 255), np.uint8)
 
 
 def _check_same_way(name: str, step: int, state: VehicleState, wanted: VehicleState) -> None:

@@ -6,14 +6,14 @@ import numpy as np
 import torch
 
 from roadproof.calibration.outline import GREY, SQUARES, fit_outline, outline_errors_px, predicted_contrast
-from roadproof.calibration.replays import Replays, Target, uniform
+from roadproof.calibration.replays import Replays, Target
 from roadproof.calibration.report import Geometry
 from roadproof.drives import Drive
 from roadproof.errors import CalibrationError, ColourError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps, pixel_maps_from_two_paints
-from roadproof.simulators.protocol import PatternImage
+from roadproof.simulators.protocol import PatternImage, uniform
 
 LEAST_PX = 20
 

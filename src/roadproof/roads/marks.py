@@ -15,8 +15,6 @@ from roadproof.scenarios import Scenario
 BESIDE_M = 5.0
 """Marks within this distance of the canvas still count: figures may reach beyond it."""
 
-_USUAL_WIDTH_M, _NO_WIDTH_M = 0.15, 0.05
-
 
 def marks_on(canvas: CanvasPlacement, roads: RoadMap) -> tuple[LaneMark, ...]:
     """The painted lines of a map on a canvas and beside it, in canvas metres.
@@ -27,12 +25,11 @@ def marks_on(canvas: CanvasPlacement, roads: RoadMap) -> tuple[LaneMark, ...]:
     found: list[LaneMark] = []
     for line in roads.mark_lines:
         if line.junction is None:
-            width = line.mark.width_m if line.mark.width_m > _NO_WIDTH_M else _USUAL_WIDTH_M
             strands = len(line.mark.kind.split())
             points = _on_canvas(canvas, line.points[:, :2])
             colour = YELLOW_MARK if line.mark.colour == "yellow" else WHITE_MARK
             found += [
-                LaneMark(points_m=part, width_m=(2 * strands - 1) * width, colour=colour)
+                LaneMark(points_m=part, width_m=(2 * strands - 1) * line.mark.painted_width_m, colour=colour)
                 for part in _near(points, canvas)
             ]
     return tuple(found)

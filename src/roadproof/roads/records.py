@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 Stations = Float[np.ndarray, " n"]
+_USUAL_WIDTH_M, _NO_WIDTH_M = 0.15, 0.05
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -108,6 +109,11 @@ class MarkRecord:
     kind: str
     colour: str
     width_m: float
+
+    @property
+    def painted_width_m(self) -> float:
+        """Width of one strand on the road; that of usual lines where a file gives hardly any."""
+        return self.width_m if self.width_m > _NO_WIDTH_M else _USUAL_WIDTH_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, homography_from_pose
 from roadproof.homographies import Homography, apply_homography, homogeneous
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import PatternImage, Simulator
+from roadproof.simulators.protocol import PatternImage, Simulator, uniform
 
 STEPS = 25
 AHEAD = Control(0.0, throttle=0.6)
@@ -200,7 +200,7 @@ class _Kit:
         fresh = self._drive(AHEAD)
         self._drive(
             Control(-0.3, throttle=0.8),
-            pattern=_opaque(255, 0, 0),
+            pattern=uniform(255, 0, 0),
             weather=Weather.CLEAR_SUNSET,
             cars=4,
             full_pictures=True,
@@ -219,7 +219,7 @@ class _Kit:
 
     def paint(self) -> str:
         """Painted squares are seen where the homography says."""
-        bare, full = (_picture(self._at_canvas(pattern)) for pattern in (None, _opaque(255, 255, 255)))
+        bare, full = (_picture(self._at_canvas(pattern)) for pattern in (None, uniform(255, 255, 255)))
         homography, camera = self._simulator.image_from_canvas(), self._simulator.camera
         errors: list[float] = []
         for left, top in SQUARES:
@@ -234,7 +234,7 @@ class _Kit:
         return f"squares are seen within {worst:.2f} px of where the homography puts them"
 
     def transparency(self) -> str:
-        clear = _opaque(255, 0, 255)
+        clear = uniform(255, 0, 255)
         clear[..., 3] = 0
         off = np.abs(self._at_canvas(None).frame.astype(int) - self._at_canvas(clear).frame)
         _expect(int(off.max()) == 0, f"a transparent pattern changes the frame by up to {int(off.max())} levels")
@@ -242,7 +242,7 @@ class _Kit:
 
     def colours(self) -> str:
         black, grey, white = (
-            _picture(self._at_canvas(_opaque(level, level, level))).astype(float) for level in (0, 128, 255)
+            _picture(self._at_canvas(uniform(level, level, level))).astype(float) for level in (0, 128, 255)
         )
         inside = (white - black).max(axis=-1) > 40
         _expect(int(inside.sum()) > 50, f"only {int(inside.sum())} pixels tell white paint from black")
@@ -273,12 +273,6 @@ class _Kit:
         raise BrokenPromiseError(
             f"the canvas is not within {VIEW_M:.0f} m after {APPROACH_STEPS} steps of throttle straight on"
         )
-
-
-def _opaque(red: int, green: int, blue: int) -> UInt8[np.ndarray, "400 400 4"]:
-    pattern = np.empty((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), np.uint8)
-    pattern[:] = (red, green, blue, 255)
-    return pattern
 
 
 def _picture(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:

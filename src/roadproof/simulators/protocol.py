@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, Obstacle, Weather
-from roadproof.geometry import CameraModel, CropResize
+from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homography
 from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
@@ -20,6 +20,11 @@ from roadproof.traffic.agents import Agents
 
 PatternImage = UInt8[np.ndarray, "400 400 4"]
 """What is painted on the canvas: RGBA with straight (not premultiplied) alpha; y = 0 is the far edge."""
+
+
+def uniform(red: int, green: int, blue: int) -> PatternImage:
+    """A canvas painted all over with one colour, each channel in 0…255."""
+    return np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), (red, green, blue, 255), np.uint8)
 
 
 class PaintKind(StrEnum):

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -98,7 +99,7 @@ def _found(session: Session, canvas: CanvasPlacement) -> Ground:
     numbers = np.arange(1, len(names) + 1)
     count, valid = watch.counted(
         [
-            [(names_of(names, on), _flat(True)), (names_of(names, ~on), _flat(False))]
+            [(list(compress(names, on)), _flat(True)), (list(compress(names, ~on)), _flat(False))]
             for bit in range(len(names).bit_length())
             for on in (_bit(numbers, bit), ~_bit(numbers, bit))
         ]
@@ -237,11 +238,6 @@ def _check_share(session: Session, valid: Bool[np.ndarray, " p"], what: str) -> 
 def _bit(numbers: Int[np.ndarray, " n"], bit: int) -> Bool[np.ndarray, " n"]:
     """One bit of numbers in Gray code."""
     return ((numbers ^ (numbers >> 1)) >> bit & 1).astype(bool)
-
-
-def names_of(names: list[str], chosen: Bool[np.ndarray, " n"]) -> list[str]:
-    """The names that are chosen."""
-    return [name for name, each in zip(names, chosen.tolist(), strict=True) if each]
 
 
 def _flat(white: bool) -> BlackWhite:

@@ -28,10 +28,9 @@ from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
 from roadproof.simulators.town.scenery import Scenery, build_scenery
-from roadproof.simulators.tracker.judge import people_hit
+from roadproof.simulators.tracker.judge import LENGTH_M, people_hit
 
 FREE_RUN_S = 0.05
-CAR_LENGTH_M = 4.5
 SYNCHRONOUS, NO_RENDERING, FIXED_DT = 0, 1, 2
 SETTINGS: Value = [False, False, [False], True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
 """CARLA's own defaults: synchronous, no rendering, fixed step, substepping, its step and number, culling distance,
@@ -325,7 +324,7 @@ class World:
         c, s = math.cos(math.radians(other.pose[4])), math.sin(math.radians(other.pose[4]))
         dx, dy = one.pose[0] - other.pose[0], one.pose[1] - other.pose[1]
         beside = abs(c * dy - s * dx)
-        return away < CAR_LENGTH_M and (beside < 2.0 or turned > 0.3)
+        return away < LENGTH_M and (beside < 2.0 or turned > 0.3)
 
     def _stop_physics(self, key: int) -> None:
         """The next step starts from where the actor is then."""

@@ -90,7 +90,7 @@ def _thinned(line: Line, spacing_m: float) -> np.ndarray:
 
 def _mark(paint: MeshBuilder, line: MarkLine) -> None:
     colour = PAINT.get(line.mark.colour, PAINT["white"])
-    width = line.mark.width_m if line.mark.width_m > 0.05 else 0.15
+    width = line.mark.painted_width_m
     kinds = line.mark.kind.split()
     for i, kind in enumerate(kinds):
         shift = (len(kinds) - 1) * width - 2 * width * i

@@ -329,9 +329,7 @@ ATLAS_TILE = 256
 
 def atlas(pictures: Sequence[Picture], columns: int) -> Picture:
     """Pictures side by side, from the upper left, each brought to `ATLAS_TILE` pixels square."""
-    rows = 1
-    while rows * columns < len(pictures):
-        rows *= 2
+    rows = _atlas_rows(len(pictures), columns)
     channels = pictures[0].shape[2]
     sheet = np.zeros((rows * ATLAS_TILE, columns * ATLAS_TILE, channels), np.uint8)
     for i, picture in enumerate(pictures):
@@ -343,10 +341,16 @@ def atlas(pictures: Sequence[Picture], columns: int) -> Picture:
 
 def atlas_uv(uv: Float[np.ndarray, "n 2"], index: int, columns: int, count: int) -> Float[np.ndarray, "n 2"]:
     """Coordinates in an atlas of `count` pictures from coordinates in its picture `index`."""
-    rows = 1
-    while rows * columns < count:
-        rows *= 2
+    rows = _atlas_rows(count, columns)
     y, x = divmod(index, columns)
     inside = np.clip(uv, 0, 1) * (1 - 1 / ATLAS_TILE) + 0.5 / ATLAS_TILE
     corner = np.array([x, rows - 1 - y])
     return (inside + corner) / (columns, rows)
+
+
+def _atlas_rows(count: int, columns: int) -> int:
+    """Rows of an atlas, a power of two."""
+    rows = 1
+    while rows * columns < count:
+        rows *= 2
+    return rows
