@@ -101,7 +101,7 @@ def lay_canvas(route: Route, road_map: RoadMap, at_m: float) -> CanvasPlacement:
     to_centre = road_map.lanes[road_map.nearest_lane(x, y, yaw).lane].width_m / 2
     # Tried a hand wider, so that rounding and the kerb's chord leave it on the road.
     tries = [(to_centre + shift_m, width_m + HAND_M) for width_m in WIDTHS_M for shift_m in SHIFTS_M]
-    found = fitting_canvas(CanvasPlacement(x, y, yaw_rad=math.remainder(yaw, 2 * math.pi)), tries, road_map)
+    found = fitting_canvas(CanvasPlacement(x_m=x, y_m=y, yaw_rad=math.remainder(yaw, 2 * math.pi)), tries, road_map)
     return CanvasPlacement(
         x_m=_r(found.x_m), y_m=_r(found.y_m), yaw_rad=_r(found.yaw_rad), width_m=_r(found.width_m - HAND_M)
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -195,7 +195,7 @@ def calibrate(
         replays = Replays(simulator, drives, folder, on_call)
     if method is Method.PUBLISHED:
         geometry = [homographies_from_points(replays, drive, settings.camera) for drive in drives.drives]
-        maps: list[PixelMaps | None] = [None] * len(geometry)
+        maps: Sequence[PixelMaps | None] = [None] * len(geometry)
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
         looks = [_look(replays, drives, drive, refine=method is Method.TWO_PAINT) for drive in drives.drives]

@@ -164,6 +164,6 @@ def _lay_canvas(route: Route, roads: RoadMap, generator: np.random.Generator) ->
         lane_m = roads.lanes[roads.nearest_lane(x, y, yaw).lane].width_m
         tries = [(0.0 if width_m < lane_m else lane_m / 2, width_m) for width_m in WIDTHS_M]
         with contextlib.suppress(ScenarioError):
-            canvas = fitting_canvas(CanvasPlacement(x, y, yaw_rad=yaw), tries, roads)
+            canvas = fitting_canvas(CanvasPlacement(x_m=x, y_m=y, yaw_rad=yaw), tries, roads)
             return replace(canvas, yaw_rad=math.remainder(yaw, 2 * math.pi))
     raise ScenarioError("no canvas fits along the route")

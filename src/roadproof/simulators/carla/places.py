@@ -101,4 +101,5 @@ def _canvas(roads: RoadMap, route: Route, at_m: float) -> CanvasPlacement:
     x, y, z, heading = route.at(at_m)
     lane = roads.lanes[roads.nearest_lane(x, y, heading).lane]
     tries = ((lane.width_m / 2, 2 * lane.width_m - 2 * EDGE_M), (0.0, lane.width_m - 2 * EDGE_M))
-    return fitting_canvas(CanvasPlacement(x, y, z, heading, length_m=CANVAS_LENGTH_M), tries, roads)
+    at = CanvasPlacement(x_m=x, y_m=y, z_m=z, yaw_rad=heading, length_m=CANVAS_LENGTH_M)
+    return fitting_canvas(at, tries, roads)
