@@ -103,6 +103,17 @@ def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(tmp_path):
         imitate(tiny(), data, plan, checkpoint=tmp_path / "a.ckpt")
 
 
+def test_a_checkpoint_from_before_all_plans_had_one_weight_decay_is_taken_up(tmp_path):
+    data, plan, path = drives(20), TrainingPlan(samples=16, batch=8), tmp_path / "a.ckpt"
+    imitate(tiny(), data, plan, checkpoint=path, every=1)
+    content = torch.load(path, weights_only=True)
+    content["plan"] |= {"weight_decay": 1e-2, "loss": {"steer": 0.6}}
+    torch.save(content, path)
+    steps = []
+    imitate(tiny(), data, plan, checkpoint=path, every=1, on_progress=lambda at: steps.append(at.step))
+    assert steps == []
+
+
 def test_training_leaves_the_global_random_state_alone():
     before = torch.get_rng_state()
     imitate(tiny(), drives(20), TrainingPlan(samples=16, batch=8))

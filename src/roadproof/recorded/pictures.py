@@ -88,8 +88,10 @@ class Apart(NamedTuple):
 
 
 NEAREST = Apart(1.0, 0.5, 0.1)
+"""Distances and a turn that count alike when a frame is chosen."""
+
 LOOKING_THE_SAME_WAY = Apart(4.0, 2.0, 0.02)
-"""Distances that count alike when a frame is chosen."""
+"""The same where a frame is to show what the nearest one does not."""
 
 MISSED = 0.04
 """A frame is helped out by another where the picture reaches so far beyond it, in halves of its width or height."""
