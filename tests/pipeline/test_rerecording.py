@@ -12,6 +12,7 @@ from paint_shy import PaintShy, along_a_street
 from roadproof.attacks import GradOpt, SteeringShift, methods
 from roadproof.attacks.gradopt import Rung
 from roadproof.calibration import Method
+from roadproof.cli.demo import _report
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
 from roadproof.drives.folder import read_drive
@@ -136,7 +137,9 @@ def test_a_controller_that_was_trained_again_is_not_answered_from_what_the_one_b
         stress_test(town, PaintShy(gain=1.0), street, done[0], budget=BUDGET, space=SearchSpace(figures=2), film=False)
 
 
-def test_a_round_that_cannot_be_calibrated_ends_them(done, town, street, tmp_path, monkeypatch):
+def test_a_round_that_cannot_be_calibrated_ends_them_and_the_demo_says_why(
+    done, town, street, tmp_path, monkeypatch, capsys
+):
     import shutil
 
     folder = shutil.copytree(done[0], tmp_path / "run")
@@ -148,9 +151,11 @@ def test_a_round_that_cannot_be_calibrated_ends_them(done, town, street, tmp_pat
         raise CalibrationError("drive round-2 has 1 of 6 frames left")
 
     monkeypatch.setattr("roadproof.pipeline.rerecording.calibrate", blind)
-    rounds = run(town, street, folder, BUDGET).rounds
-    assert len(rounds.done) == 1
-    assert rounds.stopped == "round 2: drive round-2 has 1 of 6 frames left"
+    result = run(town, street, folder, BUDGET)
+    assert len(result.rounds.done) == 1
+    assert result.rounds.stopped == "round 2: drive round-2 has 1 of 6 frames left"
+    _report(result, folder)
+    assert "\nSearching on ended early: round 2: drive round-2 has 1 of 6 frames left\n" in capsys.readouterr().out
 
 
 def test_one_search_may_be_for_several_weathers(town, street, tmp_path):

@@ -95,6 +95,8 @@ def _report(result: StressTest, out: Path) -> None:
 
     page = write_report(out)
     say(stored(out / "result.json")["verdict"]["sentence"])
+    if result.rounds is not None and result.rounds.stopped:
+        say(f"Searching on ended early: {result.rounds.stopped}")
     if (foretold := result.prediction) is not None:
         say(
             f"Predicted in the recordings {foretold.predicted_m:.2f} m of deviation ({foretold.least_m:.2f} to "
