@@ -72,14 +72,12 @@ def test_a_value_is_that_of_a_whole_drive_and_is_driven_once(town, street, tmp_p
     for other in ({"scenario": moved}, {"seed": 1}, {"weather": Weather.CLEAR_SUNSET}):
         with pytest.raises(RoadproofError, match="its clean drive, scenario, canvas, weather, seed or simulator is an"):
             DrivenMeasure(dataclasses.replace(place, **other), controller, PathDeviation())
-    older = json.loads(place.keep.read_text())
-    del older["conditions"]
-    place.keep.write_text(json.dumps(older))
-    assert DrivenMeasure(place, controller, PathDeviation()).values(SPACE, unit) == deviation
-    damaged = {"format": "roadproof-driven", "version": 1, "drives": [["a", "b"]]}
-    (tmp_path / "damaged.json").write_text(json.dumps(damaged))
-    with pytest.raises(RoadproofError, match="incomplete or damaged"):
-        DrivenMeasure(dataclasses.replace(place, keep=tmp_path / "damaged.json"), controller, SteeringShift())
+    for damage in ({"conditions": None}, {"drives": [["a", "b"]]}):
+        told = json.loads(place.keep.read_text()) | damage
+        damaged = tmp_path / "damaged.json"
+        damaged.write_text(json.dumps({name: value for name, value in told.items() if value is not None}))
+        with pytest.raises(RoadproofError, match=r"damaged\.json is incomplete or damaged .*; remove it$"):
+            DrivenMeasure(dataclasses.replace(place, keep=damaged), controller, SteeringShift())
     clean = rollout(town, controller, street)
     whole = effect_of(clean, rollout(town, controller, street, pattern=SPACE.pattern(unit[0, 0])), street.canvas)
     assert (float(steering), float(deviation)) == (whole.steering, whole.deviation)

@@ -19,12 +19,26 @@ NOW: dict[str, Any] = {
 BEFORE: dict[str, Any] = NOW | {"scenario": NOW["scenario"] | {"goal_m": [1.0, 2.0]}}
 
 
-@pytest.mark.parametrize(
-    "before", [BEFORE, None, [], "text", {"seed": 3}, BEFORE | {"more": 1}], ids=lambda value: f"{value!r:.20}"
-)
-def test_a_folder_of_the_same_parts_or_one_older_than_the_word_is_gone_on_with(before: object) -> None:
-    """What it does not say is not compared; tuples are JSON's lists."""
+@pytest.mark.parametrize("before", [BEFORE, BEFORE | {"more": 1}], ids=["the same", "more"])
+def test_a_folder_of_the_same_parts_is_gone_on_with(before: object) -> None:
+    """What it says besides is not compared; tuples are JSON's lists."""
     require_same(Path("out"), "a run", before, NOW, RoadproofError)
+
+
+@pytest.mark.parametrize(
+    ("before", "lacks"),
+    [
+        *((nothing, "what it was made of") for nothing in (None, {}, [], "text")),
+        ({name: BEFORE[name] for name in BEFORE if name != "seed"}, "its seed"),
+        ({name: BEFORE[name] for name in BEFORE if name != ANSWERS}, "its controller"),
+        ({"seed": 3}, "its scenario"),
+    ],
+)
+def test_a_folder_that_does_not_say_all_that_it_was_made_of_is_refused(before: object, lacks: str) -> None:
+    """Nobody knows whether it would have been the same."""
+    message = f"out holds a run that does not say {lacks}; choose another folder, or remove it"
+    with pytest.raises(RoadproofError, match=f"^{message}$"):
+        require_same(Path("out"), "a run", before, NOW, RoadproofError)
 
 
 OTHERS: dict[str, dict[str, Any]] = {
@@ -54,21 +68,13 @@ def test_a_folder_of_other_parts_is_refused_in_one_line(message: str) -> None:
     assert len(str(refused.value)) < 250
 
 
-def test_a_controller_is_compared_by_its_digest_where_it_was_kept() -> None:
-    """Folders older than that part are gone on with where the answers of old are the same."""
-    now = NOW | {CONTROLLER: "89ab"}
-    require_same(Path("out"), "a run", BEFORE, now, RoadproofError)
+def test_a_controller_is_compared_by_its_digest_too() -> None:
+    """Its answers come first, which say more."""
+    before, now = BEFORE | {CONTROLLER: "cdef"}, NOW | {CONTROLLER: "89ab"}
     with pytest.raises(RoadproofError, match="a run of another controller, whose weights, settings or source are"):
-        require_same(Path("out"), "a run", BEFORE | {CONTROLLER: "cdef"}, now, RoadproofError)
+        require_same(Path("out"), "a run", before, now, RoadproofError)
     with pytest.raises(RoadproofError, match="which answers otherwise"):
-        require_same(Path("out"), "a run", BEFORE | {ANSWERS: "4567"}, now, RoadproofError)
-
-
-def test_what_says_nothing_is_refused_unless_it_is_older_than_the_word() -> None:
-    """None stands for a file without the word."""
-    require_same(Path("out"), "a search", None, NOW, RoadproofError)
-    with pytest.raises(RoadproofError, match="a search that does not say what it was made of; choose another folder"):
-        require_same(Path("out"), "a search", {}, NOW, RoadproofError)
+        require_same(Path("out"), "a run", before | {ANSWERS: "4567"}, now, RoadproofError)
 
 
 def test_the_same_parts_have_one_digest() -> None:

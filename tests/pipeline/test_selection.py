@@ -90,18 +90,20 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("message", OTHERS)
-def test_a_choice_of_other_inputs_is_refused(done, town, street, tmp_path, message, older):
-    """Older ones say what they were made of by the names of their drives alone."""
-    folder = shutil.copytree(done[0], tmp_path / "selection")
+def test_a_choice_of_other_inputs_is_refused(done, town, street, message):
     given = {"controller": PaintShy(), "candidates": CANDIDATES, "best": 3} | OTHERS[message]
-    if older:
-        path, message = folder / "selection.json", "a choice with drives"
-        path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "made_of"}))
     given["scenario"] = dataclasses.replace(street, **given.get("scenario", {}))
     with pytest.raises(RoadproofError, match=f"holds {message}"):
-        select_by_driving(town, folder=folder, **given)
+        select_by_driving(town, folder=done[0], **given)
+
+
+def test_a_choice_that_does_not_say_what_it_was_made_of_is_refused(done, town, street, tmp_path):
+    folder = shutil.copytree(done[0], tmp_path / "selection")
+    path = folder / "selection.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "made_of"}))
+    with pytest.raises(RoadproofError, match="holds a choice that does not say what it was made of; choose another fo"):
+        select_by_driving(town, PaintShy(), street, CANDIDATES, best=3, folder=folder)
 
 
 def test_the_clean_drive_that_is_given_is_not_made(town, street, tmp_path):

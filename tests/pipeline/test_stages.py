@@ -71,7 +71,11 @@ def test_a_search_for_less_paint_that_found_none_is_not_repeated(tmp_path, asked
 
 @pytest.mark.parametrize(
     ("kept", "message"),
-    [({}, "does not say what it was made of"), ({"wanted_m": 0.5, "pattern": "0"}, "holds a search with pattern '0'")],
+    [
+        ({}, "does not say what it was made of"),
+        ({"wanted_m": 0.5, "pattern": "0"}, "does not say its strongest"),
+        ({"wanted_m": 0.7, "pattern": "0"}, "holds a search with wanted_m 0.7, now it is 0.5"),
+    ],
 )
 def test_less_paint_of_another_search_is_refused(tmp_path, asked, kept, message):
     run = stages_in(tmp_path)
@@ -112,7 +116,7 @@ def test_a_prediction_is_that_of_the_pattern_the_drive_and_the_controller_at_han
     assert len(made) == 5
     replace(first, made_of="").save(tmp_path / "prediction.npz")
     run.predict(recordings, pattern, chosen, None)
-    assert len(made) == 6, "an older one does not say"
+    assert len(made) == 6, "it does not say of what it is"
 
 
 class Unnamed:

@@ -187,11 +187,6 @@ def edit_manifest(folder, change):
     (folder / "recordings.json").write_text(json.dumps(manifest))
 
 
-def test_a_manifest_that_calls_the_side_push_as_older_ones_did_is_read(saved):
-    edit_manifest(saved, lambda m: [drive.update(push=drive.pop("side")) for drive in m["drives"]])
-    assert [drive.side for drive in load_recordings(saved).recordings] == [Side.CLEAN, Side.RIGHT, Side.LEFT]
-
-
 def edit_drive(folder, **fields):
     stored = dict(np.load(folder / "drive.npz"))
     np.savez(folder / "drive.npz", **(stored | fields))
@@ -222,6 +217,10 @@ DAMAGE = {
     ),
     "drive missing": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(name="gone")), "gone"),
     "unknown side": (lambda s: edit_manifest(s, lambda m: m["drives"][0].update(side="up")), "Invalid enum value 'up'"),
+    "side by another name": (
+        lambda s: edit_manifest(s, lambda m: [drive.update(push=drive.pop("side")) for drive in m["drives"]]),
+        "missing required field `side`",
+    ),
     "no drives": (lambda s: edit_manifest(s, lambda m: m.update(drives=[])), "no drives"),
     "frame missing": (lambda s: (s / "clean" / "frames" / "11.png").unlink(), "11.png is missing"),
     "frame cut": (lambda s: cut(s / "clean" / "frames" / "11.png"), "11.png cannot be read"),

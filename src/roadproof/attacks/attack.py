@@ -223,7 +223,7 @@ def kept_attack(
 
     Raises:
         RoadproofError: the stored result is damaged, belongs to another search or does not say to which, or the search
-            itself fails. A result of a version that kept no such thing is taken.
+            itself fails.
         OutputError: the folder cannot be written.
     """
     checkpoint, path = folder / "search.safetensors", folder / "result.json"

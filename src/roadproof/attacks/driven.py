@@ -110,7 +110,7 @@ class DrivenMeasure:
         self.clean = drive(None, None)
         if place.keep is not None and place.keep.exists():
             kept = _FILE.read(place.keep)
-            if kept.clean not in ("", self._told()) or kept.conditions not in ("", self._conditions):
+            if (kept.clean, kept.conditions) != (self._told(), self._conditions):
                 raise RoadproofError(
                     f"{place.keep} holds drives over patterns by another controller, or elsewhere: its clean drive, "
                     "scenario, canvas, weather, seed or simulator is another; give another file, or remove it"
@@ -168,14 +168,11 @@ def _counted_frames(clean: Episode) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """The file of effects, each by a digest of its paint, with one of the clean drive; older files have none.
-
-    Nor have they a digest of the driver, scenario, weather, seed and simulator.
-    """
+    """The file of effects, each by a digest of its paint, with digests of the clean drive and of its conditions."""
 
     drives: dict[str, Effect]
-    clean: str = ""
-    conditions: str = ""
+    clean: str
+    conditions: str
 
 
 _ROWS = Form(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from roadproof.attacks.checks import Check
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
-from roadproof.attacks.methods import GradOpt, method_of, stored
+from roadproof.attacks.methods import method_of, stored
 from roadproof.driving.speed import speed_in_words, speeds_in_words
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
@@ -99,8 +99,8 @@ class AttackResult:
         space: the search space.
         method: the search method.
         seed: seed of everything random.
-        conspicuousness: how conspicuous the strongest pattern is on this road; None in results of versions without it.
-        made_of: identity of the search, by name (`io.identity`); empty in a simulator, and in older files.
+        conspicuousness: how conspicuous the strongest pattern is on this road.
+        made_of: identity of the search, by name (`io.identity`); empty in a simulator.
     """
 
     pattern: Pattern
@@ -173,8 +173,6 @@ class AttackResult:
         folder = as_path(folder)
         path = folder / "result.json"
         content = RESULT_FILE.content(path)
-        if "method" not in content:
-            content["method"] = _of_first_format(content)
         ranked = _ROWS_FILE.made(path, content).candidates
         candidates = tuple(
             Candidate(load_pattern(folder / "candidates" / f"{rank}.json"), *msgspec.structs.astuple(each))
@@ -184,15 +182,15 @@ class AttackResult:
 
 
 class _Ranked(msgspec.Struct, array_like=True, frozen=True):
-    """A candidate without its pattern, as a list; results of earlier versions lack the last fields."""
+    """A candidate without its pattern, as a list."""
 
     group: str
     surrogate_shift: float | None
-    predicted_m: float | None = None
-    predicted_range_m: tuple[float, float] | None = None
-    driven: Effect | None = None
-    predicted_mps: float | None = None
-    predicted_range_mps: tuple[float, float] | None = None
+    predicted_m: float | None
+    predicted_range_m: tuple[float, float] | None
+    driven: Effect | None
+    predicted_mps: float | None
+    predicted_range_mps: tuple[float, float] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,14 +206,6 @@ def _rounded(history: Float[np.ndarray, "i g r"]) -> Float[np.ndarray, "i g r"]:
 
 def _method(stated: dict[str, Any]) -> Method:
     return method_of(str(stated.get("method", "")), **{name: stated[name] for name in stated if name != "method"})
-
-
-def _of_first_format(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The method of a result in the first format, from the schedule and the number of restarts that stood there."""
-    schedule: dict[str, Any] = content["schedule"] if isinstance(content.get("schedule"), dict) else {}
-    halving = bool(schedule.get("heats"))
-    stated = {"iterations": schedule.get("iterations"), "restarts": content.get("restarts"), "halving": halving}
-    return {"method": GradOpt.word} | stated
 
 
 RESULT_FILE = RecordFile(

@@ -93,8 +93,7 @@ class Calibrated:
         path = run / "calibration" / "report.json"
         content = CalibrationReport.FILE.content(path)
         report = CalibrationReport.FILE.made(path, content)
-        made_of = content.get("made_of") or {"method": report.method}
-        return Calibrated(load_recordings(run / "recordings"), report, made_of)
+        return Calibrated(load_recordings(run / "recordings"), report, content.get("made_of", {}))
 
     @staticmethod
     def kept(run: Path, drives: Drives, method: Method) -> Calibrated | None:

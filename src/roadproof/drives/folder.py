@@ -287,6 +287,5 @@ _DRIVE = RecordFile(
     error=RecordingError,
     remedy="remove its folder and record it again",
     elsewhere=("name", "episode"),
-    renamed={"push": "side"},
     header="about",
 )

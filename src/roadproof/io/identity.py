@@ -16,7 +16,7 @@ ANSWERS = "answers"
 """The part that says how the controller answered (`controllers.identity`), whatever it is called."""
 
 CONTROLLER = "controller_digest"
-"""The part that says which controller it was: its weights, settings, source and all answers; younger than `ANSWERS`."""
+"""The part that says which controller it was: its weights, settings, source and all answers."""
 
 _ANOTHER = {
     ANSWERS: "which answers otherwise, as before a training",
@@ -49,27 +49,27 @@ def require_same(
     Args:
         folder: the folder in which something was begun.
         what: what the folder holds, for the message, such as "a run".
-        before: the parts that were kept there, as JSON has them; None where the file is older than such parts. A part
-            of `now` that is not among them is not compared: the folder is older than that part's name.
+        before: the parts that were kept there, as JSON has them.
         now: the parts of what is to be done in the folder.
         error: the type of error to raise.
 
     Raises:
-        error: the file might have said what it was made of and does not, or a part differs; the message names the
-            first, with what it was and what it is.
+        error: a part of `now` was not kept there or differs; the message names the first, with what it was and what
+            it is.
     """
-    if before == {}:
-        raise error(f"{folder} holds {what} that does not say what it was made of; choose another folder, or remove it")
     known = cast("dict[str, object]", before) if isinstance(before, dict) else {}
     for part, value in cast("dict[str, object]", json.loads(json.dumps(now, default=str))).items():
-        if part not in known or known[part] == value:
+        if part in known and known[part] == value:
             continue
-        if part in _ANOTHER:
-            raise error(
-                f"{folder} holds {what} of another controller, {_ANOTHER[part]}; choose another folder, or remove it"
-            )
-        name, was, now_is = _first_difference(part, known[part], value)
-        raise error(f"{folder} holds {what} with {name} {was}, now it is {now_is}; choose another folder, or remove it")
+        if not known:
+            differs = "that does not say what it was made of"
+        elif part not in known:
+            differs = f"that does not say its {'controller' if part in _ANOTHER else part}"
+        elif part in _ANOTHER:
+            differs = f"of another controller, {_ANOTHER[part]}"
+        else:
+            differs = "with {} {}, now it is {}".format(*_first_difference(part, known[part], value))
+        raise error(f"{folder} holds {what} {differs}; choose another folder, or remove it")
 
 
 def _first_difference(name: str, before: object, now: object) -> tuple[str, str, str]:

@@ -61,7 +61,6 @@ class RecordFile(Generic[T]):
         remedy: what the user can do where a file is missing or damaged.
         elsewhere: names of fields that are not in this file; `read` takes their values by name.
         forms: the forms of fields that the file has otherwise than the dataclass, by the field's name.
-        renamed: today's names of fields, by the names that older files have for them, at any depth.
         notes: what the file says besides the fields, for people, such as units.
         header: name of an archive's JSON header; None where all its fields are arrays and numbers.
         most_bytes: how many bytes an archive may unpack to, and JSON may have (`MOST_TEXT_BYTES` at most).
@@ -75,7 +74,6 @@ class RecordFile(Generic[T]):
     remedy: str
     elsewhere: tuple[str, ...] = ()
     forms: Mapping[str, Form] = field(default_factory=dict[str, Form])
-    renamed: Mapping[str, str] = field(default_factory=dict[str, str])
     notes: Mapping[str, object] = field(default_factory=dict[str, object])
     header: str | None = HEADER
     most_bytes: int = MOST_BYTES
@@ -135,10 +133,9 @@ class RecordFile(Generic[T]):
             error: the file is missing, damaged, of another format or a newer version.
         """
         if path.suffix == ".json":
-            content = read_json(
+            return read_json(
                 path, self.name, self.version, self.error, most_bytes=min(self.most_bytes, MOST_TEXT_BYTES)
             )
-            return _renamed(content, self.renamed)
         stated, arrays = read_record(
             path,
             self._members(path),
@@ -148,7 +145,7 @@ class RecordFile(Generic[T]):
             format_version=(self.name, self.version) if self.name else None,
             most_bytes=self.most_bytes,
         )
-        return _renamed(stated, self.renamed) | arrays
+        return stated | arrays
 
     def made(self, path: Path, content: Mapping[str, Any], **elsewhere: object) -> T:
         """The record in what `content` read from a file; `path`, `elsewhere` and the errors are those of `read`."""
@@ -228,15 +225,6 @@ def check_arrays(
             raise error(f"{name} {of} has shape {values.shape}, expected {shape}")
         if not np.isfinite(values).all():
             raise error(f"{name} {of} has NaN or infinite values")
-
-
-def _renamed(stored: Any, renamed: Mapping[str, str]) -> Any:  # noqa: ANN401
-    if not renamed or not isinstance(stored, (dict, list)):
-        return stored
-    if isinstance(stored, list):
-        return [_renamed(each, renamed) for each in cast("list[object]", stored)]
-    content = cast("dict[str, Any]", stored)
-    return {renamed.get(name, name): _renamed(each, renamed) for name, each in content.items()}
 
 
 def _is_array(kind: object) -> bool:

@@ -34,7 +34,7 @@ class Prediction(Saved):
         least_mps: lowest predicted change over those errors, m/s.
         most_mps: highest predicted change over those errors, m/s.
         driven_mps: mean change of the speed of the drive in the simulator, m/s.
-        made_of: digest of the pattern, drives, recordings and controller; empty where nobody said, or in older files.
+        made_of: digest of the pattern, drives, recordings and controller; empty where nobody said.
         path_error_m: mean distance between predicted and driven positions at the same instants, metres.
         gap_m: largest distance of the predicted path across the heading from the recorded poses shown, metres.
         gap_rad: largest difference of heading from the recorded poses shown, radians.

@@ -76,7 +76,7 @@ class Selection:
         simulator_calls: number of drives, the clean one included if it was made for this; 0 if they are predicted.
         predicted: whether the drives are predicted, and nothing was driven for real.
         chosen_by: what the drives were compared by, "path deviation" in metres or "speed change" in m/s.
-        made_of: identity of the selection, by name (`io.identity`); empty in files of earlier versions.
+        made_of: identity of the selection, by name (`io.identity`).
 
     Raises:
         RoadproofError: `chosen` is not an index of the candidates, or `chosen_by` is another word.
@@ -198,10 +198,7 @@ def select_by_driving(
     }
     if (folder / "selection.json").exists():
         kept = Selection.load(folder)
-        # Names of drives hash the other parts; alone they tell what a choice older than its parts was made of.
-        before = kept.made_of or {"drives": [each.trial.painted for each in kept.driven]}
-        told = {name: value for name, value in made_of.items() if name != "drives" or not kept.made_of}
-        require_same(folder, "a choice", before, told, RoadproofError)
+        require_same(folder, "a choice", kept.made_of, made_of, RoadproofError)
         return kept
     calls = int(clean is None)
     if clean is not None and not episodes.has(bare):

@@ -5,18 +5,16 @@ RUN/run.json   whose run it is, and the cost of every stage since it began
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from roadproof.errors import RoadproofError
-from roadproof.io.identity import ANSWERS, require_same
+from roadproof.io.identity import require_same
 from roadproof.io.records import RecordFile, plain
-from roadproof.simulators.protocol import PaintKind
 
 FILE = "run.json"
 _EVERY_S = 1.0
@@ -37,24 +35,10 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """The content of run.json; earlier versions have an identity as text and the controller's answers."""
+    """The content of run.json."""
 
     cost: dict[str, StageCost]
-    made_of: dict[str, Any] = field(default_factory=dict[str, Any])
-    identity: str = ""
-    controller: str | None = None
-    paint: str = PaintKind.RENDERED
-
-    @property
-    def parts(self) -> dict[str, Any] | None:
-        if not self.identity:
-            return self.made_of or None
-        names = ("scenario", "budget", "space", "seed", "controller")
-        parts = dict(zip(names, json.loads(self.identity), strict=True)) | {"paint": self.paint}
-        return parts if self.controller is None else parts | {ANSWERS: self.controller}
-
-    def __post_init__(self) -> None:
-        _ = self.parts  # says whether they can be read
+    made_of: dict[str, Any]
 
 
 _FILE = RecordFile(kind=_Run, name="roadproof-run", error=RoadproofError, remedy="remove it, the stages stay")
@@ -82,7 +66,7 @@ class Ledger:
             self._write()
             return
         before = _FILE.read(self._path)
-        require_same(folder, what, before.parts, self._made_of, RoadproofError)
+        require_same(folder, what, before.made_of, self._made_of, RoadproofError)
         self.cost |= before.cost
 
     @contextmanager
@@ -112,8 +96,7 @@ class Ledger:
         self._write()
 
     def _write(self) -> None:
-        paint = str(self._made_of.get("paint", PaintKind.RENDERED))
-        _FILE.write(self._path, _Run(self.cost, self._made_of, paint=paint))
+        _FILE.write(self._path, _Run(self.cost, self._made_of))
 
 
 def read_cost(folder: Path) -> dict[str, StageCost]:

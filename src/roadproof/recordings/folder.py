@@ -102,7 +102,6 @@ _MANIFEST = RecordFile(
         "colour": Form(dict[str, Any], ColourTransform.to_dict, ColourTransform.from_dict),
         "canvas": Form(dict[str, float] | None, lambda canvas: canvas, _canvas),
     },
-    renamed={"push": "side"},
     notes={"units": _UNITS},
 )
 _PER_FRAME = RecordFile(

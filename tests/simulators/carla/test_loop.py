@@ -188,6 +188,6 @@ def test_the_same_pattern_makes_the_controller_deviate_as_much_as_in_the_town(si
 @pytest.mark.slow
 def test_every_result_says_how_paint_was_put_on_the_road(sides):
     for side, paint in zip(sides, (PaintKind.RENDERED, PaintKind.INJECT), strict=True):
-        assert json.loads((side.folder / "run.json").read_text())["paint"] == paint
+        assert json.loads((side.folder / "run.json").read_text())["made_of"]["paint"] == paint
         assert Evaluation.load(side.folder / "evaluation").paint is paint
         assert {side.clean.paint, side.painted.paint} == {paint}
