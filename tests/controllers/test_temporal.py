@@ -22,7 +22,7 @@ from roadproof.controllers.history import TICK_S, kept_after
 from roadproof.controllers.identity import identity_of
 from roadproof.controllers.temporal import NOTES, WINDOW
 from roadproof.datatypes import Command, Observation, VehicleState
-from roadproof.driving.rollout import _remembering
+from roadproof.driving.rollout import _acting
 from roadproof.errors import ControllerError
 
 
@@ -194,7 +194,7 @@ def seen(time_s, value):
 
 
 def test_each_drive_begins_without_a_memory():
-    policies = [_remembering(three(0.05)) for _ in range(2)]
+    policies = [_acting(three(0.05)) for _ in range(2)]
     values = [0.0, 0.2, 0.4]
     steer = [[policy(seen(0.05 * k, value)).steer for k, value in enumerate(values)] for policy in policies]
     assert steer[0] == steer[1]

@@ -120,6 +120,24 @@ def act_after_of(
     return Control(*map(float, controls[0])), after
 
 
+def next_act_of(
+    controller: Controller,
+    memory: object,
+    frame: UInt8[np.ndarray, "h w 3"],
+    speed_mps: float,
+    command: int,
+    elapsed_s: float,
+) -> tuple[Control, object]:
+    """What a controller of any kind does for one frame, as plain numbers, and what it remembers.
+
+    Raises:
+        ControllerError: the controller raises, or answers wrongly.
+    """
+    if isinstance(controller, TemporalController):
+        return act_after_of(controller, memory, frame, speed_mps, command, elapsed_s)
+    return act_of(controller, frame, speed_mps, command), None
+
+
 def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
     """What `Controller.act` answers for one frame, as plain numbers.
 

@@ -12,8 +12,8 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import UInt8
 
-from roadproof.controllers.asking import act_after_of, act_of, frame_size_of
-from roadproof.controllers.protocol import Controller, TemporalController
+from roadproof.controllers.asking import frame_size_of, next_act_of
+from roadproof.controllers.protocol import Controller
 from roadproof.datatypes import Command, Control
 from roadproof.errors import ControllerError
 from roadproof.io.identity import digest, stated
@@ -43,10 +43,7 @@ def answers_of(controller: Controller, size: tuple[int, int]) -> Answers:
     memory: object = None
     for elapsed_s in _ELAPSED_S:
         seen = (_picture(rng, size), 6.0, 2)
-        if isinstance(controller, TemporalController):
-            control, memory = act_after_of(controller, memory, *seen, elapsed_s)
-        else:
-            control = act_of(controller, *seen)
+        control, memory = next_act_of(controller, memory, *seen, elapsed_s)
         answers.append(_rounded(control))
     return answers
 
@@ -103,11 +100,7 @@ def _answers_to_all(controller: Controller, size: tuple[int, int]) -> list[tuple
     for command, speed_mps in product(Command, _SPEEDS_MPS):
         seen = (_picture(rng, frame_size_of(controller) or size), speed_mps, int(command))
         try:
-            if isinstance(controller, TemporalController):
-                control, _ = act_after_of(controller, None, *seen, 0.0)
-            else:
-                control = act_of(controller, *seen)
-            answers.append(_rounded(control))
+            answers.append(_rounded(next_act_of(controller, None, *seen, 0.0)[0]))
         except ControllerError:
             answers.append(None)
     return answers

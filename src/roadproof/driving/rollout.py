@@ -14,8 +14,8 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from roadproof.controllers import Controller, TemporalController
-from roadproof.controllers.asking import act_after_of, act_of, frame_size_of
+from roadproof.controllers import Controller
+from roadproof.controllers.asking import frame_size_of, next_act_of
 from roadproof.datatypes import Control, Ending, Observation, Weather
 from roadproof.driving.episode import GIVEN, SEEN, Episode
 from roadproof.errors import ControllerError
@@ -180,14 +180,10 @@ def drive_again(
 
 def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:
     """The policy of a driver for a drive that has just begun."""
-    if not isinstance(driver, Controller):
-        return driver(simulator)
-    if isinstance(driver, TemporalController):
-        return _remembering(driver)
-    return lambda seen: act_of(driver, seen.frame, seen.state.speed_mps, int(seen.command))
+    return _acting(driver) if isinstance(driver, Controller) else driver(simulator)
 
 
-def _remembering(controller: TemporalController) -> Policy:
+def _acting(controller: Controller) -> Policy:
     """The policy of one drive, which carries on what the controller remembers of it."""
     memory: object = None
     before_s: float | None = None
@@ -196,7 +192,7 @@ def _remembering(controller: TemporalController) -> Policy:
         nonlocal memory, before_s
         elapsed_s = 0.0 if before_s is None else seen.time_s - before_s
         asked = (seen.frame, seen.state.speed_mps, int(seen.command), elapsed_s)
-        control, memory = act_after_of(controller, memory, *asked)
+        control, memory = next_act_of(controller, memory, *asked)
         before_s = seen.time_s
         return control
 
