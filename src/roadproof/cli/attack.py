@@ -11,7 +11,7 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import answer, say, stored
-from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.paint import Paint
 from roadproof.cli.verbs import begin, keep_command
 from roadproof.limits import MANY
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from roadproof.recordings import RecordingSet
 
 
-@with_paint
 def attack(
     recordings: Annotated[Path, argument("Folder with a set of recorded drives.")],
     controller: options.ControllerSpec,

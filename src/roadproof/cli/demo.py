@@ -12,14 +12,13 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import number
 from roadproof.cli.output import answer, say, stored
-from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.paint import Paint
 from roadproof.cli.verbs import begin, keep_command
 
 if TYPE_CHECKING:
     from roadproof.pipeline.stress_test import StressTest
 
 
-@with_paint
 def demo(
     scenario: options.ScenarioName = "left-03",
     scenarios: options.ScenarioFile = None,

@@ -11,7 +11,7 @@ import typer
 from roadproof.cli import options
 from roadproof.cli.options import argument, choice, number, unset
 from roadproof.cli.output import answer, say, stored
-from roadproof.cli.paint import Paint, with_paint
+from roadproof.cli.paint import Paint
 from roadproof.cli.verbs import begin
 from roadproof.errors import RoadproofError
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from roadproof.scenarios import Scenario
 
 
-@with_paint
 def harden(
     controller: Annotated[str, argument(f"A torch.nn.Module: {options.CONTROLLERS}")],
     train_on: Annotated[str, unset("Scenarios to train on, with commas between.")],

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -38,7 +36,7 @@ def _grouped(option: Any) -> Any:  # noqa: ANN401
     return option
 
 
-_OPTIONS: dict[str, Any] = {
+OPTIONS: dict[str, Any] = {
     "max_area": Annotated[float | None, _grouped(number("Largest area of paint, m².", 0.01, 10_000.0, default=False))],
     "colours": Annotated[str | None, _grouped(unset("The only paints there are, as #dededa, with commas between."))],
     "printable": Annotated[bool, _grouped(typer.Option("--printable", help="Only colours that offset print can mix."))],
@@ -56,38 +54,20 @@ _OPTIONS: dict[str, Any] = {
         Path | None, _grouped(unset("TOML file with the same in tables named paint and variation; options win."))
     ],
 }
+"""The options that `verb` gives a function with a parameter `paint`, by name, with their annotations."""
+
 _FIELDS = {"max_area": "max_area_m2", "keep_out": "keep_out_m"}
 """The fields of `PaintLimits` that are not called as their options are."""
 
 
-def with_paint(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a verb the options on paint; it takes them as one argument, `paint`, of type `Paint`."""
-    signature = inspect.signature(command)
-    own = {name: hint for name, hint in get_type_hints(command, include_extras=True).items() if name != "paint"}
-    plain = [each for name, each in signature.parameters.items() if name != "paint"]
-    added = [
-        inspect.Parameter(
-            name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=False if name in ("printable", "robust") else None,
-            annotation=hint,
-        )
-        for name, hint in _OPTIONS.items()
-    ]
-
-    @wraps(command)
-    def called(**values: Any) -> None:  # noqa: ANN401
-        asked = {name: values.pop(name) for name in _OPTIONS}
-        command(**values, paint=_paint(asked))
-
-    keyword = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=own[each.name]) for each in plain]
-    called.__signature__ = signature.replace(parameters=[*keyword, *added])  # type: ignore[attr-defined]
-    called.__annotations__ = own | _OPTIONS
-    return called
+def with_paint(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a verb was given, with what the options on paint say as one argument, `paint`."""
+    own = {name: value for name, value in given.items() if name not in OPTIONS}
+    return own | {"paint": _paint({name: given[name] for name in OPTIONS})}
 
 
 def _paint(asked: Mapping[str, Any]) -> Paint:
-    """The limits and the variation of the options, by their names in `_OPTIONS`, and of the file."""
+    """The limits and the variation of the options, by their names in `OPTIONS`, and of the file."""
     given = {name: value for name, value in asked.items() if value is not None and value is not False}
     if not given:
         # Torch takes seconds to import; commands without limits read their other options first.

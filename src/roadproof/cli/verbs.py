@@ -1,4 +1,4 @@
-"""What verbs can be told besides: how loud they are, to print JSON, and to say only what they would take."""
+"""What verbs can be told besides: how loud they are, to print JSON, to only estimate; and the options on paint."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
 from roadproof.cli.group import words_given
 from roadproof.cli.output import answer, in_json, say
+from roadproof.cli.paint import OPTIONS, with_paint
 from roadproof.cli.progress import Loudness, in_words, is_quiet, speak, tell
 from roadproof.errors import RoadproofError
 from roadproof.io.commands import write_command
@@ -41,7 +42,7 @@ _dry_run = False  # one command a process
 def verb(
     function: Callable[..., None], *, works: bool = True, estimates: bool = False, answers: bool = True
 ) -> Callable[..., None]:
-    """A verb with the options that its kind of work asks for.
+    """A verb with the options that its kind of work asks for; those on paint come where it takes `paint`.
 
     Args:
         function: the function that does the verb's work.
@@ -49,6 +50,8 @@ def verb(
         estimates: whether the verb calls `begin`, and so takes --dry-run.
         answers: whether the verb calls `answer`, and so takes --json.
     """
+    own = inspect.signature(function)
+    searches = "paint" in own.parameters
 
     @functools.wraps(function)
     def called(
@@ -68,18 +71,23 @@ def verb(
         _dry_run = dry_run
         try:
             with in_json() if json else nullcontext():
-                function(**given)
+                function(**(with_paint(given) if searches else given))
         finally:
             _dry_run = False
             speak(Loudness.USUAL)
 
-    more: dict[str, Any] = {"quiet": _Quiet, "verbose": _Verbose} if works else {}
+    more = dict(OPTIONS) if searches else {}
+    more |= {"quiet": _Quiet, "verbose": _Verbose} if works else {}
     more |= ({"dry_run": _DryRun} if estimates else {}) | ({"json": _Json} if answers else {})
     hints = get_type_hints(function, include_extras=True) | more
-    own = inspect.signature(function)
-    parameters = [each.replace(annotation=hints[name]) for name, each in own.parameters.items()]
+    parameters = [each.replace(annotation=hints[name]) for name, each in own.parameters.items() if name not in more]
     parameters += [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=False if get_args(kind)[0] is bool else None,
+            annotation=kind,
+        )
         for name, kind in more.items()
     ]
     called.__annotations__ = hints
