@@ -57,7 +57,7 @@ def test_a_search_for_the_speed_beats_chance_and_says_how_much_in_metres_a_secon
     assert (whole.history[-1] >= whole.history[0] - 1e-3).all()
     assert list(whole.by_group) == ["slower", "faster"]
     assert (whole.objective, whole.predicted_m, whole.predicted_range_m) == ("speed change", None, None)
-    assert whole.predicted[0] == f"{abs(whole.predicted_mps):.2f} m/s {whole.group}"
+    assert whole.predicted == f"{abs(whole.predicted_mps):.2f} m/s {whole.group}"
     assert (whole.predicted_mps < 0) == (whole.group == "slower")
     ranges = [(each.group, *each.predicted_range_mps) for each in whole.candidates]
     assert all(low <= each.predicted_mps <= high for each, (_, low, high) in zip(whole.candidates, ranges, strict=True))

@@ -75,16 +75,14 @@ class Candidate:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class AttackResult:
-    """The pattern an attack found, and how it was found.
+class AttackResult(Candidate):
+    """The pattern an attack found, which is that of its first candidate, and how it was found.
 
     On recordings its numbers come from composited frames: the *surrogate*'s of single recorded ones, *predicted* ones
     of drives in the recorded world. What the car does is for driving to say. In a simulator they are *driven*, in the
     drives that chose the pattern: other drives have to report it.
 
     Args:
-        pattern: the strongest pattern, that of the first candidate, whose are also group, surrogate_shift, predicted_m,
-            predicted_range_m, predicted_mps, predicted_range_mps and driven; see `Candidate`.
         objective: what was made large: "steering shift", "path deviation", "speed change", or the name of the user's
             own.
         by_group: best value of every group, in the objective's unit: steer units per frame, metres, or m/s; for the
@@ -100,12 +98,10 @@ class AttackResult:
         method: the search method.
         seed: seed of everything random.
         conspicuousness: how conspicuous the strongest pattern is on this road.
-        made_of: identity of the search, by name (`io.identity`); empty in a simulator.
+        made_of: identity of the search, by name (`io.identity`); empty in a simulator. The others are those of
+            `Candidate`.
     """
 
-    pattern: Pattern
-    group: str
-    surrogate_shift: float | None
     by_group: dict[str, float]
     candidates: tuple[Candidate, ...]
     history: Float[np.ndarray, "i g r"]
@@ -115,11 +111,6 @@ class AttackResult:
     method: Method
     seed: int
     objective: str = "steering shift"
-    predicted_m: float | None = None
-    predicted_range_m: tuple[float, float] | None = None
-    predicted_mps: float | None = None
-    predicted_range_mps: tuple[float, float] | None = None
-    driven: Effect | None = None
     conspicuousness: Conspicuousness | None = None
     made_of: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
@@ -128,7 +119,7 @@ class AttackResult:
         known = (
             ("made large", f"{self.objective}, for {self.group}, by {self.method.word}"),
             ("surrogate", None if self.surrogate_shift is None else f"{self.surrogate_shift:+.3f} steer a frame"),
-            ("predicted", self.predicted and "{} ({})".format(*self.predicted)),
+            ("predicted", (told := self.predicted_with_spread) and "{} ({})".format(*told)),
             ("driven, to choose it", self.driven and f"{self.driven.deviation:.2f} m of deviation"),
             ("took", f"{self.cost.seconds:.0f} s, {self.cost.simulator_calls} simulator calls"),
             *(("look at", f"{each.name}: {each.finding}") for each in self.checks if not each.passed),
@@ -137,15 +128,15 @@ class AttackResult:
         return shown + table(("attack", ""), [(name, value) for name, value in known if value])
 
     @property
-    def predicted(self) -> tuple[str, str] | None:
-        """What is predicted, in words with its unit, and its spread; None if nothing was driven in recordings."""
+    def predicted_with_spread(self) -> tuple[str, str] | None:
+        """What is predicted and its spread, in words with units; None if nothing was driven in recordings."""
+        if self.predicted is None:
+            return None
         if self.predicted_mps is not None:
             spread = self.predicted_range_mps or (self.predicted_mps, self.predicted_mps)
-            return speed_in_words(self.predicted_mps), speeds_in_words(*spread)
-        if self.predicted_m is None:
-            return None
+            return self.predicted, speeds_in_words(*spread)
         low, high = self.predicted_range_m or (self.predicted_m, self.predicted_m)
-        return f"{self.predicted_m:.2f} m of deviation", f"{low:.2f} to {high:.2f}"
+        return f"{self.predicted} of deviation", f"{low:.2f} to {high:.2f}"
 
     def save(self, folder: AnyPath) -> None:
         """Write pattern.json, pattern.png, candidates/ and result.json.

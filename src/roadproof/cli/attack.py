@@ -199,9 +199,9 @@ def _summarise(result: AttackResult, out: Path) -> None:
 
     sides = ", ".join(f"{name} {value:+.3f}" for name, value in result.by_group.items())
     shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
-    if result.predicted is not None:
+    if (predicted := result.predicted_with_spread) is not None:
         looks = " and variations" if result.objective.endswith("variations") else ""
-        mean, spread = result.predicted
+        mean, spread = predicted
         shift = f"{mean} predicted ({spread} over small errors{looks}), nothing was driven for real; {shift}"
     say(
         f"Strongest for {result.group}: {shift}",
