@@ -13,12 +13,13 @@ from roadproof.cli import options
 from roadproof.cli.options import argument, number, unset
 from roadproof.cli.output import answer, say, stored, table
 from roadproof.cli.verbs import begin, keep_command
-from roadproof.cli.worlds import Recorded, open_world, world_asked
+from roadproof.cli.worlds import world_asked
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.limits import MAX_CROWD
 
 if TYPE_CHECKING:
     from roadproof.datatypes import Weather
+    from roadproof.drives.worlds import Recorded
     from roadproof.driving.evaluation import Evaluation
     from roadproof.patterns import Pattern
     from roadproof.pipeline.fidelity import Fidelity
@@ -73,6 +74,7 @@ def evaluate(
     """Drive over a pattern, alone and in traffic, and say how bad it is."""
     from roadproof.cli.progress import stages
     from roadproof.controllers import Controller
+    from roadproof.drives.worlds import open_world
     from roadproof.driving.evaluate import PAPER_WEATHERS, random_patterns
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from roadproof.simulators.loading import MappedSimulator
 
 Word = TypeVar("Word", bound=str)
-RECORDED = "recorded:"
 
 
 def number(
@@ -89,7 +88,7 @@ def _simulator(spec: str) -> str:
 
 def _world(spec: str) -> str:
     """What `--simulator` names where that may also be recordings."""
-    return spec if spec.startswith(RECORDED) else _simulator(spec)
+    return spec if spec.startswith("recorded:") else _simulator(spec)
 
 
 def _device(device: str) -> str:

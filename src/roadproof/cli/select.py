@@ -9,7 +9,6 @@ from roadproof.cli import options
 from roadproof.cli.options import argument, number
 from roadproof.cli.output import answer, say, stored
 from roadproof.cli.verbs import keep_command
-from roadproof.cli.worlds import open_world, recorded_in
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult, Candidate
@@ -31,6 +30,7 @@ def select(
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.drives.folder import read_settings
+    from roadproof.drives.worlds import open_world, recorded_in
     from roadproof.errors import RoadproofError
     from roadproof.io.locks import hold
     from roadproof.patterns import save_pattern

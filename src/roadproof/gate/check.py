@@ -26,6 +26,7 @@ from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
+from roadproof.drives.worlds import begun_in
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.starts import NOMINAL
 from roadproof.errors import CheckError
@@ -139,7 +140,7 @@ class _Run:
             size = (world.input.height_px, world.input.width_px)
             fresh = plan.budget == "full"
             require_usable(self.controller, size=size, device=self.device, gradients=fresh)
-            scenario = place.begun_in(world)
+            scenario = begun_in(world, place.scenario)
             site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
             paints = known_paints(plan, scenario, site, self.folder / "patterns" / scenario.name)
             if fresh:
@@ -229,7 +230,7 @@ class _Run:
         (drives / FILM).unlink(missing_ok=True)
         paint = read_paint(Path(worst.paint))
         with place.factory() as world:
-            start = worst.start.of(place.begun_in(world))
+            start = worst.start.of(begun_in(world, place.scenario))
             film_drives(world, start, (worst.clean, worst.painted), paint, drives)
         write_worst(drives / STRIP, self.folder / WORST)
         return case

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
 
 from roadproof.datatypes import Weather
+from roadproof.drives.worlds import RECORDED, open_world
 from roadproof.gate.plan import CheckPlan
-from roadproof.recorded.simulator import RecordedSimulator
-from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
-from roadproof.simulators.loading import open_simulator
-from roadproof.simulators.protocol import Simulator, SimulatorFactory
+from roadproof.simulators.protocol import SimulatorFactory
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,11 +30,6 @@ class Place:
     factory: SimulatorFactory
     where: str
 
-    def begun_in(self, world: Simulator) -> Scenario:
-        """The scenario as it is driven: in recordings it begins where they do."""
-        recorded = isinstance(world, RecordedSimulator)
-        return replace(self.scenario, start=world.scenario.start) if recorded else self.scenario
-
 
 def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
     """The places of a check, in the order of its plan.
@@ -45,26 +38,17 @@ def places_of(plan: CheckPlan, device: str) -> tuple[Place, ...]:
         plan: the plan of the check.
         device: the torch device on which recorded worlds make their pictures.
     """
+
+    def place(scenario: Scenario, weathers: tuple[Weather, ...], where: str) -> Place:
+        return Place(scenario=scenario, weathers=weathers, factory=partial(open_world, where, device), where=where)
+
     if plan.budget == "full":
-        factory = partial(open_simulator, plan.simulator)
-        return tuple(
-            Place(scenario=each, weathers=plan.weathers, factory=factory, where=plan.simulator)
-            for each in plan.scenarios
-        )
+        return tuple(place(each, plan.weathers, plan.simulator) for each in plan.scenarios)
     return tuple(
-        Place(
-            scenario=each,
-            weathers=(weather,),
-            factory=partial(_in_recordings, plan.recordings[each.name, weather], weather, device),
-            where=f"recorded:{plan.recordings[each.name, weather]}",
-        )
+        place(each, (weather,), f"{RECORDED}{plan.recordings[each.name, weather]}")
         for each in plan.scenarios
         for weather in plan.weathers
     )
-
-
-def _in_recordings(run: Path, weather: Weather, device: str) -> RecordedSimulator:
-    return RecordedSimulator(load_recordings(run / "recordings"), weather=weather, device=device)
 
 
 def command_of(plan: CheckPlan, place: Place, weather: Weather, pattern: str, seed: int, out: Path) -> str:
