@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.checks import (
     Check,
     check_bounds,
@@ -32,7 +33,6 @@ from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, Ste
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
-from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
 from roadproof.errors import ControllerError, RoadproofError
@@ -115,7 +115,7 @@ def attack(
         on_step=on_step,
     )
     frames = measure.frames_evaluated
-    if search.gave_way and isinstance(measure, Surrogate | ClosedLoopMeasure):
+    if search.gave_way and isinstance(measure, BatchedMeasure):
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
     told, groups = groups, measure.groups
     candidates = _candidates(measure, search, space, groups)

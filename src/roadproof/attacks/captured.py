@@ -16,10 +16,9 @@ from typing import TypedDict, Unpack
 
 import torch
 
-from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.attacks.step import State, corrected, require_finite_step, stepped
-from roadproof.attacks.surrogate import Surrogate
 from roadproof.errors import RoadproofError
 from roadproof.foreign import in_one_line
 from roadproof.search_space import SearchSpace
@@ -122,7 +121,7 @@ def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Step
     """The steps of a rung as a `Replay`; why there is none, in words; None where there is no need, as on a CPU."""
     if measure.device.type not in RECORDERS or int(steps["state"]["done"]) >= steps["iterations"]:
         return None
-    same = measure.replayable() if isinstance(measure, Surrogate | ClosedLoopMeasure) else None
+    same = measure.replayable() if isinstance(measure, BatchedMeasure) else None
     if same is None:
         return "their operations differ from step to step"
     try:

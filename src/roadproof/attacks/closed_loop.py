@@ -9,8 +9,8 @@ positive in the group's direction.
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from abc import abstractmethod
+from collections.abc import Sequence
 from threading import Lock
 from typing import TypedDict, Unpack
 
@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import Group, Points, Values, to_side
 from roadproof.attacks.surrogate import FIXED, Surrogate
 from roadproof.compositing.variation import Looks, Variation
@@ -52,7 +53,7 @@ class Rolling(TypedDict, total=False):
     variation: Variation | None
 
 
-class ClosedLoopMeasure(ABC):
+class ClosedLoopMeasure(BatchedMeasure):
     """What patterns do to the drive in a recorded world, for every group at once.
 
     Args:
@@ -115,11 +116,7 @@ class ClosedLoopMeasure(ABC):
         return part
 
     def replayable(self) -> ClosedLoopMeasure | None:
-        """The measure with the same operations on tensors of the same shapes in every step; None with a variation.
-
-        It paints densely, and does not look whether poses and answers are finite: whoever asks it for values has to.
-        Its frames are counted from nought.
-        """
+        """The measure with the same operations in every step, as `BatchedMeasure` says; None with a variation."""
         if self.variation is not None:
             return None
         same = copy.copy(self)
@@ -134,28 +131,14 @@ class ClosedLoopMeasure(ABC):
             # Not cleared: a copy of this measure may have these drives with looks of its own.
             self._bare = {}
 
-    def values(self, space: SearchSpace, unit: Points) -> Values:
-        """Mean towards each group's direction, at R points per group, without gradients."""
-        with torch.no_grad():
-            return torch.cat([self._values(space, part) for part in self._parts(unit)], 1)
+    def slope(self, gradient: Points) -> Points:
+        """The gradient of each point, scaled to unit length.
 
-    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
-        """Mean towards each group's direction and its gradient at R points a group of a search space.
-
-        The gradient of each point is scaled to unit length: a closed loop amplifies, and by how much says nothing about
-        how far a step should go.
+        A closed loop amplifies, and by how much says nothing about how far a step should go.
         """
-        values: list[Tensor] = []
-        gradients: list[Tensor] = []
-        for part in self._parts(unit):
-            leaf = part.detach().requires_grad_()
-            value = self._values(space, leaf)
-            (gradient,) = torch.autograd.grad(value.sum(), leaf)
-            flat = gradient.flatten(2)
-            length = flat.square().sum(2, keepdim=True).sqrt().clamp_min(1e-12)
-            values.append(value.detach())
-            gradients.append((flat / length).view_as(gradient))
-        return torch.cat(values, 1), torch.cat(gradients, 1)
+        flat = gradient.flatten(2)
+        length = flat.square().sum(2, keepdim=True).sqrt().clamp_min(1e-12)
+        return (flat / length).view_as(gradient)
 
     def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, Float[Tensor, "g r s"]]:
         """Steering shift on the recorded frames, and what is predicted with small errors.
@@ -187,12 +170,13 @@ class ClosedLoopMeasure(ABC):
         """What tells this measure from others on the same drives."""
         return self._starts, self.every
 
-    def _parts(self, unit: Points) -> Iterator[Float[Tensor, "g s k n"]]:
-        pictures = len(self.groups) * sum(self._pictures(world) for world in self.worlds)
-        at_once = max(1, MAX_PICTURES // pictures)
-        yield from unit.chunk(-(-unit.shape[1] // at_once), 1)
+    @property
+    def at_once(self) -> int:
+        """How many points of each group make no more than MAX_PICTURES pictures."""
+        return MAX_PICTURES // (len(self.groups) * sum(self._pictures(world) for world in self.worlds))
 
-    def _values(self, space: SearchSpace, unit: Points) -> Values:
+    def valued(self, space: SearchSpace, unit: Points) -> Values:
+        """Mean towards each group's direction, at R points per group, all at once and differentiable in the points."""
         patterns = space.pattern(unit.flatten(0, 1))
         each = [self.read(world, self.roll(world, patterns)) for world in self.worlds]
         read = torch.cat([part.view(*unit.shape[:2], -1) for part in each], -1)

@@ -23,14 +23,14 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.captured import Replay, in_words, replay_of
 from roadproof.attacks.checkpoint import Checkpoint
-from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.groups import Points, Values
 from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
-from roadproof.attacks.surrogate import FIXED, Surrogate
+from roadproof.attacks.surrogate import FIXED
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
@@ -185,7 +185,7 @@ def gradopt(
         measure.frames_evaluated += int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung = rungs[number]
-        if number > at and rung.groups_compete and isinstance(measure, Surrogate | ClosedLoopMeasure):
+        if number > at and rung.groups_compete and isinstance(measure, BatchedMeasure):
             state, behind = _without_those_behind(state, behind)
         climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
         beside = side_by_side(climbed)
@@ -203,7 +203,7 @@ def gradopt(
         replay = replay_of(climbed, space, iterations=rung.iterations, state=state, **adam)
         run["" if isinstance(replay, Replay) else replay] += rung.iterations - int(state["done"])
         while int(state["done"]) < rung.iterations:
-            if isinstance(climbed, Surrogate | ClosedLoopMeasure):
+            if isinstance(climbed, BatchedMeasure):
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
             state = replay.go_on() if isinstance(replay, Replay) else _step(beside, space, state, **adam)
             on_step(done + int(state["done"]), float(state["best"].max()))
@@ -215,7 +215,7 @@ def gradopt(
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
     best, last = state["best"], _of_groups(measure, behind)
-    if isinstance(last, Surrogate | ClosedLoopMeasure) and last.variation is not None:
+    if isinstance(last, BatchedMeasure) and last.variation is not None:
         # Every step had looks of its own; results are compared in the same ones.
         last.redraw(FIXED)
         best = last.values(space, state["best_unit"])
@@ -248,7 +248,7 @@ def _at(unit: Points, index: Int64[Tensor, "g i"]) -> Float[Tensor, "g i k n"]:
 def _of_groups(measure: RecordedMeasure, behind: Float[Tensor, " g"]) -> RecordedMeasure:
     """The measure of the groups that have not given way."""
     kept = cast("list[int]", behind.isnan().nonzero()[:, 0].tolist())
-    if len(kept) < len(behind) and isinstance(measure, Surrogate | ClosedLoopMeasure):
+    if len(kept) < len(behind) and isinstance(measure, BatchedMeasure):
         return measure.of_groups(kept)
     return measure
 

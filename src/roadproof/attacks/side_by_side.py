@@ -20,10 +20,9 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 
-from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.objective import RecordedMeasure
-from roadproof.attacks.surrogate import Surrogate
 from roadproof.controllers import Controller
 from roadproof.search_space import SearchSpace
 
@@ -36,7 +35,7 @@ def side_by_side(measure: RecordedMeasure) -> Beside | RecordedMeasure:
     A user's own code may not stand two calls at once, and a mean over new looks is drawn for all groups together: such
     measures stay as they are, and so does a measure on another device than the processor.
     """
-    if not isinstance(measure, Surrogate | ClosedLoopMeasure) or measure.variation is not None:
+    if not isinstance(measure, BatchedMeasure) or measure.variation is not None:
         return measure
     free = measure.device.type == "cpu" and torch.get_num_threads() > 1
     return Beside(measure) if free and _is_torch_alone(measure.controller) else measure
@@ -59,7 +58,7 @@ class Beside:
         whole: the measure. What is valued here counts among its `frames_evaluated`.
     """
 
-    def __init__(self, whole: Surrogate | ClosedLoopMeasure) -> None:
+    def __init__(self, whole: BatchedMeasure) -> None:
         self._whole = whole
         self._parts = [whole.of_groups([k]) for k in range(len(whole.groups))]
         if len(self._parts) == 1:
@@ -74,7 +73,7 @@ class Beside:
     def values(self, space: SearchSpace, unit: Points) -> Values:
         """The values of R points per group, without gradients."""
 
-        def valued(part: RecordedMeasure, points: Tensor) -> Tensor:
+        def valued(part: BatchedMeasure, points: Tensor) -> Tensor:
             return part.values(space, points)
 
         return self._joined(unit, self._each(valued, unit))
@@ -82,7 +81,7 @@ class Beside:
     def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """The values of R points per group, and their gradients."""
 
-        def climbed(part: RecordedMeasure, points: Tensor) -> tuple[Tensor, Tensor]:
+        def climbed(part: BatchedMeasure, points: Tensor) -> tuple[Tensor, Tensor]:
             return part.values_and_gradients(space, points)
 
         each = self._each(climbed, unit)
@@ -91,7 +90,7 @@ class Beside:
     def _joined(self, unit: Tensor, parts: Sequence[Tensor]) -> Tensor:
         return torch.cat(list(parts), 0 if len(unit) > 1 else 1)
 
-    def _each(self, function: Callable[[RecordedMeasure, Tensor], Result], unit: Tensor) -> list[Result]:
+    def _each(self, function: Callable[[BatchedMeasure, Tensor], Result], unit: Tensor) -> list[Result]:
         points = cast("tuple[Tensor, ...]", unit.split(1) if len(unit) > 1 else unit.tensor_split(2, 1))
         busy = [(part, some) for part, some in zip(self._parts, points, strict=True) if some.numel()]
         threads = torch.get_num_threads()

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import STEERED, Group, Points, Values, divergence, require_directions
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
@@ -34,7 +35,7 @@ MAX_FRAMES = 256
 """Frames the controller sees at once: bounds memory, and more make no CPU faster."""
 
 
-class Surrogate:
+class Surrogate(BatchedMeasure):
     """Divergence of patterns on a set of recordings, for every group at once, with gradients.
 
     Args:
@@ -107,11 +108,7 @@ class Surrogate:
         return part
 
     def replayable(self) -> Surrogate | None:
-        """The surrogate with the same operations on tensors of the same shapes in every step; None with a variation.
-
-        It paints densely, and does not look whether the controller's answers are finite: whoever asks it for values
-        has to. Its frames are counted from nought.
-        """
+        """The surrogate with the same operations in every step, as `BatchedMeasure` says; None with a variation."""
         if self.variation is not None:
             return None
         same = copy.copy(self)
@@ -175,22 +172,15 @@ class Surrogate:
             for part, clean, view in zip(parts, self._clean_looked, self.views, strict=True)
         ]
 
-    def values(self, space: SearchSpace, unit: Points) -> Values:
-        """δ per frame at points of a search space, without gradients, a bounded number of frames at a time."""
-        with torch.no_grad():
-            return torch.cat([self.divergences(_patterns(space, part)) for part in self._batches(unit)], 1)
+    def valued(self, space: SearchSpace, unit: Points) -> Values:
+        """δ per frame of R points per group, all at once and differentiable in the points."""
+        return self.divergences([space.pattern(points) for points in unit])
 
-    def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
-        """δ per frame and its gradient at R points a group of a search space, a bounded number of frames at a time."""
-        values: list[Tensor] = []
-        gradients: list[Tensor] = []
-        for part in self._batches(unit):
-            leaf = part.detach().requires_grad_()
-            value = self.divergences(_patterns(space, leaf))
-            (gradient,) = torch.autograd.grad(value.sum(), leaf)
-            values.append(value.detach())
-            gradients.append(gradient)
-        return torch.cat(values, 1), torch.cat(gradients, 1)
+    @property
+    def at_once(self) -> int:
+        """How many points of each group make no more than MAX_FRAMES frames."""
+        looks = 1 if self._looks is None else len(self._looks)
+        return MAX_FRAMES // (looks * sum(len(view.frames) for view in self.views))
 
     def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, None]:
         """The mean steering shift per frame; None for the deviation, which the surrogate does not know."""
@@ -205,12 +195,6 @@ class Surrogate:
             for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer)
         ]
         return digest(repr(told), *seen)
-
-    def _batches(self, unit: Points) -> tuple[Tensor, ...]:
-        """Parts of at most MAX_FRAMES frames, as even as can be; at least one pattern a group each."""
-        looks = 1 if self._looks is None else len(self._looks)
-        at_once = max(1, MAX_FRAMES // (looks * sum(len(view.frames) for view in self.views)))
-        return unit.chunk(-(-unit.shape[1] // at_once), dim=1)
 
     def _compositor(self, copies: int) -> Compositor:
         # Batches of a search are of one size, or two: the frames are kept until another size comes, and for good where
@@ -228,10 +212,6 @@ class Surrogate:
     def _steer(self, frames: Tensor, speed: Tensor, command: Tensor) -> Tensor:
         self.frames_evaluated += len(frames)
         return steer_of(self.controller, frames, speed, command, finite=not self._replayed).float()
-
-
-def _patterns(space: SearchSpace, unit: Points) -> list[Pattern]:
-    return [space.pattern(group) for group in unit]
 
 
 def _view(recordings: RecordingSet, drives: Sequence[Recording], device: torch.device | str) -> CanvasView:
