@@ -101,7 +101,7 @@ def test_a_size_that_is_none_is_named(name):
 def test_a_size_that_raises_is_in_the_report():
     (check,) = check_controller(bad_drivers.SIZE_RAISES()).checks
     assert check.name == "interface"
-    assert "raised OSError" in check.found
+    assert "raised OSError" in check.finding
 
 
 EVERYTHING_BAD = {

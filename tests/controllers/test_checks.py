@@ -125,7 +125,7 @@ def test_a_network_left_in_training_mode_is_caught():
 def test_something_that_is_no_controller_is_told_what_it_lacks():
     report = check_controller(nn.Linear(2, 2))
     assert [failure.name for failure in report.failures] == ["interface"]
-    assert "input_size, steer, act" in report.failures[0].found
+    assert "input_size, steer, act" in report.failures[0].finding
 
 
 def test_a_controller_of_any_size_needs_a_size():

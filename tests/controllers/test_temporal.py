@@ -184,7 +184,7 @@ def test_a_wrong_answer_is_one_line():
             return super().controls_after(*arguments)[0][:, :1], None
 
     failure = check_controller(Wrong(None), size=(24, 32)).failures[0]
-    assert "controls_after answered shape (8, 1)" in failure.found
+    assert "controls_after answered shape (8, 1)" in failure.finding
 
 
 def seen(time_s, value):

@@ -8,9 +8,9 @@ import torch
 from PIL import Image
 
 from roadproof.attacks import AttackResult, Candidate, GradOpt
-from roadproof.attacks.checks import Check
 from roadproof.attacks.result import Cost
 from roadproof.calibration.report import CalibrationReport, DriveReport, Spread
+from roadproof.checks import Check
 from roadproof.coverage import Shape
 from roadproof.datatypes import Ending, Event, EventKind, Weather
 from roadproof.drives import Drive, Trajectories, Window

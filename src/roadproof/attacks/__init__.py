@@ -10,7 +10,6 @@ from roadproof.attacks.blackbox import GaussianProcess as GaussianProcess
 from roadproof.attacks.blackbox import RandomSearch as RandomSearch
 from roadproof.attacks.cheapest import Cheapest as Cheapest
 from roadproof.attacks.cheapest import cheapest as cheapest
-from roadproof.attacks.checks import Check as Check
 from roadproof.attacks.driven import InSimulator as InSimulator
 from roadproof.attacks.groups import parse_groups as parse_groups
 from roadproof.attacks.method import Method as Method
@@ -30,3 +29,4 @@ from roadproof.attacks.show import ShownDrive as ShownDrive
 from roadproof.attacks.show import show_pattern as show_pattern
 from roadproof.attacks.site import site_of as site_of
 from roadproof.attacks.surrogate import Surrogate as Surrogate
+from roadproof.checks import Check as Check

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.checks import (
-    Check,
     check_bounds,
     check_gradients,
     check_groups,
@@ -33,6 +32,7 @@ from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, Ste
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
+from roadproof.checks import Check
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
 from roadproof.errors import ControllerError, RoadproofError

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 
@@ -11,6 +10,7 @@ from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.gradopt import Search, random_search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import Measure, RecordedMeasure
+from roadproof.checks import Check
 from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
 
@@ -19,23 +19,6 @@ STRAYS_M = 0.5
 
 ASIDE_M, TURNED_RAD = 1.0, 0.3
 """Further from a recorded pose a picture shows much that was not recorded."""
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """The outcome of one self-check of a search.
-
-    Args:
-        name: short name of the check.
-        passed: whether the check found nothing wrong.
-        finding: what was measured, in a sentence.
-        advice: what to do about it; empty if the check passed.
-    """
-
-    name: str
-    passed: bool
-    finding: str
-    advice: str = ""
 
 
 def check_search(

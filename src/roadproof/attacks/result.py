@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.attacks.checks import Check
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import method_of, stored
+from roadproof.checks import Check
 from roadproof.driving.speed import speed_in_words, speeds_in_words
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path

@@ -212,5 +212,5 @@ def _summarise(result: AttackResult, out: Path) -> None:
     if result.conspicuousness is not None:
         say(f"How conspicuous it is: {result.conspicuousness.sentence}")
     for check in result.checks:
-        say(f"  {'ok ' if check.passed else 'BAD'} {check.name}: {check.finding}{check.advice and '; ' + check.advice}")
+        say(f"  {check}")
     say(f"Results in {out}: pattern.json, pattern.png, result.json, search.png, film-*.png")

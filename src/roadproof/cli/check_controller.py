@@ -12,7 +12,6 @@ from roadproof.cli.options import argument
 from roadproof.cli.output import answer, say
 
 if TYPE_CHECKING:
-    from roadproof.controllers import ControllerReport
     from roadproof.training.scores import DrivingScore, Trial
 
 
@@ -34,7 +33,7 @@ def check_controller(
     sky, driven = options.weather_of(weather), options.scenarios_of(scenarios)
     controller = load_controller(spec)
     report = check(controller, size=controller.input_size or (88, 200))
-    _say_promises(report)
+    say(*map(str, report.checks))
     acts = any(check.name == DRIVES and check.passed for check in report.checks)
     if drive and not acts:
         typer.echo("not driven: act does not answer as a drive needs it", err=True)
@@ -58,12 +57,6 @@ def check_controller(
     drives = [{"scenario": each.scenario.name, **told, "clean": s.clean, **asdict(s)} for each, s in scored]
     answer(found | {"drives": drives})
     raise typer.Exit(0 if report.passed else 1)
-
-
-def _say_promises(report: ControllerReport) -> None:
-    for check in report.checks:
-        verdict, advice = ("ok ", "") if check.passed else ("BAD", f"; {check.advice}")
-        say(f"{verdict} {check.name}: {check.found}{advice}")
 
 
 def _say_scores(scored: list[tuple[Trial, DrivingScore]]) -> None:

@@ -1,7 +1,6 @@
 """Controllers: what is attacked and what drives."""
 
 from roadproof.controllers.cards import ControllerCard as ControllerCard
-from roadproof.controllers.checks import ControllerCheck as ControllerCheck
 from roadproof.controllers.checks import ControllerReport as ControllerReport
 from roadproof.controllers.checks import check_controller as check_controller
 from roadproof.controllers.cil import CIL as CIL

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from roadproof.checks import Check, CheckReport
 from roadproof.controllers.asking import (
     NO_GRADIENT,
     act_of,
@@ -34,7 +35,6 @@ from roadproof.controllers.protocol import (
 from roadproof.datatypes import Command
 from roadproof.errors import ControllerError
 from roadproof.foreign import call
-from roadproof.io.html import table
 from roadproof.io.records import RecordFile, Saved
 
 DRIVES = "drives"
@@ -48,42 +48,8 @@ _BROKEN_GRADIENT = "look for square roots and norms at zero, whose derivative is
 
 
 @dataclass(frozen=True, slots=True)
-class ControllerCheck:
-    """One promise and whether it is kept.
-
-    Args:
-        name: short name of the check, the same in all versions.
-        passed: whether the promise is kept.
-        found: what was measured, in words.
-        advice: what to do if the check fails.
-    """
-
-    name: str
-    passed: bool
-    found: str
-    advice: str
-
-
-@dataclass(frozen=True, slots=True)
-class ControllerReport(Saved):
-    """All checks in the order in which they were made, without those that an earlier failure makes impossible."""
-
-    checks: tuple[ControllerCheck, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Whether every check passed."""
-        return all(check.passed for check in self.checks)
-
-    @property
-    def failures(self) -> tuple[ControllerCheck, ...]:
-        """The checks that did not pass."""
-        return tuple(check for check in self.checks if not check.passed)
-
-    def _repr_html_(self) -> str:
-        """How a notebook shows it: a row for each check."""
-        rows = [(c.name, "kept" if c.passed else "broken", c.found, "" if c.passed else c.advice) for c in self.checks]
-        return table(("promise", "", "found", "what to do"), rows)
+class ControllerReport(CheckReport, Saved):
+    """What `check_controller` found."""
 
     def require(self) -> None:
         """Refuse a controller that fails a check.
@@ -93,7 +59,7 @@ class ControllerReport(Saved):
         """
         if self.failures:
             raise ControllerError(
-                "; ".join(f"controller fails '{c.name}' ({c.found}): {c.advice}" for c in self.failures)
+                "; ".join(f"controller fails '{c.name}' ({c.finding}): {c.advice}" for c in self.failures)
             )
 
 
@@ -140,7 +106,7 @@ def check_controller(
     except ControllerError as error:
         return ControllerReport((_failed("interface", error, _INTERFACE),))
     if missing:
-        return ControllerReport((ControllerCheck("interface", False, f"lacks {', '.join(missing)}", _INTERFACE),))
+        return ControllerReport((Check("interface", False, f"lacks {', '.join(missing)}", _INTERFACE),))
     size = size or own_size
     if size is None:
         raise ControllerError("the controller takes frames of any size; say at which size to check it: size=(h, w)")
@@ -188,7 +154,7 @@ def require_usable(
         act_of(controller, _picture(few), float(few.speed_mps[0]), int(few.command[0]))
 
 
-def _checks(controller: Controller, drive: _Drive, tolerance: float) -> Iterator[ControllerCheck]:
+def _checks(controller: Controller, drive: _Drive, tolerance: float) -> Iterator[Check]:
     leaf = drive.frames.clone().requires_grad_()
     try:
         steer = answer_of(controller, "steer", leaf, drive.speed_mps, drive.command)
@@ -196,7 +162,7 @@ def _checks(controller: Controller, drive: _Drive, tolerance: float) -> Iterator
         advice = "make steer accept (b, 3, h, w) frames, (b,) speeds and commands, and answer one value a frame"
         yield _failed("answers", error, advice)
     else:
-        yield ControllerCheck("answers", True, f"shape {tuple(steer.shape)}, {steer.dtype}", "")
+        yield Check("answers", True, f"shape {tuple(steer.shape)}, {steer.dtype}", "")
         yield from _steer_checks(controller, drive, steer, tolerance)
         yield from _gradient_checks(steer, leaf)
     if isinstance(controller, PedalController):
@@ -208,17 +174,17 @@ def _checks(controller: Controller, drive: _Drive, tolerance: float) -> Iterator
 
 def _steer_checks(
     controller: Controller, drive: _Drive, steer: Float[Tensor, " b"], tolerance: float
-) -> Iterator[ControllerCheck]:
+) -> Iterator[Check]:
     count, before, answer = len(drive.frames), drive.frames.clone(), steer.detach()
     broken = int((~answer.isfinite()).sum())
     advice = "look for divisions by zero and logarithms, and for NaN in the weights"
-    yield ControllerCheck("finite answers", broken == 0, f"{broken} of {count} NaN or infinite", advice)
+    yield Check("finite answers", broken == 0, f"{broken} of {count} NaN or infinite", advice)
     parts = [_Drive(*(values[i : i + 1] for values in drive)) for i in range(count)]
     advice = "switch dropout and noise off (eval mode), and keep no state from call to call"
     yield _repeated("determinism", controller, [drive], answer, tolerance, advice)
     advice = "answer each frame by itself: batch normalisation in eval mode, no statistics over the batch"
     yield _repeated("batch consistency", controller, parts, answer, tolerance, advice)
-    yield ControllerCheck("frames untouched", torch.equal(before, drive.frames), "frames compared", _ON_A_COPY)
+    yield Check("frames untouched", torch.equal(before, drive.frames), "frames compared", _ON_A_COPY)
 
 
 def _repeated(
@@ -228,7 +194,7 @@ def _repeated(
     first: Float[Tensor, " b"],
     tolerance: float,
     advice: str,
-) -> ControllerCheck:
+) -> Check:
     """Whether frames asked about again, a part at a time, are answered as they were at first."""
     try:
         with torch.no_grad():
@@ -238,21 +204,21 @@ def _repeated(
     return _equal(name, first, again, tolerance, advice)
 
 
-def _gradient_checks(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Iterator[ControllerCheck]:
+def _gradient_checks(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Iterator[Check]:
     try:
         gradient = _gradient_of(steer, leaf)
     except ControllerError as error:
         yield _failed("gradients", error, NO_GRADIENT)
         return
     if gradient is None:
-        yield ControllerCheck("gradients", False, "none reach the frames", NO_GRADIENT)
+        yield Check("gradients", False, "none reach the frames", NO_GRADIENT)
         return
     largest = gradient.flatten(1).abs().amax(dim=1)
     dead = int((largest == 0).sum())
-    yield ControllerCheck("gradients", dead == 0, f"zero for {dead} of {len(largest)} frames", NO_GRADIENT)
+    yield Check("gradients", dead == 0, f"zero for {dead} of {len(largest)} frames", NO_GRADIENT)
     broken = int((~gradient.flatten(1).isfinite().all(dim=1)).sum())
     found = f"NaN or infinite for {broken} of {len(largest)} frames"
-    yield ControllerCheck("finite gradients", broken == 0, found, _BROKEN_GRADIENT)
+    yield Check("finite gradients", broken == 0, found, _BROKEN_GRADIENT)
 
 
 def _gradient_of(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"] | None:
@@ -268,7 +234,7 @@ def _gradient_of(steer: Float[Tensor, " b"], leaf: Float[Tensor, "b 3 h w"]) -> 
     return gradient
 
 
-def _pedal_check(controller: PedalController, drive: _Drive) -> ControllerCheck:
+def _pedal_check(controller: PedalController, drive: _Drive) -> Check:
     advice = "answer finite steer, throttle and brake of each frame inside their ranges, differentiable in the frames"
     try:
         controls = controls_of(controller, drive.frames.clone().requires_grad_(), drive.speed_mps, drive.command)
@@ -276,12 +242,10 @@ def _pedal_check(controller: PedalController, drive: _Drive) -> ControllerCheck:
         return _failed("pedals", error, advice)
     least = controls.new_tensor([-1.0, 0.0, 0.0])
     outside = int(((controls < least) | (controls > 1)).any(1).sum())
-    return ControllerCheck(
-        "pedals", outside == 0, f"outside their ranges for {outside} of {len(controls)} frames", advice
-    )
+    return Check("pedals", outside == 0, f"outside their ranges for {outside} of {len(controls)} frames", advice)
 
 
-def _memory_checks(controller: TemporalController, drive: _Drive, tolerance: float) -> Iterator[ControllerCheck]:
+def _memory_checks(controller: TemporalController, drive: _Drive, tolerance: float) -> Iterator[Check]:
     """Whether what is remembered does what a search and many cars side by side rely on."""
     shapes = "answer controls_after with a tuple: (b, 3) controls inside their ranges, and what is to be remembered"
     leaf, later = drive.frames.clone().requires_grad_(), drive._replace(frames=drive.frames.flip(3))
@@ -307,20 +271,20 @@ def _memory_checks(controller: TemporalController, drive: _Drive, tolerance: flo
     found = gradient is not None and bool(gradient.isfinite().all())
     told = "reaches" if found else "does not reach"
     advice = "keep tensors in the memory as they are: no detach, no_grad or numpy, or paint seen before has no effect"
-    yield ControllerCheck("gradient through memory", found, f"it {told} the frames before", advice)
+    yield Check("gradient through memory", found, f"it {told} the frames before", advice)
 
 
-def _act_check(controller: Controller, drive: _Drive) -> ControllerCheck:
+def _act_check(controller: Controller, drive: _Drive) -> Check:
     advice = "return a finite Control inside its ranges (Control.clipped) for one uint8 frame"
     try:
         control = act_of(controller, _picture(drive), float(drive.speed_mps[0]), int(drive.command[0]))
     except ControllerError as error:
         return _failed(DRIVES, error, advice)
-    return ControllerCheck(DRIVES, control == control.clipped(), f"{control}", advice)
+    return Check(DRIVES, control == control.clipped(), f"{control}", advice)
 
 
-def _failed(name: str, error: ControllerError, advice: str) -> ControllerCheck:
-    return ControllerCheck(name, False, str(error), advice)
+def _failed(name: str, error: ControllerError, advice: str) -> Check:
+    return Check(name, False, str(error), advice)
 
 
 def _picture(drive: _Drive) -> UInt8[np.ndarray, "h w 3"]:
@@ -329,15 +293,13 @@ def _picture(drive: _Drive) -> UInt8[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(levels.cpu().numpy())
 
 
-def _equal(
-    name: str, one: Float[Tensor, " b"], other: Float[Tensor, " b"], tolerance: float, advice: str
-) -> ControllerCheck:
+def _equal(name: str, one: Float[Tensor, " b"], other: Float[Tensor, " b"], tolerance: float, advice: str) -> Check:
     if one.shape != other.shape:
-        return ControllerCheck(name, False, f"shapes {tuple(one.shape)} and {tuple(other.shape)}", advice)
+        return Check(name, False, f"shapes {tuple(one.shape)} and {tuple(other.shape)}", advice)
     # NaN in both places is the business of another check.
     difference = torch.where(one.isnan() & other.isnan(), 0.0, (one - other).abs())
     largest = float(difference.max())
-    return ControllerCheck(name, largest <= tolerance, f"answers differ by up to {largest:.2g}", advice)
+    return Check(name, largest <= tolerance, f"answers differ by up to {largest:.2g}", advice)
 
 
 def _made_up_drive(size: tuple[int, int], device: str, seed: int) -> _Drive:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from roadproof.checks import Check, CheckReport
 from roadproof.datatypes import Command, Control, Observation, VehicleState, Weather
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, homography_from_pose
@@ -30,32 +31,8 @@ SQUARE_PX = 90
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
-    """One promise, whether it is kept, and what was seen."""
-
-    name: str
-    passed: bool
-    detail: str
-
-    def __str__(self) -> str:
-        return f"{'ok    ' if self.passed else 'FAILED'} {self.name}: {self.detail}"
-
-
-@dataclass(frozen=True, slots=True)
-class SimulatorReport:
+class SimulatorReport(CheckReport):
     """What `check_simulator` found."""
-
-    checks: tuple[Check, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Every promise is kept."""
-        return all(check.passed for check in self.checks)
-
-    def __str__(self) -> str:
-        failed = sum(not check.passed for check in self.checks)
-        verdict = "all checks passed" if not failed else f"{failed} of {len(self.checks)} checks failed"
-        return "\n".join([*map(str, self.checks), verdict])
 
     def require(self) -> None:
         """Raise what the first failed check saw.
@@ -63,9 +40,8 @@ class SimulatorReport:
         Raises:
             BrokenPromiseError: a promise is not kept.
         """
-        for check in self.checks:
-            if not check.passed:
-                raise BrokenPromiseError(f"{check.name}: {check.detail}")
+        for check in self.failures:
+            raise BrokenPromiseError(f"{check.name}: {check.finding}")
 
 
 class BrokenPromiseError(Exception):

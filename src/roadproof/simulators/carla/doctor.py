@@ -8,13 +8,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from roadproof.checks import Check
 from roadproof.datatypes import Control, Observation, VehicleState
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.scenarios import Scenario
 from roadproof.simulators.carla.inject import ASPHALT_LEVEL, may_show
 from roadproof.simulators.carla.places import scenario_between, spawn_places, straight_stretch
 from roadproof.simulators.carla.simulator import CarlaSimulator
-from roadproof.simulators.checks import BrokenPromiseError, Check, SimulatorReport, check_simulator, checked
+from roadproof.simulators.checks import BrokenPromiseError, SimulatorReport, check_simulator, checked
 from roadproof.simulators.protocol import PaintKind
 
 STRETCH_M, CANVAS_AT_M = 60.0, 30.0
@@ -137,7 +138,7 @@ class _Examination:
         only = ("homography", "paint", "transparency", "colours")
         report = check_simulator(self._simulator, self.scenario, steps=STEPS, only=only)
         report.require()
-        return f"{self._simulator.paint}: {report.checks[1].detail}; {report.checks[3].detail}"
+        return f"{self._simulator.paint}: {report.checks[1].finding}; {report.checks[3].finding}"
 
     def native(self) -> str:
         """Whether paint can be part of the server's world, and how paint in pictures differs from it."""
