@@ -8,7 +8,7 @@ An episode is one file that explains itself: a NumPy archive of named arrays and
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import chain, count
 from typing import TypeAlias, TypeVar
 
@@ -25,6 +25,7 @@ from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Pictures, Simulator
 
 SimulatorT = TypeVar("SimulatorT", bound=Simulator)
+Seen = TypeVar("Seen")
 Policy: TypeAlias = Callable[[Observation], Control]
 """What one drive is driven by: what is seen in, what is done out."""
 
@@ -176,6 +177,41 @@ def drive_again(
         on_step=on_step,
         until=lambda _: next(seen) >= steps,
     )
+
+
+def look_again(
+    simulator: Simulator,
+    episode: Episode,
+    scenario: Scenario,
+    steps: Collection[int],
+    look: Callable[[Observation], Seen],
+    *,
+    pattern: Pattern | PatternImage | None = None,
+    full_pictures: bool = False,
+) -> dict[int, Seen]:
+    """Drive an episode again as far as it is looked at, and keep what a function makes of some of its observations.
+
+    Args:
+        simulator, episode, scenario, pattern: those of `drive_again`.
+        steps: numbers of the observations to look at, one or more, from 0.
+        look: makes of an observation what is kept.
+        full_pictures: whether these observations show the full camera picture.
+
+    Returns:
+        What was kept, by the number of the observation; only of those that came before the drive ended.
+    """
+    wanted, numbers = frozenset(steps), count()
+    kept: dict[int, Seen] = {}
+
+    def keep(seen: Observation, _: Control | None) -> None:
+        if (number := next(numbers)) in wanted:
+            kept[number] = look(seen)
+
+    pictures = wanted if full_pictures else False
+    drive_again(
+        simulator, episode, scenario, pattern=pattern, steps=max(wanted) + 1, full_pictures=pictures, on_step=keep
+    )
+    return kept
 
 
 def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,9 @@ from roadproof.attacks.groups import Direction, Group
 from roadproof.compositing import composite, view_canvas
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
-from roadproof.datatypes import Control, Observation, Weather
+from roadproof.datatypes import Weather
 from roadproof.driving.episode import Episode
-from roadproof.driving.rollout import drive_again, rollout
+from roadproof.driving.rollout import look_again, rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
@@ -193,15 +192,8 @@ def rendered_frames(
     wanted = set(frame_number.tolist())
     if not wanted or min(wanted) < 0 or max(wanted) >= len(episode):
         raise RecordingError(f"frames up to {max(wanted, default=0)} are asked of a drive of {len(episode)} steps")
-    frames: list[np.ndarray] = []
-    steps = count()
-
-    def keep(seen: Observation, _: Control | None) -> None:
-        if next(steps) in wanted:
-            frames.append(seen.frame)
-
-    drive_again(simulator, episode, scenario, pattern=pattern, steps=max(wanted) + 1, on_step=keep)
-    return np.stack(frames)
+    frames = look_again(simulator, episode, scenario, wanted, lambda seen: seen.frame, pattern=pattern)
+    return np.stack(list(frames.values()))
 
 
 def is_drive_of(recorded: Recording, episode: Episode) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -14,11 +13,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from roadproof.datatypes import Control, Observation
+from roadproof.datatypes import Observation
 from roadproof.driving.deviation import lateral_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.rollout import drive_again
+from roadproof.driving.rollout import look_again
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import write_atomically
@@ -176,21 +175,18 @@ def _filmed(start: Scenario, strip: Sequence[int], simulator: Simulator, take: _
     A car that stands for good, at a rail until its time is up, say, is shown for a moment only.
     """
     title, colour, episode, paint = take
-    kept: dict[int, bytes] = {}
     moving = np.flatnonzero(episode.speed_mps > STANDS_MPS)
     enough = min(int(moving[-1]) + 1 + round(EVENT_SHOWN_S / episode.dt_s), len(episode)) if moving.size else 1
     each = max(1, round(PICTURE_S / episode.dt_s))
-    wanted, steps = frozenset((*range(0, enough, each), *(step for step in strip if step < enough))), itertools.count()
-
-    def keep(seen: Observation, _: Control | None) -> None:
-        if (step := next(steps)) not in wanted:
-            return
-        file = io.BytesIO()
-        Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
-        kept[step] = file.getvalue()
-
-    drive_again(simulator, episode, start, pattern=paint, steps=enough, full_pictures=wanted, on_step=keep)
+    steps = (*range(0, enough, each), *(step for step in strip if step < enough))
+    kept = look_again(simulator, episode, start, steps, _as_jpeg, pattern=paint, full_pictures=True)
     return _Side(title, colour, episode, each, enough, kept)
+
+
+def _as_jpeg(seen: Observation) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
+    return file.getvalue()
 
 
 def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: int) -> Image.Image:

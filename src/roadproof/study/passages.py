@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import io
-from itertools import count, product
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from roadproof.datatypes import Control, Observation
+from roadproof.datatypes import Observation
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluation import Evaluation
-from roadproof.driving.rollout import drive_again
+from roadproof.driving.rollout import look_again
 from roadproof.driving.trial import Trial
 from roadproof.pipeline.film import passage_steps
 from roadproof.scenarios import Scenario
@@ -57,21 +57,10 @@ def _strip(
 ) -> UInt8[np.ndarray, "h w 3"]:
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
     steps = passage_steps(clean, painted, scenario.canvas, PICTURES)
-    taken, numbers = list[UInt8[np.ndarray, "h w 3"]](), count()
+    start = trial.start.of(scenario)
+    taken = look_again(simulator, painted, start, steps, _small, pattern=paint, full_pictures=True)
+    return np.concatenate([taken[step] for step in steps if step in taken], 1)
 
-    def keep(seen: Observation, _: Control | None) -> None:
-        times = steps.count(next(numbers))
-        if times:
-            small = Image.fromarray(seen.shown).resize(SIZE_PX, Image.Resampling.LANCZOS)
-            taken.extend([np.asarray(small)] * times)
 
-    drive_again(
-        simulator,
-        painted,
-        trial.start.of(scenario),
-        pattern=paint,
-        steps=steps[-1] + 1,
-        full_pictures=frozenset(steps),
-        on_step=keep,
-    )
-    return np.concatenate(taken, 1)
+def _small(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
+    return np.asarray(Image.fromarray(seen.shown).resize(SIZE_PX, Image.Resampling.LANCZOS))
