@@ -20,8 +20,7 @@ from roadproof.attacks.groups import STEERED, Group, Points, Values, divergence,
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import steer_of
-from roadproof.errors import ControllerError
+from roadproof.controllers.asking import require_size, steer_of
 from roadproof.io.identity import digest
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
@@ -59,13 +58,9 @@ class Surrogate(BatchedMeasure):
         device: torch.device | str = "cpu",
         variation: Variation | None = None,
     ) -> None:
-        height, width = recordings.view.height_px, recordings.view.width_px
-        if controller.input_size not in (None, (height, width)):
-            wanted = controller.input_size
-            raise ControllerError(
-                f"the controller takes frames of {wanted[1]}×{wanted[0]} (width × height), "
-                f"the recordings have {width}×{height}; use a controller for this input, or record for this controller"
-            )
+        size = recordings.view.height_px, recordings.view.width_px
+        advice = "use a controller for this input, or record for this controller"
+        require_size(controller, size, "the recordings have", advice)
         require_directions(groups, STEERED, "steering shift")
         self.groups = tuple(groups)
         self.recordings = recordings

@@ -179,6 +179,24 @@ def frame_size_of(controller: Controller) -> tuple[int, int] | None:
     return cast("tuple[int, int]", size)
 
 
+def require_size(controller: Controller, size: tuple[int, int], given: str, advice: str) -> None:
+    """Refuse a controller that takes frames of another size, before it is asked about any.
+
+    Args:
+        controller: the controller.
+        size: (height, width) of the frames that it will be given.
+        given: who gives them, for the message, such as "the simulator gives".
+        advice: what to do, for the message.
+
+    Raises:
+        ControllerError: the controller takes frames of another size.
+    """
+    if (own := frame_size_of(controller)) not in (None, size):
+        raise ControllerError(
+            f"the controller takes frames of {own[1]}×{own[0]}, {given} {size[1]}×{size[0]} (width×height); {advice}"
+        )
+
+
 def answer_of(
     controller: Controller, member: str, frames: Frames, speed_mps: Speeds, command: Commands
 ) -> Float[Tensor, "b ..."]:

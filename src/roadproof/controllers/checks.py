@@ -21,6 +21,7 @@ from roadproof.controllers.asking import (
     controls_after_of,
     controls_of,
     frame_size_of,
+    require_size,
     steer_of,
 )
 from roadproof.controllers.protocol import (
@@ -130,11 +131,7 @@ def require_usable(
         ControllerError: the controller takes another frame size, raises, answers wrongly, writes into its frames, or
             has no finite gradient.
     """
-    if (own := frame_size_of(controller)) not in (None, size):
-        raise ControllerError(
-            f"the controller takes frames of {own[1]}×{own[0]}, here they have {size[1]}×{size[0]} (width×height); "
-            "use a controller for these, or record for this one"
-        )
+    require_size(controller, size, "here they have", "use a controller for these, or record for this one")
     few = _Drive(*(values[:2] for values in _made_up_drive(size, device, seed=0)))
     leaf = few.frames.clone().requires_grad_()
     steer = steer_of(controller, leaf, few.speed_mps, few.command)

@@ -15,7 +15,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import frame_size_of, next_act_of
+from roadproof.controllers.asking import next_act_of, require_size
 from roadproof.datatypes import Control, Ending, Observation, Weather
 from roadproof.driving.episode import GIVEN, SEEN, Episode
 from roadproof.errors import ControllerError
@@ -74,7 +74,9 @@ def rollout(
             control; the message names the line of its author's code.
     """
     if isinstance(driver, Controller):
-        _check_size(driver, simulator)
+        # Before the town is built, also for controllers that would not complain.
+        size = simulator.input.height_px, simulator.input.width_px
+        require_size(driver, size, "the simulator gives", "give the simulator another `input`")
     seen = simulator.reset(
         scenario,
         weather=weather,
@@ -233,16 +235,6 @@ def _acting(controller: Controller) -> Policy:
         return control
 
     return policy
-
-
-def _check_size(controller: Controller, simulator: Simulator) -> None:
-    """Refuse frames of the wrong size before the town is built, also for controllers that would not complain."""
-    size, view = frame_size_of(controller), simulator.input
-    if size is not None and size != (view.height_px, view.width_px):
-        raise ControllerError(
-            f"the controller takes frames of {size[1]}×{size[0]}, the simulator gives {view.width_px}×{view.height_px} "
-            "(width×height); give the simulator another `input`"
-        )
 
 
 def _row(seen: Observation) -> tuple[float, ...]:
