@@ -191,16 +191,12 @@ def look_again(
     pattern: Pattern | PatternImage | None = None,
     full_pictures: bool = False,
 ) -> dict[int, Seen]:
-    """Drive an episode again as far as it is looked at, and keep what a function makes of some of its observations.
+    """Drive an episode again as far as it is looked at, and keep what `look` makes of its observations at some steps.
 
-    Args:
-        simulator, episode, scenario, pattern: those of `drive_again`.
-        steps: numbers of the observations to look at, one or more, from 0.
-        look: makes of an observation what is kept.
-        full_pictures: whether these observations show the full camera picture.
+    Steps count from 0; at them there are full pictures, where these are asked for. All else is as in `drive_again`.
 
     Returns:
-        What was kept, by the number of the observation; only of those that came before the drive ended.
+        What was kept, by the step; only of steps that came before the drive ended.
     """
     wanted, numbers = frozenset(steps), count()
     kept: dict[int, Seen] = {}
