@@ -106,10 +106,20 @@ class Pool(Generic[Inside]):
             raise SimulatorError(DIED) from None
 
 
+def here_or_beside(inside: Inside, opens: Opens[Inside] | None, processes: int) -> Pool[Inside]:
+    """Processes that each work in a context of their own; a single one is this process, in what is open already.
+
+    Args:
+        inside: what this process works in, where it is the only one.
+        opens: makes a context of the same kind; needed for several processes.
+        processes: how many work at once.
+    """
+    return Pool(partial(nullcontext, inside) if opens is None or processes == 1 else opens, processes)
+
+
 def open_or_here(pool: Pool[Inside] | None, inside: Inside) -> AbstractContextManager[Pool[Inside]]:
     """Processes that are open already, and stay open; without them this process alone, working in what is given."""
-    here: Opens[Inside] = partial(nullcontext, inside)
-    return nullcontext(pool) if pool is not None else Pool[Inside](here, 1)
+    return nullcontext(pool) if pool is not None else here_or_beside(inside, None, 1)
 
 
 def spread(

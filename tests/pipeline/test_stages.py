@@ -12,13 +12,13 @@ import needs
 from roadproof.attacks import AttackResult
 from roadproof.controllers import load_controller
 from roadproof.drives import Drives
-from roadproof.driving.evaluate import drivers
 from roadproof.errors import RoadproofError
 from roadproof.pipeline import stages
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stages import Stages
+from roadproof.processes import here_or_beside
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from runs import write_attack, write_record, write_selection
@@ -39,7 +39,7 @@ def stages_in(folder, **options):
         seed=0,
         controller_name="pilotnet",
         device="cpu",
-        pool=drivers(town, None, 1),
+        pool=here_or_beside(town, None, 1),
         on_progress=lambda *_: None,
         **options,
     )

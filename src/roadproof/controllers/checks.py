@@ -65,7 +65,7 @@ class ControllerReport(CheckReport, Saved):
 
 
 ControllerReport.FILE = RecordFile(
-    kind=ControllerReport, name="roadproof-controller", error=ControllerError, remedy="check the controller again"
+    kind=ControllerReport, name="roadproof-controller-check", error=ControllerError, remedy="check the controller again"
 )
 _ON_A_COPY = "work on a copy: steer must not write into the frames it is given"
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
@@ -17,12 +17,11 @@ import torch
 from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
 from roadproof.driving.evaluation import ATTACK, Evaluation
-from roadproof.driving.rollout import SimulatorT
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.patterns import Pattern, raster
-from roadproof.processes import Opens, Pool, require_picklable
+from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
@@ -102,7 +101,7 @@ def evaluate(
         planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
         drives = list(dict.fromkeys(drive for pair in planned for drive in pair))
         if pool is None:
-            pool = stack.enter_context(drivers(world, simulator if callable(simulator) else None, processes))
+            pool = stack.enter_context(here_or_beside(world, simulator if callable(simulator) else None, processes))
         make_missing(pool, episodes, drives, lambda done: on_drive(done, len(drives)))
     evaluation = Evaluation(
         scenario=scenario,
@@ -158,17 +157,6 @@ def _planned(
             clean = replace(alone[run % len(alone)], cars=cars, pedestrians=pedestrians, seed=seed + run)
             pairs += [(clean, replace(clean, paint=paint)) for paint in painted]
     return pairs
-
-
-def drivers(world: SimulatorT, factory: Opens[SimulatorT] | None, processes: int) -> Pool[SimulatorT]:
-    """Processes that drive, each in a simulator of its own; one process drives in the open one.
-
-    Args:
-        world: open simulator that drives where one process does.
-        factory: function that makes a simulator of the same kind; needed for several processes.
-        processes: how many processes drive at once.
-    """
-    return Pool(partial(nullcontext, world) if factory is None or processes == 1 else factory, processes)
 
 
 def make_missing(

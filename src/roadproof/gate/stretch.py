@@ -14,7 +14,7 @@ from roadproof.datatypes import Ending, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
 from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import drivers, make_missing
+from roadproof.driving.evaluate import make_missing
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
@@ -22,6 +22,7 @@ from roadproof.gate.verdict import Kind, Measures, median_95, share_95
 from roadproof.io.identity import digest
 from roadproof.paint import Site
 from roadproof.patterns import Pattern, save_pattern
+from roadproof.processes import here_or_beside
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.formatting import in_words
 from roadproof.scenarios import Scenario, identity
@@ -107,7 +108,7 @@ class Stretch:
         """
         alone = [each for weather in self.weathers for each in self._alone(weather).values()]
         total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
-        with drivers(self.world, factory, processes) as pool:
+        with here_or_beside(self.world, factory, processes) as pool:
             make_missing(pool, self.episodes, alone, lambda done: on_drive(done, total))
             painted = [each for weather in self.weathers for _, _, each in self._pairs(weather, self.paints)]
             total = len(alone) + len(painted)

@@ -27,7 +27,6 @@ from roadproof.attacks.speed import require_pedals
 from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
-from roadproof.driving.evaluate import drivers
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
@@ -41,7 +40,7 @@ from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
 from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages
-from roadproof.processes import require_picklable
+from roadproof.processes import here_or_beside, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -173,7 +172,7 @@ def stress_test(
         seed=seed,
         controller_name=controller_name,
         device=device,
-        pool=drivers(simulator, factory, processes),
+        pool=here_or_beside(simulator, factory, processes),
         on_progress=on_progress,
     )
     stages.check_paint()
