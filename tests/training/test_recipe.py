@@ -1,6 +1,7 @@
 """The whole recipe, tiny: every stage leaves its files, nothing is done twice, and another recipe is refused."""
 
 import json
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -49,9 +50,8 @@ def test_drives_can_be_collected_alone_and_learnt_from_later(tmp_path):
 
 
 def test_a_folder_of_another_recipe_is_refused(tmp_path):
-    (tmp_path / "recipe.json").write_text(
-        json.dumps({"format": "roadproof-recipe", "version": 1, "recipe": {"network": "cil", "drives": 7}})
-    )
+    begun = asdict(replace(TINY, drives=7))
+    (tmp_path / "recipe.json").write_text(json.dumps({"format": "roadproof-recipe", "version": 1, "recipe": begun}))
     with pytest.raises(TrainingError, match="holds a training with drives 7, now it is 1"):
         follow(TINY, tmp_path)
 
