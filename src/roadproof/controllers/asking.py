@@ -101,25 +101,6 @@ def next_controls_of(
     return steer_of(controller, frames, speed_mps, command, finite=finite)[:, None], None
 
 
-def act_after_of(
-    controller: TemporalController,
-    memory: object,
-    frame: UInt8[np.ndarray, "h w 3"],
-    speed_mps: float,
-    command: int,
-    elapsed_s: float,
-) -> tuple[Control, object]:
-    """What `TemporalController.controls_after` answers for one camera frame, as plain numbers, and what it remembers.
-
-    Raises:
-        ControllerError: the controller raises, or answers wrongly.
-    """
-    with torch.no_grad():
-        one = one_frame_batch(controller, frame, speed_mps, command)
-        controls, after = controls_after_of(controller, memory, *one, elapsed_s)
-    return Control(*map(float, controls[0])), after
-
-
 def next_act_of(
     controller: Controller,
     memory: object,
@@ -133,9 +114,12 @@ def next_act_of(
     Raises:
         ControllerError: the controller raises, or answers wrongly.
     """
-    if isinstance(controller, TemporalController):
-        return act_after_of(controller, memory, frame, speed_mps, command, elapsed_s)
-    return act_of(controller, frame, speed_mps, command), None
+    if not isinstance(controller, TemporalController):
+        return act_of(controller, frame, speed_mps, command), None
+    with torch.no_grad():
+        one = one_frame_batch(controller, frame, speed_mps, command)
+        controls, after = controls_after_of(controller, memory, *one, elapsed_s)
+    return Control(*map(float, controls[0])), after
 
 
 def act_of(controller: Controller, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from roadproof.controllers.asking import act_after_of
+from roadproof.controllers.asking import next_act_of
 from roadproof.controllers.protocol import Commands, Frames, Speeds
 from roadproof.controllers.steering import SteeringController
 from roadproof.controllers.trajectory import TrajectoryController
@@ -95,7 +95,7 @@ class HistoryController(nn.Module):
 
     def act(self, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int) -> Control:
         """The control at a frame that stands for all before it."""
-        return act_after_of(self, None, frame, speed_mps, command, 0.0)[0]
+        return next_act_of(self, None, frame, speed_mps, command, 0.0)[0]
 
     def controls_after(
         self, memory: object, frames: Frames, speed_mps: Speeds, command: Commands, elapsed_s: float
