@@ -12,10 +12,8 @@ from roadproof.errors import RecordingError, RoadproofError
 from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
-from roadproof.simulators.loading import MappedSimulator, open_simulator
+from roadproof.simulators.loading import RECORDED, MappedSimulator, open_simulator
 from roadproof.simulators.protocol import Simulator
-
-RECORDED = "recorded:"
 
 
 @dataclass(frozen=True, slots=True)

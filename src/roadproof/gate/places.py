@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 
 from roadproof.datatypes import Weather
-from roadproof.drives.worlds import RECORDED, open_world
+from roadproof.drives.worlds import open_world
 from roadproof.gate.plan import CheckPlan
 from roadproof.scenarios import Scenario
+from roadproof.simulators.loading import RECORDED
 from roadproof.simulators.protocol import SimulatorFactory
 
 

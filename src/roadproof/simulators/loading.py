@@ -15,6 +15,9 @@ from roadproof.roads.marks import Mapped
 from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
 SPECS = "town or carla://HOST:PORT"
+RECORDED = "recorded:"
+"""Begins the spec of recordings that are driven in, which are no simulator."""
+
 CARLA_PORT, LAST_PORT = 2000, 65534  # sensor data goes through the next
 _PAINTS: dict[str, PaintChoice] = {"": "inject", **{f"paint={choice}": choice for choice in get_args(PaintChoice)}}
 
@@ -43,7 +46,7 @@ def check_spec(spec: str) -> None:
     Raises:
         SimulatorError: no simulator has this name, or the spec is no address.
     """
-    if spec.startswith("recorded:"):
+    if spec.startswith(RECORDED):
         raise SimulatorError(f"simulator {spec!r} is a recorded world, which evaluate, select and drive alone drive in")
     if is_server(spec):
         _address(spec)
