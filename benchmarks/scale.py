@@ -32,7 +32,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.evaluate import evaluate
 from roadproof.io.files import write_json
 from roadproof.machine import keep_freed_memory, made_with
-from roadproof.pipeline.estimate import of_search
+from roadproof.pipeline.workload import of_search
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator

@@ -90,7 +90,7 @@ def test_a_dry_run_answers_what_it_would_take(invoke, tmp_path, monkeypatch):
 
 def test_a_dry_run_counts_the_search_for_less_paint_and_the_drive_over_it(invoke, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("roadproof.pipeline.estimate.frame_seconds", lambda *_, **__: 0.002)
+    monkeypatch.setattr("roadproof.pipeline.workload.frame_seconds", lambda *_, **__: 0.002)
     usual, less = (
         answered(invoke("demo", "--dry-run", "--json", *more)[1].out) for more in ((), ("--cheapest", "0.8"))
     )

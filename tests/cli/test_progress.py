@@ -10,7 +10,7 @@ from roadproof.cli import progress as saying
 from roadproof.cli.progress import Loudness, in_words, progress, speak, stages
 from roadproof.cli.verbs import begin
 from roadproof.errors import OutputError
-from roadproof.pipeline.estimate import Estimate
+from roadproof.pipeline.workload import Workload
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +73,7 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(invoke, tmp_path, monke
 
 
 def test_what_takes_long_says_so_once_the_folder_is_its_own(capsys, tmp_path):
-    long, short = (Estimate(drives=3, seconds=seconds, megabytes=20.0) for seconds in (3600.0, 20.0))
+    long, short = (Workload(drives=3, seconds=seconds, megabytes=20.0) for seconds in (3600.0, 20.0))
     with pytest.raises(OutputError):
         begin(long, Path("/dev/null/x"))
     assert capsys.readouterr().err == ""

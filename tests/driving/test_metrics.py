@@ -188,8 +188,8 @@ def test_the_interval_has_students_width(freedom, textbook):
 
 
 def test_a_single_run_has_no_interval_and_no_run_no_mean():
-    assert intervals.mean_95([4.0]) == intervals.Mean(4.0, None, None, 1)
-    assert intervals.mean_95([2.0] * 10) == intervals.Mean(2.0, 2.0, 2.0, 10)
+    assert intervals.mean_95([4.0]) == intervals.Estimate(4.0, None, None, 1)
+    assert intervals.mean_95([2.0] * 10) == intervals.Estimate(2.0, 2.0, 2.0, 10)
     for nothing in ([], [1.0, math.nan]):
         with pytest.raises(EpisodeError, match="cannot be taken"):
             intervals.mean_95(nothing)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from roadproof.gate.verdict import Change, Estimate, Status, judge, least_drives, median_95, share_95
+from roadproof.driving.intervals import Estimate, median_95, share_95
+from roadproof.gate.verdict import Change, Status, judge, least_drives
 
 
 def covered(count, low, high):
@@ -27,7 +28,7 @@ def test_the_interval_of_a_median_is_the_shortest_pair_of_drives_that_covers_it(
 
 
 def test_five_drives_have_no_interval():
-    assert median_95([0.1, 0.2, 0.3, 0.4, 0.5]) == Estimate(value=0.3, low=None, high=None)
+    assert median_95([0.1, 0.2, 0.3, 0.4, 0.5]) == Estimate(0.3, None, None, 5)
     assert least_drives("deviation_m", 0.5) == 6
 
 
@@ -58,7 +59,7 @@ def test_a_share_of_zero_is_met_by_the_drives_made():
     [(0.3, 0.5, Status.PASSED), (0.3, 0.51, Status.TOO_FEW), (0.3, None, Status.TOO_FEW), (0.51, 0.9, Status.FAILED)],
 )
 def test_a_limit_is_passed_with_its_whole_interval(value, high, status):
-    measures = {"deviation_m": Estimate(value=value, low=None if high is None else 0.1, high=high)}
+    measures = {"deviation_m": Estimate(value, None if high is None else 0.1, high, 20)}
     found, reasons = judge(measures, {"deviation_m": 0.5}, {}, None)
     assert found is status
     assert bool(reasons) == (status is not Status.PASSED)
@@ -78,8 +79,8 @@ def test_a_limit_is_passed_with_its_whole_interval(value, high, status):
 )
 def test_a_change_fails_where_it_exceeds_both(before, now, fails):
     change = Change(absolute=0.1, relative=0.2)
-    measures = {"deviation_m": Estimate(value=now, low=now, high=now)}
-    stored = {"deviation_m": Estimate(value=before, low=before, high=before)}
+    measures = {"deviation_m": Estimate(now, now, now, 20)}
+    stored = {"deviation_m": Estimate(before, before, before, 20)}
     status, reasons = judge(measures, {}, {"deviation_m": change}, stored)
     assert status is (Status.FAILED if fails else Status.PASSED)
     assert not fails or f"was {before:.2f} m in the reference" in reasons[0]

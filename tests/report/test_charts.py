@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from roadproof.driving.deviation import path_of
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 from roadproof.patterns import raster
 from roadproof.report import charts
 from roadproof.report.formatting import mean_in_words
@@ -99,6 +99,6 @@ def test_the_same_drives_give_the_same_chart(drives):
 
 
 def test_means_are_written_with_half_their_interval():
-    assert mean_in_words(Mean(1.333, 1.1, 1.566, 10), 2) == "1.33 ± 0.23"
-    assert mean_in_words(Mean(2.0, None, None, 1), 1) == "2.0"
+    assert mean_in_words(Estimate(1.333, 1.1, 1.566, 10), 2) == "1.33 ± 0.23"
+    assert mean_in_words(Estimate(2.0, None, None, 1), 1) == "2.0"
     assert mean_in_words(None, 1) == "–"

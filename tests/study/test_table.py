@@ -2,9 +2,9 @@ import re
 
 import pytest
 
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
-from roadproof.study.table import Estimate, Heading, Table, in_latex, in_markdown, latex_text, markdown_text
+from roadproof.study.table import Heading, Number, Table, in_latex, in_markdown, latex_text, markdown_text
 
 HOSTILE = "<b>_BO_ 100% $x^2$ {a} \\end{table} #1 & ~ | `c` *d* [e](f)"
 
@@ -16,8 +16,8 @@ def table(name="overall", text=HOSTILE):
         note=f"note of {text}",
         header=((Heading(""), Heading(text, 2)), (Heading("K"), Heading("a"), Heading("% ≥"))),
         rows=(
-            ("1", Estimate(Mean(-1.234, -2.0, 0.5, 3), best=True), "82%"),
-            (text, Estimate(Mean(-0.001, None, None, 1)), Estimate(Mean(0.5, 0.25, 1.0, 4), 0, unit="%")),
+            ("1", Number(Estimate(-1.234, -2.0, 0.5, 3), best=True), "82%"),
+            (text, Number(Estimate(-0.001, None, None, 1)), Number(Estimate(0.5, 0.25, 1.0, 4), 0, unit="%")),
         ),
     )
 
@@ -28,8 +28,8 @@ def test_a_table_is_as_wide_everywhere():
 
 
 def test_nothing_that_is_shown_looks_like_less_than_nothing():
-    assert Estimate(Mean(-0.001, -0.004, 0.1, 2)).value == "0.00"
-    assert Estimate(Mean(-0.25, -1.0, 0.1, 2)).value == "−0.25"
+    assert Number(Estimate(-0.001, -0.004, 0.1, 2)).value == "0.00"
+    assert Number(Estimate(-0.25, -1.0, 0.1, 2)).value == "−0.25"
 
 
 def test_latex_is_balanced_and_escaped():

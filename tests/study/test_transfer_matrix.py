@@ -5,7 +5,7 @@ from PIL import Image
 from roadproof.errors import StudyError
 from roadproof.report.plots import save
 from roadproof.study.results import PENALTY
-from roadproof.study.table import Estimate
+from roadproof.study.table import Number
 from roadproof.study.transfer_matrix import transfer_map, transfer_table
 
 
@@ -37,7 +37,7 @@ DRIVES = [
 def test_the_matrix_is_found_on_by_driven_by():
     table = transfer_table(DataFrame(DRIVES))
     assert [heading.text for heading in table.header[1]] == ["found on", "cil", "pilotnet", "robust"]
-    shown = [[cell.value if isinstance(cell, Estimate) else cell for cell in row] for row in table.rows]
+    shown = [[cell.value if isinstance(cell, Number) else cell for cell in row] for row in table.rows]
     assert shown == [["cil", "1.50", "0.50", "0.25"], ["pilotnet", "0.30", "1.50", "–"]]
     assert [cell.best for cell in table.rows[0][1:]] == [True, False, True]
     assert "1 to 2 patterns a cell" in table.note

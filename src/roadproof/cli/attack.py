@@ -84,7 +84,7 @@ def attack(
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
     from roadproof.coverage import Shape
-    from roadproof.pipeline.estimate import of_cheapest, of_search
+    from roadproof.pipeline.workload import of_cheapest, of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.gate.plan import CheckPlan
     from roadproof.gate.result import CheckResult
-    from roadproof.pipeline.estimate import Estimate
+    from roadproof.pipeline.workload import Workload
 
 
 def check(
@@ -56,7 +56,7 @@ def check(
     if chosen.budget == "full":
         check_processes(chosen.simulator, processes)
     who = load_controller(chosen.controller, device=device)
-    begin(_estimate(chosen, who, processes))
+    begin(_workload(chosen, who, processes))
     with stages() as show:
         result = run_check(chosen, who, out, compare=not accept, device=device, processes=processes, on_progress=show)
     _summarise(result, out)
@@ -71,10 +71,10 @@ def check(
         raise typer.Exit(1)
 
 
-def _estimate(plan: CheckPlan, who: Controller, processes: int) -> Estimate:
-    """The estimate of all cases; a fresh attack is a whole stress test but for its evaluation."""
+def _workload(plan: CheckPlan, who: Controller, processes: int) -> Workload:
+    """All cases; a fresh attack is a whole stress test but for its evaluation."""
     from roadproof.pipeline.budget import QUICK
-    from roadproof.pipeline.estimate import of_drives, of_run
+    from roadproof.pipeline.workload import of_drives, of_run
 
     seeds, full = len(plan.seeds), plan.budget == "full"
     stored = sum(map(len, plan.stored.values()))

@@ -48,8 +48,8 @@ def demo(
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.pipeline.budget import BUDGETS
-    from roadproof.pipeline.estimate import of_cheapest, of_drives, of_run
     from roadproof.pipeline.stress_test import stress_test
+    from roadproof.pipeline.workload import of_cheapest, of_drives, of_run
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 

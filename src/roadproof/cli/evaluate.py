@@ -79,9 +79,9 @@ def evaluate(
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange
     from roadproof.patterns import read_paint
-    from roadproof.pipeline.estimate import of_evaluation
     from roadproof.pipeline.fidelity import measure_fidelity
     from roadproof.pipeline.film import film_drives
+    from roadproof.pipeline.workload import of_evaluation
     from roadproof.recorded.simulator import check_canvas
     from roadproof.recordings import load_recordings
 

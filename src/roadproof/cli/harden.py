@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from roadproof.controllers import Controller
     from roadproof.hardening.budget import HardeningBudget
     from roadproof.hardening.tuning import TrainingStep
-    from roadproof.pipeline.estimate import Estimate
+    from roadproof.pipeline.workload import Workload
     from roadproof.scenarios import Scenario
 
 
@@ -75,7 +75,7 @@ def harden(
     check_streets(training, judging)
     load_trainable(controller)
     who = load_controller(controller, device=device)
-    begin(_estimate(spent, who, rounds, len(training), len(judging), len(clean)), out)
+    begin(_workload(spent, who, rounds, len(training), len(judging), len(clean)), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,
@@ -104,13 +104,13 @@ def harden(
     answer(stored(out / "hardening.json"))
 
 
-def _estimate(
+def _workload(
     budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int, clean: int
-) -> Estimate:
-    """The estimate of attacks, tuning and judging, from numbers of streets; clean drives are made before and after."""
-    from roadproof.pipeline.estimate import Estimate, frame_seconds, of_drives, of_run, of_search
+) -> Workload:
+    """Attacks, tuning and judging, from numbers of streets; clean drives are made before and after."""
+    from roadproof.pipeline.workload import Workload, frame_seconds, of_drives, of_run, of_search
 
-    learnt = Estimate(seconds=budget.tuning.pictures * frame_seconds(who))
+    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who))
     whole = of_run(budget.attack, who, film=False).times((rounds + 1) * training) + learnt.times(rounds)
     whole += of_drives(budget.town_drives * rounds)
     if judging:

@@ -52,7 +52,7 @@ def record(
     from roadproof.errors import RecordingError, ScenarioError
     from roadproof.io.files import inside
     from roadproof.pipeline.budget import BUDGETS
-    from roadproof.pipeline.estimate import RECORDED_DRIVE
+    from roadproof.pipeline.workload import RECORDED_DRIVE
     from roadproof.simulators.loading import open_simulator
 
     chosen = [options.scenario_of(name, scenarios) for name in dict.fromkeys(names)]

@@ -16,7 +16,7 @@ from roadproof.limits import MAX_PROCESSES
 
 if TYPE_CHECKING:
     from roadproof.controllers import Controller
-    from roadproof.pipeline.estimate import Estimate
+    from roadproof.pipeline.workload import Workload
     from roadproof.study.plan import Job, Study
     from roadproof.study.rows import JobResult
 
@@ -46,7 +46,7 @@ def run(
     begun = sum(is_done(job, out) for job in jobs)
     if begun < len(jobs) or is_dry_run():
         # One that is not there is refused at once, not job by job.
-        begin(_estimate(chosen, load_controller(chosen.controller), workers), out)
+        begin(_workload(chosen, load_controller(chosen.controller), workers), out)
     failed = 0
     with progress("Jobs", len(jobs), "{:.0f} failed", begun=begun, remember_s=HOURS_S) as show:
 
@@ -67,12 +67,12 @@ def run(
         raise typer.Exit(1)
 
 
-def _estimate(study: Study, who: Controller, workers: int) -> Estimate:
-    """The estimate of all jobs, also of those that are done already."""
-    from roadproof.pipeline.estimate import Estimate, of_drives, of_evaluation, of_run
+def _workload(study: Study, who: Controller, workers: int) -> Workload:
+    """All jobs, also of those that are done already."""
+    from roadproof.pipeline.workload import Workload, of_drives, of_evaluation, of_run
     from roadproof.study.methods import BlackBoxPlan, budget_of
 
-    traffic, whole = study.traffic, Estimate()
+    traffic, whole = study.traffic, Workload()
     judged = of_evaluation(len(study.weathers), study.starts.count, traffic.runs if traffic else 0, film=False)
     for method in study.methods:
         budget = replace(budget_of(method, study.weathers[0]), starts=0, runs=0)

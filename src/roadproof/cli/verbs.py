@@ -22,7 +22,7 @@ from roadproof.io.commands import write_command
 from roadproof.io.locks import hold
 
 if TYPE_CHECKING:
-    from roadproof.pipeline.estimate import Estimate
+    from roadproof.pipeline.workload import Workload
 
 SHORT_S = 180.0
 """What takes longer is said before it begins."""
@@ -100,25 +100,25 @@ def is_dry_run() -> bool:
     return _dry_run
 
 
-def begin(estimate: Estimate, *folders: Path) -> None:
+def begin(work: Workload, *folders: Path) -> None:
     """Work in folders until the command ends, and say what that takes where it takes long; a dry run ends here.
 
     Args:
-        estimate: the estimate of all the work, also of what the folders may hold already.
+        work: all the work, also what the folders may hold already.
         folders: the folders for results.
 
     Raises:
         OutputError: a folder cannot be written, or another process works in it.
     """
-    parts = [f"{estimate.drives} drives"] if estimate.drives else []
-    told = f"{', '.join((*parts, f'about {in_words(estimate.seconds)}', f'{estimate.megabytes:.0f} MB on the disk'))}"
+    parts = [f"{work.drives} drives"] if work.drives else []
+    told = f"{', '.join((*parts, f'about {in_words(work.seconds)}', f'{work.megabytes:.0f} MB on the disk'))}"
     if _dry_run:
-        say(f"{told}; less where the folder holds some of it already ({estimate.basis})")
-        answer(asdict(estimate))
+        say(f"{told}; less where the folder holds some of it already ({work.basis})")
+        answer(asdict(work))
         raise typer.Exit
     for folder in folders:
         hold(folder)
-    if estimate.seconds > SHORT_S and not is_quiet():
+    if work.seconds > SHORT_S and not is_quiet():
         less = ", less what is done already" if any(any(folder.iterdir()) for folder in folders) else ""
         tell(f"This takes {told}{less}; when it is interrupted, the same command goes on")
 

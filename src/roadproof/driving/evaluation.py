@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image
 
 from roadproof.datatypes import Weather
-from roadproof.driving.intervals import Mean, mean_95
+from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
 from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, RoadproofError
@@ -71,19 +71,19 @@ class Row:
     pattern: str
     weather: Weather | None
     traffic: bool
-    deviation_m: Mean
-    lateral_m: Mean
-    speed_change_mps: Mean | None
+    deviation_m: Estimate
+    lateral_m: Estimate
+    speed_change_mps: Estimate | None
     count: int
     median_m: float
     least_m: float
     most_m: float
     left_lane: float
-    points: Mean | None
-    clean_points: Mean | None
-    leaderboard: Mean | None
+    points: Estimate | None
+    clean_points: Estimate | None
+    leaderboard: Estimate | None
     failed: float | None
-    first_event_s: Mean | None
+    first_event_s: Estimate | None
 
     @property
     def metres(self) -> str:
@@ -228,11 +228,11 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
     drawn = traffic or pattern != ATTACK or any(trial.start != NOMINAL for trial in trials)
     deviations = [trial.deviation_m for trial in trials]
 
-    def mean(values: Sequence[float]) -> Mean:
+    def mean(values: Sequence[float]) -> Estimate:
         found = mean_95(values)
         return found if drawn else replace(found, low=None, high=None)
 
-    def known(value: Callable[[Trial], float | None]) -> Mean | None:
+    def known(value: Callable[[Trial], float | None]) -> Estimate | None:
         values = [value(trial) for trial in trials]
         told = [each for each in values if each is not None]
         return mean(told) if len(told) == len(values) else None

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import roadproof
 from roadproof.datatypes import Weather
+from roadproof.driving.intervals import Estimate
 from roadproof.driving.starts import StartOffset
 from roadproof.errors import CheckError
 from roadproof.gate.plan import BudgetName, CheckPlan, Key
-from roadproof.gate.verdict import Estimate, Kind, Status
+from roadproof.gate.verdict import Kind, Status
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.records import RecordFile
 

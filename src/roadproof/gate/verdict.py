@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-import numpy as np
-from scipy import stats
-
-CONFIDENCE = 0.95
+from roadproof.driving.intervals import CONFIDENCE, Estimate
 
 
 class Kind(StrEnum):
@@ -38,21 +35,6 @@ class Status(StrEnum):
     TOO_FEW = "too few drives"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Estimate:
-    """A measure of a case with its 95 % interval.
-
-    Args:
-        value: the median in metres, or the share of drives, 0 to 1.
-        low: lower end of the interval; None where there are too few drives for one.
-        high: upper end of the interval; None where there are too few drives for one.
-    """
-
-    value: float
-    low: float | None
-    high: float | None
-
-
 Measures: TypeAlias = Mapping[str, Estimate]
 """`failed` on the bare road; `deviation_m` and `left_lane` over paint."""
 
@@ -73,31 +55,6 @@ class Change:
         """Whether a measure is worse by more than both; beside a reference of 0 every relative change is."""
         worse = now - before
         return worse > self.absolute and worse > self.relative * before
-
-
-def median_95(values: Sequence[float]) -> Estimate:
-    """The median with the exact interval that its order statistics give; it needs six values.
-
-    Nothing is assumed of how deviations are distributed: they lie near 0 and near a lane's width, and seldom between.
-
-    Raises:
-        ValueError: there is no value.
-    """
-    found: Any = stats.quantile_test(list(values), p=0.5).confidence_interval(CONFIDENCE)
-    low, high = float(found.low), float(found.high)
-    return Estimate(
-        value=float(np.median(values)), low=None if math.isnan(low) else low, high=None if math.isnan(high) else high
-    )
-
-
-def share_95(yes: int, count: int) -> Estimate:
-    """A share of drives with its exact (Clopper–Pearson) interval.
-
-    Raises:
-        ValueError: there is no drive, or there are fewer than say yes.
-    """
-    found: Any = stats.binomtest(yes, count).proportion_ci(CONFIDENCE)
-    return Estimate(value=yes / count, low=float(found.low), high=float(found.high))
 
 
 def least_drives(measure: str, limit: float) -> int:

@@ -23,7 +23,7 @@ from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_epis
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.infractions import counted
-from roadproof.driving.intervals import Mean, mean_95
+from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.hardening.run import Run
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.stress_test import OnProgress
@@ -92,7 +92,7 @@ class Verdict:
     """
 
     outcome: str
-    change_m: Mean
+    change_m: Estimate
     over: str
     before_m: float
     after_m: float

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluation import ATTACK, Row
-from roadproof.driving.intervals import Mean, mean_95
+from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path, write_text
@@ -44,7 +44,7 @@ class Compared:
     judged: Judged
     verdict: Verdict
     alone: dict[Weather | None, Row]
-    change: Mean | None
+    change: Estimate | None
 
     @property
     def predicted(self) -> bool:
@@ -133,7 +133,7 @@ def _name(path: Path, paths: Sequence[Path]) -> str:
     return Path(*own[-depth:]).as_posix()
 
 
-def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Mean | None:
+def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Estimate | None:
     """The mean change of the deviation over drives that have all but pattern and controller in common."""
     known = {_conditions(trial): trial.deviation_m for trial in before}
     shared = [trial for trial in after if _conditions(trial) in known]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from roadproof.calibration.report import Spread
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 
 MISSING = "–"
 UNKNOWN = "not known"
@@ -14,7 +14,7 @@ def in_words(name: str) -> str:
     return name.replace("-", " ")
 
 
-def mean_in_words(mean: Mean | None, digits: int) -> str:
+def mean_in_words(mean: Estimate | None, digits: int) -> str:
     """A mean with half the width of its 95 % interval, "1.33 ± 0.21"; without it where there was one run."""
     if mean is None:
         return MISSING

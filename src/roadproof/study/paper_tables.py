@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 from roadproof.report.formatting import MISSING, in_words
 from roadproof.scenarios import KINDS
 from roadproof.study.kept_jobs import StatedMethod
 from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, PENALTY, Block, Metric, Results
 from roadproof.study.rows import JobId
 from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios, paired, wilcoxon_p
-from roadproof.study.table import Cell, Estimate, Heading, Table, headings, slug
+from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
 from roadproof.study.table_notes import table_note
 
 SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}
@@ -117,9 +117,9 @@ def _paired_table(results: Results, ours: str, theirs: str, blocks: Sequence[Blo
                 continue
             p = wilcoxon_p(found.by_scenario)
             told = MISSING if p is None else "< 0.001" if p < 0.001 else f"{p:.3f}"
-            share = Estimate(found.at_least, 0, unit="%")
+            share = Number(found.at_least, 0, unit="%")
             counts = (str(found.difference.count), str(len(found.by_scenario)))
-            rows.append((*where, Estimate(found.difference), share, str(found.ties), told, *counts))
+            rows.append((*where, Number(found.difference), share, str(found.ties), told, *counts))
     said = (
         f"Difference: {ours} less {theirs}, above 0 where {ours} is stronger. p: two-sided Wilcoxon signed-rank "
         "test of the scenarios’ mean differences, not corrected for the number of rows."
@@ -218,12 +218,12 @@ def _gaps_table(results: Results, gaps: Mapping[JobId, str]) -> Table:
     )
 
 
-def _row_of(means: Sequence[Mean | None]) -> list[Cell]:
+def _row_of(means: Sequence[Estimate | None]) -> list[Cell]:
     """Means side by side, the highest marked; equal ones all, unless all are equal."""
     values = [mean.value for mean in means if mean is not None]
     top = max(values, default=0.0)
     one = min(values, default=0.0) < top - EQUAL
-    return [MISSING if mean is None else Estimate(mean, best=one and mean.value >= top - EQUAL) for mean in means]
+    return [MISSING if mean is None else Number(mean, best=one and mean.value >= top - EQUAL) for mean in means]
 
 
 def _spread(values: Values) -> str:
@@ -234,7 +234,7 @@ def _spread(values: Values) -> str:
     return f"{middle:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _share(mean: Mean | None) -> str:
+def _share(mean: Estimate | None) -> str:
     return MISSING if mean is None else f"{mean.value:.0%}"
 
 

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy import stats as _stats
 
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 
 stats: Any = _stats  # which types its own results as anything
 Values: TypeAlias = Any
@@ -24,7 +24,7 @@ EQUAL = 1e-9
 """Means of equal drives may differ by their rounding; such a pair is a tie."""
 
 
-def mean_over_scenarios(values: Values) -> Mean | None:
+def mean_over_scenarios(values: Values) -> Estimate | None:
     """The mean of all cases with its 95 % percentile bootstrap interval over scenarios.
 
     Whole scenarios are drawn with replacement, with all their cases; the draws are the same in every call. With
@@ -38,7 +38,7 @@ def mean_over_scenarios(values: Values) -> Mean | None:
     scenarios = values.groupby(level=0, sort=False)
     mean, sums, counts = float(values.mean()), scenarios.sum().to_numpy(), scenarios.size().to_numpy()
     if len(sums) < 2:
-        return Mean(mean, None, None, len(values))
+        return Estimate(mean, None, None, len(values))
     interval = stats.bootstrap(
         (sums, counts),
         _ratio,
@@ -48,7 +48,7 @@ def mean_over_scenarios(values: Values) -> Mean | None:
         method="percentile",
         random_state=np.random.default_rng(SEED),
     ).confidence_interval
-    return Mean(mean, float(interval.low), float(interval.high), len(values))
+    return Estimate(mean, float(interval.low), float(interval.high), len(values))
 
 
 def _ratio(sums: np.ndarray, counts: np.ndarray, axis: int) -> np.ndarray:
@@ -68,10 +68,10 @@ class Paired:
         by_scenario: mean difference of each scenario.
     """
 
-    ours: Mean
-    theirs: Mean
-    difference: Mean
-    at_least: Mean
+    ours: Estimate
+    theirs: Estimate
+    difference: Estimate
+    at_least: Estimate
     ties: int
     by_scenario: tuple[float, ...]
 

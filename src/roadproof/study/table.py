@@ -7,37 +7,37 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TypeAlias
 
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
-    """A mean that is shown with its interval.
+class Number:
+    """A number that is shown with its interval.
 
     Args:
-        mean: the mean and both ends of its interval.
+        estimate: the number and both ends of its interval.
         digits: how many digits stand after the point.
-        best: whether the mean is the best of its row.
+        best: whether it is the best of its row.
         unit: the unit behind the number; "%" for shares, which are in [0, 1].
     """
 
-    mean: Mean
+    estimate: Estimate
     digits: int = 2
     best: bool = False
     unit: str = ""
 
     @property
     def value(self) -> str:
-        """The mean in words."""
-        return self._shown(self.mean.value) + self.unit
+        """The number in words."""
+        return self._shown(self.estimate.value) + self.unit
 
     @property
     def interval(self) -> tuple[str, str] | None:
         """Both ends of the interval in words."""
-        if self.mean.low is None or self.mean.high is None:
+        if self.estimate.low is None or self.estimate.high is None:
             return None
-        return self._shown(self.mean.low), self._shown(self.mean.high)
+        return self._shown(self.estimate.low), self._shown(self.estimate.high)
 
     def _shown(self, number: float) -> str:
         shown = f"{number * 100 if self.unit == '%' else number:.{self.digits}f}"
@@ -45,7 +45,7 @@ class Estimate:
         return shown.replace("-", "−") if float(shown) else shown.removeprefix("-")
 
 
-Cell: TypeAlias = str | Estimate
+Cell: TypeAlias = str | Number
 
 
 @dataclass(frozen=True, slots=True)

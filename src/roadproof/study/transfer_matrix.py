@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from roadproof.driving.intervals import Mean
+from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
 from roadproof.report.formatting import MISSING
 from roadproof.study.charts import INK, MUTED, Picture, plain
 from roadproof.study.results import DEVIATION, JOB, Metric, check_finite
 from roadproof.study.rows import Frame
 from roadproof.study.statistics import mean_over_scenarios
-from roadproof.study.table import Cell, Estimate, Heading, Table, headings, slug
+from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
 
 
 def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
@@ -30,8 +30,8 @@ def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
     means = [mean for mean in matrix.to_numpy().flat if mean is not None]
     several, worst = len(found_on) > 1, _values(matrix).max(axis=0)
 
-    def cell(mean: Mean | None, driver: str) -> Cell:
-        return MISSING if mean is None else Estimate(mean, best=several and bool(mean.value == worst[driver]))
+    def cell(mean: Estimate | None, driver: str) -> Cell:
+        return MISSING if mean is None else Number(mean, best=several and bool(mean.value == worst[driver]))
 
     counts, missing = sorted({mean.count for mean in means}), matrix.size - len(means)
     return Table(
@@ -94,7 +94,7 @@ def _matrix(rows: Frame, metric: Metric) -> Frame:
 
 
 def _values(matrix: Frame) -> Frame:
-    def value(mean: Mean | None) -> float:
+    def value(mean: Estimate | None) -> float:
         return np.nan if mean is None else mean.value
 
     return matrix.map(value).astype(float)

@@ -42,8 +42,8 @@ _USUAL, _MEASURED = "from usual costs", "the controller measured here, drives fr
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Estimate:
-    """An estimate of drives, time and disk space that some work takes.
+class Workload:
+    """Drives, time and disk space that some work takes, estimated before it begins.
 
     Args:
         drives: number of simulator drives.
@@ -57,7 +57,7 @@ class Estimate:
     megabytes: float = 0.0
     basis: str = _USUAL
 
-    def __add__(self, other: Estimate) -> Estimate:
+    def __add__(self, other: Workload) -> Workload:
         return replace(
             other if self.basis == _USUAL else self,
             drives=self.drives + other.drives,
@@ -65,13 +65,13 @@ class Estimate:
             megabytes=self.megabytes + other.megabytes,
         )
 
-    def times(self, count: int, *, at_once: int = 1) -> Estimate:
-        """The estimate of the same work done `count` times, `at_once` of them side by side."""
+    def times(self, count: int, *, at_once: int = 1) -> Workload:
+        """The same work done `count` times, `at_once` of them side by side."""
         seconds = self.seconds * math.ceil(count / at_once)
         return replace(self, drives=self.drives * count, seconds=seconds, megabytes=self.megabytes * count)
 
 
-RECORDED_DRIVE = Estimate(drives=1, seconds=DRIVE_S, megabytes=DRIVE_MB)
+RECORDED_DRIVE = Workload(drives=1, seconds=DRIVE_S, megabytes=DRIVE_MB)
 """A drive past the bare canvas, or a replay of one, whose pictures are kept."""
 
 
@@ -104,7 +104,7 @@ def frame_seconds(controller: Controller, *, gradients: bool = True) -> float:
 
 def of_search(
     method: Method, objective: Objective, frames: int, controller: Controller, *, groups: int = 2
-) -> Estimate:
+) -> Workload:
     """Estimate a search for patterns.
 
     Args:
@@ -127,10 +127,10 @@ def of_search(
         for rung in rungs
     )
     seconds = groups * count * _looks(objective) * frame_seconds(controller, gradients=method.by_gradient)
-    return Estimate(seconds=seconds, megabytes=1.0, basis=_MEASURED)
+    return Workload(seconds=seconds, megabytes=1.0, basis=_MEASURED)
 
 
-def of_cheapest(figures: int, objective: Objective, controller: Controller) -> Estimate:
+def of_cheapest(figures: int, objective: Objective, controller: Controller) -> Workload:
     """Estimate the search for less paint, where every limit of the area is tried.
 
     Args:
@@ -142,7 +142,7 @@ def of_cheapest(figures: int, objective: Objective, controller: Controller) -> E
     # Below each limit the pattern, and what it is without each of its figures, is only valued.
     valued = len(UNSURE) * STRETCH_STEPS * (1 + figures) / 3
     count = MOST_LEVELS * (climbed * _looks(objective) + valued)
-    return Estimate(seconds=count * frame_seconds(controller), basis=_MEASURED)
+    return Workload(seconds=count * frame_seconds(controller), basis=_MEASURED)
 
 
 def _looks(objective: Objective) -> int:
@@ -158,24 +158,24 @@ def _pictures(rung: Rung, objective: Objective, frames: int) -> int:
     return math.ceil(STRETCH_STEPS / (rung.every if rung.every > 1 else objective.every))
 
 
-def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Estimate:
+def of_drives(alone: int, crowded: int = 0, *, processes: int = 1) -> Workload:
     """Estimate drives in the town, alone and in traffic."""
     seconds = (alone * DRIVE_S + crowded * CROWDED_S) / processes
-    return Estimate(drives=alone + crowded, seconds=seconds, megabytes=(alone + crowded) * EPISODE_MB)
+    return Workload(drives=alone + crowded, seconds=seconds, megabytes=(alone + crowded) * EPISODE_MB)
 
 
 def of_evaluation(
     weathers: int, starts: int, runs: int, *, random: int = 0, film: bool = True, processes: int = 1
-) -> Estimate:
+) -> Workload:
     """Estimate an evaluation: every clean drive, every painted one, and the film made after them."""
     alone = weathers * (2 * max(starts, 1) + random)
     crowded = weathers * runs * (3 if random else 2)
-    return of_drives(alone, crowded, processes=processes) + Estimate(
+    return of_drives(alone, crowded, processes=processes) + Workload(
         seconds=2 * DRIVE_S * film, megabytes=FILM_MB * film
     )
 
 
-def of_run(budget: Budget, controller: Controller, *, film: bool = True, processes: int = 1) -> Estimate:
+def of_run(budget: Budget, controller: Controller, *, film: bool = True, processes: int = 1) -> Workload:
     """Estimate a whole stress test of one scenario.
 
     Args:

@@ -7,8 +7,8 @@ import torch
 
 from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
 from roadproof.compositing import Variation
-from roadproof.pipeline import estimate
-from roadproof.pipeline.estimate import frame_seconds, of_search
+from roadproof.pipeline import workload
+from roadproof.pipeline.workload import frame_seconds, of_search
 
 
 class Waits(torch.nn.Module):
@@ -41,7 +41,7 @@ def test_threads_that_wait_for_each_other_do_not_count():
 
 @pytest.mark.parametrize("objective", [PathDeviation, SteeringShift])
 def test_a_search_over_looks_shows_every_frame_in_each(monkeypatch, objective):
-    monkeypatch.setattr(estimate, "frame_seconds", lambda *_, **__: 0.002)
+    monkeypatch.setattr(workload, "frame_seconds", lambda *_, **__: 0.002)
     one, four = (
         of_search(GradOpt(), objective(variation=variation), 40, Waits(0.0)).seconds
         for variation in (None, Variation(draws=4))
