@@ -17,21 +17,21 @@ from pathlib import Path
 from roadproof.io.files import write_json
 from roadproof.machine import made_with
 from roadproof.scenarios import builtin_scenarios
-from roadproof.training.scores import DrivingScore, Trial, score_drives
+from roadproof.training.scores import BareDrive, DrivingScore, score_drives
 
 TRAFFIC_SEEDS = (0, 1, 2)
 AGENTS = 20
 
 
-def summary(drives: list[tuple[Trial, DrivingScore]]) -> dict[str, object]:
+def summary(drives: list[tuple[BareDrive, DrivingScore]]) -> dict[str, object]:
     """Counts and spreads of a set of drives."""
     scores = [score for _, score in drives]
     return {
         "drives": len(drives),
         "clean": sum(one.clean for one in scores),
-        "not_arrived": [trial.scenario.name for trial, one in drives if not one.arrived],
+        "not_arrived": [drive.scenario.name for drive, one in drives if not one.arrived],
         "events": dict(Counter(event.kind.value for one in scores for event in one.events)),
-        "with_events": [trial.scenario.name for trial, one in drives if one.events],
+        "with_events": [drive.scenario.name for drive, one in drives if one.events],
         "seconds_median": round(statistics.median(one.seconds for one in scores), 2),
         "seconds_longest": round(max(one.seconds for one in scores), 2),
         "lateral_m_largest": round(max(one.lateral_m for one in scores), 3),
@@ -48,7 +48,7 @@ def main() -> None:
     begin = time.perf_counter()
     conditions = [("alone", 0, 0), *((f"traffic, seed {seed}", AGENTS, seed) for seed in TRAFFIC_SEEDS)]
     for name, agents, seed in conditions:
-        trials = [Trial(scenario=scenario, cars=agents, pedestrians=agents, seed=seed) for scenario in scenarios]
+        trials = [BareDrive(scenario=scenario, cars=agents, pedestrians=agents, seed=seed) for scenario in scenarios]
         result = summary(list(score_drives(trials, None)))
         results[name] = result
         print(f"{name}: {result['clean']} of {result['drives']} clean, events {result['events']}")

@@ -30,7 +30,7 @@ from roadproof.machine import made_with
 from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario, builtin_scenarios
 from roadproof.training.random_scenarios import random_scenario
-from roadproof.training.scores import DrivingScore, Trial, score_drives
+from roadproof.training.scores import BareDrive, DrivingScore, score_drives
 
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 AGENTS = 20
@@ -54,13 +54,13 @@ def random_ways(map_name: str) -> list[Scenario]:
     ]
 
 
-def conditions() -> dict[str, list[Trial]]:
+def conditions() -> dict[str, list[BareDrive]]:
     """What is driven, by name."""
     built_in = builtin_scenarios()
-    every = {weather.value: [Trial(scenario=s, weather=weather) for s in built_in] for weather in WEATHERS}
-    every["traffic"] = [Trial(scenario=s, cars=AGENTS, pedestrians=AGENTS) for s in built_in]
-    every["random ways, town"] = [Trial(scenario=s) for s in random_ways("town")]
-    every["random ways, second town"] = [Trial(scenario=s) for s in random_ways("second")]
+    every = {weather.value: [BareDrive(scenario=s, weather=weather) for s in built_in] for weather in WEATHERS}
+    every["traffic"] = [BareDrive(scenario=s, cars=AGENTS, pedestrians=AGENTS) for s in built_in]
+    every["random ways, town"] = [BareDrive(scenario=s) for s in random_ways("town")]
+    every["random ways, second town"] = [BareDrive(scenario=s) for s in random_ways("second")]
     return every
 
 
@@ -107,10 +107,10 @@ def study(controllers: Sequence[str], names: Sequence[str], processes: int, out:
                 if name not in names:
                     continue
                 done = drives.setdefault(controller, {}).setdefault(name, {})
-                missing = [trial for trial in trials if trial.scenario.name not in done]
+                missing = [drive for drive in trials if drive.scenario.name not in done]
                 task = bar.add_task(f"{controller}, {name}", total=len(trials), completed=len(done))
-                for trial, score in score_drives(missing, str(shipped_weights(controller)), processes=processes):
-                    done[trial.scenario.name] = row(score)
+                for drive, score in score_drives(missing, str(shipped_weights(controller)), processes=processes):
+                    done[drive.scenario.name] = row(score)
                     bar.advance(task)
                     keep(content, out)
                 found = summary(list(done.values()))

@@ -9,7 +9,7 @@ import torch
 
 from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import Cheapest, GradOpt, PathDeviation, attack, cheapest, site_of
-from roadproof.attacks.cheapest import in_words
+from roadproof.attacks.cheapest import cheapest_in_words
 from roadproof.attacks.groups import RIGHT_GROUP
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.paint import PaintLimits, conspicuousness
@@ -76,13 +76,13 @@ def test_less_paint_still_reaches_the_deviation_and_keeps_the_limits(searched, t
     site = site_of(road)
     far = (kept.pattern.colours.double() - torch.tensor(site.asphalt).double()).norm(dim=-1) / math.sqrt(3)
     assert float(far.max()) <= 0.4
-    assert "Least paint that is predicted" in in_words(less, wanted_m)
+    assert "Least paint that is predicted" in cheapest_in_words(less, wanted_m)
 
 
 def test_a_deviation_that_nothing_reaches_has_no_cheapest_pattern(searched):
     road, found = searched
     assert cheapest(road, PullsToBrightPaint(), found, 90.0, groups=[RIGHT_GROUP], objective=GOAL) is None
-    assert "there is none with less paint" in in_words(None, 90.0)
+    assert "there is none with less paint" in cheapest_in_words(None, 90.0)
 
 
 def test_deviations_out_of_range_and_canvases_of_unknown_size_are_one_line(searched):

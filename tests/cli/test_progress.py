@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from roadproof.cli import progress as saying
-from roadproof.cli.progress import Loudness, in_words, progress, speak, stages
+from roadproof.cli.progress import Loudness, duration_in_words, progress, speak, stages
 from roadproof.cli.verbs import begin
 from roadproof.errors import OutputError
 from roadproof.pipeline.workload import Workload
@@ -53,7 +53,7 @@ def test_silence_is_broken_with_the_time_left(capsys, monkeypatch):
 
 @pytest.mark.parametrize(("seconds", "words"), [(12.4, "12 s"), (600.0, "10 min"), (3 * 3600.0, "3.0 h")])
 def test_times_are_said_as_people_do(seconds, words):
-    assert in_words(seconds) == words
+    assert duration_in_words(seconds) == words
 
 
 def test_both_at_once_are_refused(invoke):

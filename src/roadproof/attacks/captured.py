@@ -130,7 +130,7 @@ def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Step
         return in_one_line(error)
 
 
-def in_words(steps: Counter[str | None]) -> str:
+def steps_in_words(steps: Counter[str | None]) -> str:
     """How steps were run, from their number by what `replay_of` said, "" where they were replayed; "" on a CPU."""
     reasons = [reason for reason in steps if reason]
     if not reasons and not steps[""]:

@@ -187,7 +187,7 @@ def cheapest(
     )
 
 
-def in_words(found: Cheapest | None, wanted_m: float) -> str:
+def cheapest_in_words(found: Cheapest | None, wanted_m: float) -> str:
     """The outcome of the search for less paint, as one sentence."""
     if found is None:
         return (

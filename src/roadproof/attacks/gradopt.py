@@ -24,7 +24,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from roadproof.attacks.batched import BatchedMeasure
-from roadproof.attacks.captured import Replay, in_words, replay_of
+from roadproof.attacks.captured import Replay, replay_of, steps_in_words
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.groups import Points, Values
 from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
@@ -220,7 +220,7 @@ def gradopt(
         last.redraw(FIXED)
         best = last.values(space, state["best_unit"])
     gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
-    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, in_words(run))
+    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps_in_words(run))
 
 
 def _starts(

@@ -180,14 +180,14 @@ def _less_paint(
 ) -> dict[str, Any] | None:
     """The least paint for a deviation, which the folder keeps, as its file has it; None if there is none."""
     from roadproof.attacks import cheapest
-    from roadproof.attacks.cheapest import MOST_LEVELS, in_words
+    from roadproof.attacks.cheapest import MOST_LEVELS, cheapest_in_words
     from roadproof.cli.progress import progress
 
     with progress("Looking for less paint", MOST_LEVELS) as show:
         less = cheapest(
             drives, attacked, strongest, wanted_m, groups=groups, objective=objective, device=device, on_level=show
         )
-    say(in_words(less, wanted_m))
+    say(cheapest_in_words(less, wanted_m))
     if less is None:
         return None
     less.save(folder)

@@ -12,7 +12,7 @@ from roadproof.cli.options import argument
 from roadproof.cli.output import answer, say
 
 if TYPE_CHECKING:
-    from roadproof.training.scores import DrivingScore, Trial
+    from roadproof.training.scores import BareDrive, DrivingScore
 
 
 def check_controller(
@@ -43,12 +43,12 @@ def check_controller(
         raise typer.Exit(0 if report.passed else 1)
 
     # Panda3D is an extra.
-    from roadproof.training.scores import Trial, score_drives
+    from roadproof.training.scores import BareDrive, score_drives
 
-    trials = [Trial(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in driven]
-    scored: list[tuple[Trial, DrivingScore]] = []
-    with progress("Driving", len(trials), "{:.0f} clean") as show:
-        for done in score_drives(trials, spec, processes=processes):
+    wanted = [BareDrive(scenario=s, weather=sky, cars=cars, pedestrians=pedestrians) for s in driven]
+    scored: list[tuple[BareDrive, DrivingScore]] = []
+    with progress("Driving", len(wanted), "{:.0f} clean") as show:
+        for done in score_drives(wanted, spec, processes=processes):
             scored.append(done)
             show(len(scored), sum(score.clean for _, score in scored))
     scored.sort(key=lambda pair: pair[0].scenario.name)
@@ -59,7 +59,7 @@ def check_controller(
     raise typer.Exit(0 if report.passed else 1)
 
 
-def _say_scores(scored: list[tuple[Trial, DrivingScore]]) -> None:
+def _say_scores(scored: list[tuple[BareDrive, DrivingScore]]) -> None:
     scores = [score for _, score in scored]
     clean, turns = sum(score.clean for score in scores), sum(score.turns for score in scores)
     say(
@@ -68,8 +68,8 @@ def _say_scores(scored: list[tuple[Trial, DrivingScore]]) -> None:
         f"steering changes by {sum(s.steer_change for s in scores) / len(scores):.4f} a step; "
         f"{sum(s.turns_taken for s in scores)} of {turns} junctions left as commanded"
     )
-    for trial, score in scored:
+    for drive, score in scored:
         if not score.clean:
             what = ", ".join(f"{e.kind} at {e.time_s:.1f} s" for e in score.events) or "did not arrive"
             x, y = score.failed_at_m or (0.0, 0.0)
-            say(f"  {trial.scenario.name}: {what}, near ({x:.0f}, {y:.0f})")
+            say(f"  {drive.scenario.name}: {what}, near ({x:.0f}, {y:.0f})")

@@ -43,7 +43,7 @@ def demo(
     paint: Paint,
 ) -> None:
     """Record, calibrate, attack, choose by driving, evaluate and report: the whole loop for one scenario."""
-    from roadproof.attacks.cheapest import in_words
+    from roadproof.attacks.cheapest import cheapest_in_words
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
@@ -84,7 +84,7 @@ def demo(
     if cheapest is not None:
         less = result.cheapest
         driven = "" if less is None else f"; driven {less[1].deviation_m:.2f} m"
-        say(in_words(less and less[0], cheapest) + driven)
+        say(cheapest_in_words(less and less[0], cheapest) + driven)
     answer(stored(out / "result.json"))
 
 

@@ -151,9 +151,9 @@ class _Lines:
         title, done, total, value = self._now
         said = " ".join(filter(None, (title or "Beginning", f"{done}/{total}" if total else "", value)))
         if title and (seconds := self._told_s - self._since_s) >= 1:
-            said += f", {in_words(seconds)}"
+            said += f", {duration_in_words(seconds)}"
             if self._first < done < total:
-                said += f", about {in_words(seconds * (total - done) / (done - self._first))} left"
+                said += f", about {duration_in_words(seconds * (total - done) / (done - self._first))} left"
         tell(said)
 
 
@@ -162,7 +162,7 @@ def tell(line: str) -> None:
     Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False).print(line)
 
 
-def in_words(seconds: float) -> str:
+def duration_in_words(seconds: float) -> str:
     """A time as people say it: "40 s", "12 min", "3.5 h"."""
     if seconds < 100:
         return f"{seconds:.0f} s"

@@ -16,7 +16,7 @@ import typer
 from roadproof.cli.group import words_given
 from roadproof.cli.output import answer, in_json, say
 from roadproof.cli.paint import OPTIONS, with_paint
-from roadproof.cli.progress import Loudness, in_words, is_quiet, speak, tell
+from roadproof.cli.progress import Loudness, duration_in_words, is_quiet, speak, tell
 from roadproof.errors import RoadproofError
 from roadproof.io.commands import write_command
 from roadproof.io.locks import hold
@@ -111,7 +111,7 @@ def begin(work: Workload, *folders: Path) -> None:
         OutputError: a folder cannot be written, or another process works in it.
     """
     parts = [f"{work.drives} drives"] if work.drives else []
-    told = f"{', '.join((*parts, f'about {in_words(work.seconds)}', f'{work.megabytes:.0f} MB on the disk'))}"
+    told = f"{', '.join((*parts, f'about {duration_in_words(work.seconds)}', f'{work.megabytes:.0f} MB on the disk'))}"
     if _dry_run:
         say(f"{told}; less where the folder holds some of it already ({work.basis})")
         answer(asdict(work))

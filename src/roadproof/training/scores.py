@@ -24,8 +24,8 @@ TAKEN_M = 2.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Trial:
-    """One drive to be scored.
+class BareDrive:
+    """A drive over the bare road that is to be scored.
 
     Args:
         scenario: the scenario to drive.
@@ -44,7 +44,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DrivingScore:
-    """What came of a trial.
+    """What came of a drive.
 
     Args:
         arrived: whether the goal was reached in time.
@@ -80,30 +80,30 @@ class DrivingScore:
 
 
 def score_drives(
-    trials: Sequence[Trial], spec: str | None, *, processes: int = 1
-) -> Iterator[tuple[Trial, DrivingScore]]:
-    """Drive trials and score them, as they come.
+    drives: Sequence[BareDrive], spec: str | None, *, processes: int = 1
+) -> Iterator[tuple[BareDrive, DrivingScore]]:
+    """Make the drives and score them, as they come.
 
     Args:
-        trials: the drives to be scored.
+        drives: the drives to be scored.
         spec: spec of the controller that drives; None for the expert.
         processes: how many simulators drive at once.
 
     Raises:
         ControllerError: the controller cannot be loaded, or does not fit the simulator.
     """
-    return spread(_score, trials, partial(driving, spec, STEP_S), processes=processes)
+    return spread(_score, drives, partial(driving, spec, STEP_S), processes=processes)
 
 
-def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial) -> DrivingScore:
-    """Drive one trial; alone on the road it ends at the first event, since the score is known then.
+def score_drive(town: TownSimulator, controller: Controller | None, wanted: BareDrive) -> DrivingScore:
+    """Make one drive; alone on the road it ends at the first event, since the score is known then.
 
     Args:
         town: an open simulator.
         controller: the controller that drives; None for the expert.
-        trial: the drive to be scored.
+        wanted: the drive to be scored.
     """
-    alone = trial.cars + trial.pedestrians == 0
+    alone = wanted.cars + wanted.pedestrians == 0
     track: list[tuple[float, float]] = []
     events: list[Event] = []
 
@@ -115,11 +115,11 @@ def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial
     drive = rollout(
         town,
         expert if controller is None else controller,
-        trial.scenario,
-        weather=trial.weather,
-        cars=trial.cars,
-        pedestrians=trial.pedestrians,
-        seed=trial.seed,
+        wanted.scenario,
+        weather=wanted.weather,
+        cars=wanted.cars,
+        pedestrians=wanted.pedestrians,
+        seed=wanted.seed,
         until=is_over,
     )
     at, aside = np.array(track).T
@@ -141,8 +141,8 @@ def score_drive(town: TownSimulator, controller: Controller | None, trial: Trial
     )
 
 
-def _score(inside: Driving, trial: Trial) -> DrivingScore:
-    return score_drive(inside.town, inside.controller, trial)
+def _score(inside: Driving, drive: BareDrive) -> DrivingScore:
+    return score_drive(inside.town, inside.controller, drive)
 
 
 def _taken(crossing: Crossing, at: np.ndarray, aside: np.ndarray, arrived: bool) -> bool:
