@@ -162,7 +162,8 @@ class ClosedLoopMeasure(BatchedMeasure):
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""
         # The variation is in the fingerprint of the steering shift.
-        worlds = [(each.vehicle, each.recordings.obstacles) for each in self.worlds]
+        obstacles = self._steering.recordings.obstacles
+        worlds = [(each.vehicle, obstacles) for each in self.worlds]
         more = repr((*self.told(), worlds))
         return digest(more, self._steering.fingerprint())
 

@@ -89,6 +89,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         weather: Weather = Weather.CLEAR_NOON,
         device: torch.device | str = "cpu",
     ) -> None:
+        self.recordings = recordings
         self._world = RecordedWorld(recordings, vehicle=vehicle, device=device)
         if self._world.vehicle.dt_s != self._world.course.dt_s:
             raise SimulatorError(
@@ -98,25 +99,20 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         super().__init__(recordings.camera, recordings.view, self._world.course.dt_s)
         self._weather = Weather(weather)
 
-    @property
-    def recordings(self) -> RecordingSet:
-        """The recordings in which it drives."""
-        return self._world.recordings
-
     @cached_property
     def identity(self) -> str:
         """A hash of frames, poses, colours and vehicle: other recordings are another world."""
-        return digest(f"{self._world.vehicle} {self._world.recordings.digest()}")
+        return digest(f"{self._world.vehicle} {self.recordings.digest()}")
 
     @cached_property
     def scenario(self) -> Scenario:
         """The recorded stretch as a scenario: from its first frame to the canvas' end; no simulator has its map."""
-        course, recordings = self._world.course, self._world.recordings
+        course = self._world.course
         first, last = course.first, course.first + course.count - 1
         goal_x_m, goal_y_m = self.way[-1].tolist()
         turned = float(course.poses.yaw_rad[last] - course.poses.yaw_rad[first])
         kind: Kind = "straight" if abs(turned) <= TURNS_RAD else "left" if turned > 0 else "right"
-        name = recordings.origin.split(",")[0].strip()
+        name = self.recordings.origin.split(",")[0].strip()
         return Scenario(
             name=name if is_plain_name(name) else "recorded",
             kind=kind,

@@ -129,7 +129,6 @@ class RecordedWorld:
         clean = recordings.clean
         if clean is None:
             raise RecordingError("the set has no clean drive, which a recorded world begins with; record one")
-        self.recordings = recordings
         self.bank = FrameBank(recordings, device=device)
         assert clean.track is not None
         tracks = [drive.track for drive in recordings.recordings if drive.track is not None]
@@ -192,7 +191,7 @@ class RecordedWorld:
         count = len(starts) * (1 if pattern is None else len(pattern.boxes))
         if pattern is not None:
             pattern = pattern.mapped(lambda part: part.repeat_interleave(len(starts), 0))
-            pattern = pattern if looks is None else looks.placed(pattern, self.recordings.canvas)
+            pattern = pattern if looks is None else looks.placed(pattern, self.bank.canvas)
         car = self.begin(starts, count // len(starts))
         course = self.course
         rows: list[tuple[Tensor, ...]] = []
