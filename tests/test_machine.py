@@ -28,16 +28,36 @@ print(faults() - before)
 """
 
 
-def page_faults(first: str) -> int:
+GIVE_BACK = """
+import torch
+from roadproof.machine import give_back_freed_memory, keep_freed_memory
+keep_freed_memory()
+taken = lambda: int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1])
+before = taken()
+kept, freed = torch.ones(1000), [torch.ones(8 << 18) for _ in range(20)]
+last = torch.ones(1000)
+del freed
+{first}
+print(taken() - before)
+"""
+glibc_only = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+
+
+def answer_of(script: str, first: str) -> int:
     told = subprocess.run(
-        [sys.executable, "-c", ASK_AGAIN.format(first=first)], capture_output=True, text=True, check=True
+        [sys.executable, "-c", script.format(first=first)], capture_output=True, text=True, check=True
     )
     return int(told.stdout)
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library is not glibc")
+@glibc_only
 def test_blocks_that_were_freed_are_used_again() -> None:
-    assert page_faults("keep_freed_memory()") < 0.3 * page_faults("")
+    assert answer_of(ASK_AGAIN, "keep_freed_memory()") < 0.3 * answer_of(ASK_AGAIN, "")
+
+
+@glibc_only
+def test_what_was_freed_is_given_back_where_that_is_asked() -> None:
+    assert answer_of(GIVE_BACK, "give_back_freed_memory()") < 0.1 * answer_of(GIVE_BACK, "")
 
 
 ASK_CONTROLLER = (

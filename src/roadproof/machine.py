@@ -29,6 +29,12 @@ def keep_freed_memory() -> None:
     set_option(_TRIM_THRESHOLD, _NEVER)
 
 
+def give_back_freed_memory() -> None:
+    """Give what this process has freed back to the system, where the C library can be told to: others may need it."""
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def sleep_while_waiting() -> None:
     """Let torch's threads sleep soon while one waits for another, where GNU OpenMP runs them; before torch is imported.
 

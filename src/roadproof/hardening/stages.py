@@ -25,6 +25,7 @@ from roadproof.hardening.views import Street
 from roadproof.io.files import write_tensors
 from roadproof.io.identity import stated
 from roadproof.io.known import known_by
+from roadproof.machine import give_back_freed_memory
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stress_test import OnProgress, StressTest
 from roadproof.processes import spread, stopping
@@ -63,6 +64,8 @@ class Stages:
         for number in range(count + 1):
             if number:
                 self.tune(number, tests)
+                # The streets took gigabytes, which the processes that attack next need.
+                give_back_freed_memory()
             tests.append(self.attack(number))
         costs = [cost for each in tests for test in each for cost in test.cost.values()]
         self.ledger.calls("attack", sum(cost.simulator_calls for cost in costs))
