@@ -48,8 +48,8 @@ def main() -> None:
     begin = time.perf_counter()
     conditions = [("alone", 0, 0), *((f"traffic, seed {seed}", AGENTS, seed) for seed in TRAFFIC_SEEDS)]
     for name, agents, seed in conditions:
-        trials = [BareDrive(scenario=scenario, cars=agents, pedestrians=agents, seed=seed) for scenario in scenarios]
-        result = summary(list(score_drives(trials, None)))
+        wanted = [BareDrive(scenario=scenario, cars=agents, pedestrians=agents, seed=seed) for scenario in scenarios]
+        result = summary(list(score_drives(wanted, None)))
         results[name] = result
         print(f"{name}: {result['clean']} of {result['drives']} clean, events {result['events']}")
     results["wall_s"] = round(time.perf_counter() - begin, 1)

@@ -103,12 +103,12 @@ def study(controllers: Sequence[str], names: Sequence[str], processes: int, out:
     drives: dict[str, dict[str, dict[str, Any]]] = content["drives"]
     with Progress() as bar:
         for controller in controllers:
-            for name, trials in conditions().items():
+            for name, wanted in conditions().items():
                 if name not in names:
                     continue
                 done = drives.setdefault(controller, {}).setdefault(name, {})
-                missing = [drive for drive in trials if drive.scenario.name not in done]
-                task = bar.add_task(f"{controller}, {name}", total=len(trials), completed=len(done))
+                missing = [drive for drive in wanted if drive.scenario.name not in done]
+                task = bar.add_task(f"{controller}, {name}", total=len(wanted), completed=len(done))
                 for drive, score in score_drives(missing, str(shipped_weights(controller)), processes=processes):
                     done[drive.scenario.name] = row(score)
                     bar.advance(task)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from roadproof.driving.intervals import Estimate, median_95, share_95
-from roadproof.gate.verdict import Change, Status, judge, least_drives
+from roadproof.driving.intervals import Estimate
+from roadproof.gate.verdict import Change, Status, judge, least_drives, median_95, share_95
 
 
 def covered(count, low, high):

@@ -79,10 +79,10 @@ def test_who_stands_until_the_drive_is_given_up_does_not_arrive(town):
 
 
 def test_processes_and_one_process_agree():
-    trials = [
+    wanted = [
         BareDrive(scenario=find_scenario(name, SCENARIOS), weather=Weather.RAINY_NOON, cars=3, pedestrians=3, seed=1)
         for name in ("straight-10", "right-07")
     ]
-    alone, spread = dict(score_drives(trials, None)), dict(score_drives(trials, None, processes=2))
+    alone, spread = dict(score_drives(wanted, None)), dict(score_drives(wanted, None, processes=2))
     assert alone == spread
-    assert set(alone) == set(trials)
+    assert set(alone) == set(wanted)

@@ -1,18 +1,15 @@
-"""Means, medians and shares of independent runs, each with its interval."""
+"""Figures of independent runs with their intervals, and the mean."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from roadproof.errors import EpisodeError
-
-CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,30 +45,5 @@ def mean_95(values: Sequence[float]) -> Estimate:
     mean = float(numbers.mean())
     if numbers.size == 1:
         return Estimate(mean, None, None, 1)
-    half = float(special.stdtrit(numbers.size - 1, 0.5 + CONFIDENCE / 2)) * float(numbers.std(ddof=1))
-    half /= math.sqrt(numbers.size)
+    half = float(special.stdtrit(numbers.size - 1, 0.975)) * float(numbers.std(ddof=1)) / math.sqrt(numbers.size)
     return Estimate(mean, mean - half, mean + half, numbers.size)
-
-
-def median_95(values: Sequence[float]) -> Estimate:
-    """The median with the exact interval that its order statistics give; it needs six values.
-
-    Nothing is assumed of how deviations are distributed: they lie near 0 and near a lane's width, and seldom between.
-
-    Raises:
-        ValueError: there is no value.
-    """
-    found: Any = stats.quantile_test(list(values), p=0.5).confidence_interval(CONFIDENCE)
-    low, high = float(found.low), float(found.high)
-    ends = None if math.isnan(low) else low, None if math.isnan(high) else high
-    return Estimate(float(np.median(values)), *ends, len(values))
-
-
-def share_95(yes: int, count: int) -> Estimate:
-    """A share of drives with its exact (Clopper–Pearson) interval.
-
-    Raises:
-        ValueError: there is no drive, or there are fewer than say yes.
-    """
-    found: Any = stats.binomtest(yes, count).proportion_ci(CONFIDENCE)
-    return Estimate(yes / count, float(found.low), float(found.high), count)

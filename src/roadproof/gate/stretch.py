@@ -16,10 +16,9 @@ from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_epis
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import make_missing
 from roadproof.driving.infractions import counted
-from roadproof.driving.intervals import median_95, share_95
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
-from roadproof.gate.verdict import Kind, Measures
+from roadproof.gate.verdict import Kind, Measures, median_95, share_95
 from roadproof.io.identity import digest
 from roadproof.paint import Site
 from roadproof.patterns import Pattern, save_pattern
