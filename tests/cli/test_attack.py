@@ -44,6 +44,10 @@ CONTROLLER = textwrap.dedent(
         return controller
     """
 )
+DRIVES = CONTROLLER.replace("class Linear", "class Drives").replace(
+    "raise NotImplementedError",
+    "from roadproof.datatypes import Control; return Control(0.0, 0.5, 0.0)",
+)
 
 
 @pytest.fixture(scope="module")
@@ -216,3 +220,30 @@ def test_importing_roadproof_is_quick_and_free_of_heavy_libraries():
         timeout=60,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_the_same_search_is_answered_from_its_folder_and_another_is_refused_there(tmp_path, invoke, monkeypatch):
+    save_recordings(recording_set(frames=3), tmp_path / "set")
+    (tmp_path / "driving_controller.py").write_text(DRIVES)
+    monkeypatch.chdir(tmp_path)
+    asked = {"controller": "driving_controller:Drives"}
+    assert invoke(*command("--out", "out", **asked))[0] == 0
+    found = (tmp_path / "out" / "result.json").read_bytes()
+    code, printed = invoke(*command("--out", "out", **asked))
+    assert code == 0
+    assert "Strongest for clean+" in printed.out
+    assert (tmp_path / "out" / "result.json").read_bytes() == found, "it took other seconds: it was searched again"
+    for another in (["--seed", "1"], ["--iterations", "5"], ["--random-patterns", "4"]):
+        code, printed = invoke(*command("--out", "out", *another, **asked))
+        assert code == 2
+        assert "out holds a search with" in printed.err
+        assert "choose another folder, or remove it" in printed.err
+        assert (tmp_path / "out" / "result.json").read_bytes() == found
+
+
+def test_a_search_on_a_controller_that_cannot_drive_is_never_taken_for_a_kept_one(here, tmp_path, invoke):
+    assert invoke(*command("--out", str(tmp_path / "out")))[0] == 0
+    code, printed = invoke(*command("--out", str(tmp_path / "out")))
+    assert code == 2
+    assert "holds a search, perhaps of another controller" in printed.err
+    assert "choose another folder, or remove it" in printed.err

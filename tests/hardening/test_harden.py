@@ -19,8 +19,8 @@ from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
 from roadproof.hardening.harden import STAGES, harden
 from roadproof.hardening.page import write_hardening
-from roadproof.hardening.run import Run
-from roadproof.hardening.stages import Stages
+from roadproof.hardening.plan import HardeningPlan
+from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import Tuning, training_step
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.scenarios import Scenario
@@ -79,7 +79,7 @@ class StoppedError(Exception):
 
 def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
     budget = dataclasses.replace(TINY, town_drives=1)
-    asked = Run(
+    asked = HardeningPlan(
         spec="pilotnet",
         scenarios=(street(tmp_path, "near", 15.0),),
         folder=tmp_path / "out",
@@ -95,7 +95,7 @@ def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
     asked.round(1).mkdir(parents=True)
     save_controller(spoilt, asked.weights(1), origin="spoilt")
     ledger = Ledger(asked.folder, {}, STAGES)
-    stages = Stages(asked, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
+    stages = HardeningStages(asked, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
     first = stages.town(1).draw(500, torch.Generator().manual_seed(0), to_paint=False)
     assert not (asked.round(1) / "town").exists()
     both = stages.town(2).draw(500, torch.Generator().manual_seed(0), to_paint=False)

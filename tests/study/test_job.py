@@ -22,12 +22,13 @@ from roadproof.attacks import CMAES, AttackResult, GradOpt, PathDeviation, Publi
 from roadproof.calibration import Method
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
+from roadproof.driving.starts import StartPlan
 from roadproof.patterns import load_pattern
 from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING
 from roadproof.scenarios import find_scenario
 from roadproof.study.job import run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
-from roadproof.study.plan import Job, StartPlan, TrafficPlan
+from roadproof.study.plan import Job, TrafficPlan
 from roadproof.study.rows import CostColumns, DriveColumns, JobColumns, PaintColumns
 
 COSTS = ("search_seconds", "seconds")

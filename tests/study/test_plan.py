@@ -8,10 +8,11 @@ import pytest
 
 from roadproof.controllers import shipped
 from roadproof.datatypes import Weather
+from roadproof.driving.starts import StartPlan
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.scenarios import builtin_scenarios
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan
-from roadproof.study.plan import StartPlan, TrafficPlan, load_study
+from roadproof.study.plan import TrafficPlan, load_study
 
 TEXT = """
 format = "roadproof-study"

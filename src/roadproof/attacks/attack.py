@@ -94,7 +94,7 @@ def attack(
     made_of: dict[str, Any] = {}
     if isinstance(recordings, RecordingSet):
         with suppress(ControllerError):  # one that cannot drive is attacked all the same, but nothing goes on with it
-            made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts)
+            made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
     start = time.perf_counter()
     if isinstance(recordings, InSimulator):
         _refuse_in_simulator(groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
@@ -157,6 +157,7 @@ def _made_of(
     groups: Sequence[Group] | None,
     seed: int,
     starts: Sequence[Candidate],
+    random_patterns: int,
 ) -> dict[str, Any]:
     """What identifies a search on recordings, by name, as JSON has it."""
     begun = [(each.group, known_by(each.pattern)) for each in starts]
@@ -172,6 +173,8 @@ def _made_of(
         "starts": digest(as_text(begun))[:16],
         **parts_of(controller, (recordings.view.height_px, recordings.view.width_px)),
     }
+    # Results are older than this part; those of the pipeline compare with no random patterns.
+    made_of |= {"random_patterns": random_patterns} if random_patterns else {}
     return cast("dict[str, Any]", plain(made_of))
 
 
@@ -214,6 +217,7 @@ def kept_attack(
     groups: Sequence[Group] | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
+    random_patterns: int = 0,
     starts: Sequence[Candidate] = (),
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
@@ -222,13 +226,19 @@ def kept_attack(
     `folder` is that of the result, and keeps the checkpoint of the running search; all else is as in `attack`.
 
     Raises:
-        RoadproofError: the stored result is damaged, belongs to another search or does not say to which, or the search
-            itself fails.
+        RoadproofError: the stored result is damaged, belongs to another search or does not say to which, the controller
+            cannot be told from another, or the search itself fails.
         OutputError: the folder cannot be written.
     """
     checkpoint, path = folder / "search.safetensors", folder / "result.json"
     if path.exists():
-        made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts)
+        try:
+            made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
+        except ControllerError as error:
+            raise ControllerError(
+                f"{folder} holds a search, perhaps of another controller: this one cannot drive, by which it would be "
+                f"known ({error}); choose another folder, or remove it"
+            ) from None
         require_same(folder, "a search", RESULT_FILE.content(path).get("made_of"), made_of, RoadproofError)
     else:
         attack(
@@ -240,6 +250,7 @@ def kept_attack(
             groups=groups,
             seed=seed,
             device=device,
+            random_patterns=random_patterns,
             starts=starts,
             checkpoint=checkpoint,
             on_step=on_step,

@@ -157,7 +157,7 @@ def cheapest(
     area = found.space.limits or PaintLimits()
     limits = replace(area, max_area_m2=area.max_area_m2 or _NO_LIMIT_M2)
     space = replace(found.space, limits=limits, site=None).on(site)
-    run = _Run(measure, space, wanted_m, found.seed, space.point(found.pattern)[None, None].to(measure.device))
+    run = _Narrowing(measure, space, wanted_m, found.seed, space.point(found.pattern)[None, None].to(measure.device))
     level = run.level()
     if level.predicted_m < wanted_m:
         return None
@@ -211,7 +211,7 @@ def check_wanted(wanted_m: float) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Run:
+class _Narrowing:
     """A search space that becomes narrower, and where the search is in it."""
 
     measure: DeviationMeasure
@@ -233,7 +233,7 @@ class _Run:
         least = self._least_m(self.space, self.unit)
         return Level(float(area_m2(self.pattern, site.size_m)), self.space.figures, float(least[0]))
 
-    def without_a_figure(self) -> _Run | None:
+    def without_a_figure(self) -> _Narrowing | None:
         """The search without the figure whose loss costs least deviation; None if every figure is needed."""
         count = self.space.figures
         if count == 1:
@@ -244,7 +244,7 @@ class _Run:
         best = int(least.argmax())
         return replace(self, space=space, unit=unit[:, [best]]) if float(least[best]) >= self.wanted_m else None
 
-    def lowered(self, most_m2: float) -> _Run:
+    def lowered(self, most_m2: float) -> _Narrowing:
         """The search after going on under a lower limit of the area, in m²."""
         assert self.space.limits is not None
         space = replace(self.space, limits=replace(self.space.limits, max_area_m2=most_m2))

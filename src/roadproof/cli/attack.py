@@ -78,8 +78,7 @@ def attack(
     paint: Paint,
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
-    from roadproof.attacks import OBJECTIVES, method_of, parse_groups, show_pattern, site_of
-    from roadproof.attacks import attack as run
+    from roadproof.attacks import OBJECTIVES, kept_attack, method_of, parse_groups, show_pattern, site_of
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
@@ -114,9 +113,9 @@ def attack(
     frames = sum(len(each.frames) for each in drives.recordings)
     work = of_search(searched, goal, frames, attacked, groups=len(chosen))
     begin(work if cheapest is None else work + of_cheapest(space.figures, goal, attacked), out)
-    checkpoint = out / "search.safetensors"
     with progress("Searching", searched.steps(goal)) as on_step:
-        result = run(
+        result = kept_attack(
+            out,
             drives,
             attacked,
             space,
@@ -126,14 +125,11 @@ def attack(
             seed=seed,
             device=device,
             random_patterns=random_patterns,
-            checkpoint=checkpoint,
             on_step=on_step,
         )
-    result.save(out)
     keep_command(out)
     winner = next(group for group in chosen if str(group) == result.group)
     draw_attack(result, show_pattern(result.pattern, drives, attacked, winner, device=device), out)
-    checkpoint.unlink(missing_ok=True)
     _summarise(result, out)
     found = stored(out / "result.json")
     if cheapest is not None:

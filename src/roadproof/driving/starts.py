@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from roadproof.errors import EpisodeError
+from roadproof.io.tables import check_range
 from roadproof.scenarios import Scenario
 
 MOST = {"right_m": 1.0, "turned_rad": 0.3, "faster_mps": 5.0}
@@ -73,4 +74,28 @@ class StartRange:
         return tuple(StartOffset(right_m=r, turned_rad=t, faster_mps=f) for r, t, f in drawn.tolist())
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StartPlan(StartRange):
+    """Where the drives begin that judge a pattern: not where it was chosen.
+
+    Args:
+        count: how many drives alone there are in each weather, 1 to 1000.
+
+    Raises:
+        EpisodeError: a start is too far from the scenario's, there is no drive, or there are too many.
+    """
+
+    count: int = 5
+
+    def __post_init__(self) -> None:
+        StartRange.__post_init__(self)
+        check_range(self.count, "count", 1, 1000, EpisodeError)
+
+    @property
+    def range(self) -> StartRange:
+        """The range that the starts are drawn from, without how many there are."""
+        return StartRange(right_m=self.right_m, turned_rad=self.turned_rad, faster_mps=self.faster_mps)
+
+
 USUAL_STARTS = StartRange()
+USUAL_PLAN = StartPlan()

@@ -89,7 +89,7 @@ def run_check(
         clear(folder)
         if compare and plan.reference is not None:
             before = load_reference(plan.reference, architecture, plan)
-        run = _Run(plan, controller, folder, before, device, processes, on_progress)
+        run = _Check(plan, controller, folder, before, device, processes, on_progress)
         places = places_of(plan, device)
         cases = tuple(case for place in places for case in run.cases(place))
         result = CheckResult(
@@ -123,7 +123,7 @@ def architecture_of(controller: Controller) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Run:
+class _Check:
     """The arguments of `run_check`."""
 
     plan: CheckPlan

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
+from roadproof.driving.starts import StartPlan
 from roadproof.errors import CheckError, RoadproofError
 from roadproof.gate.inputs import Stored, recordings_of, stored_patterns
 from roadproof.gate.verdict import Change, Kind, least_drives
@@ -17,10 +18,9 @@ from roadproof.io.tables import build, check_range, each_once
 from roadproof.io.text import read_toml
 from roadproof.limits import MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
+from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
 from roadproof.scenarios import BUILTIN_FILE, Scenario, load_scenarios
 from roadproof.simulators.loading import check_spec
-from roadproof.study.plan import StartPlan
-from roadproof.study.reading import beside, chosen_scenarios, refuse_untrusted, take_head
 
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
@@ -141,7 +141,7 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
         take_head(content, FORMAT, FORMAT_VERSION, CheckError)
         plan = _plan(build(_Stated, content, "the check", CheckError), path.parent, budget)
         if not trust:
-            refuse_untrusted(plan.controller, plan.simulator if plan.budget == "full" else None)
+            refuse_untrusted(plan.controller, plan.simulator if plan.budget == "full" else None, CheckError)
     except RoadproofError as error:
         raise CheckError(f"{path}: {error}") from None
     return plan

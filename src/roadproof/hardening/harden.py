@@ -26,9 +26,9 @@ from roadproof.controllers.loading import load_trainable
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
 from roadproof.hardening.judgement import Judgement
+from roadproof.hardening.plan import WEIGHTS, HardeningPlan
 from roadproof.hardening.result import Hardened
-from roadproof.hardening.run import WEIGHTS, Run
-from roadproof.hardening.stages import Stages
+from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import TrainingStep
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.io.files import AnyPath, as_path, write_atomically
@@ -98,7 +98,7 @@ def harden(
             f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
         )
     load_trainable(controller)
-    run = Run(
+    plan = HardeningPlan(
         spec=controller,
         scenarios=tuple(scenarios),
         folder=folder,
@@ -107,21 +107,21 @@ def harden(
         seed=seed,
         device=device,
     )
-    teacher = run.controller(0)
+    teacher = plan.controller(0)
     with working_in(folder):
-        ledger = Ledger(folder, run.made_of(simulator, teacher, training_step), STAGES, "a hardening")
-        stages = Stages(run, simulator, teacher, training_step, factory, processes, ledger, on_progress)
+        ledger = Ledger(folder, plan.made_of(simulator, teacher, training_step), STAGES, "a hardening")
+        stages = HardeningStages(plan, simulator, teacher, training_step, factory, processes, ledger, on_progress)
         done = stages.rounds(rounds)
         best = min(done[1:], key=lambda each: each.mean_m).number
         weights = folder / WEIGHTS
-        write_atomically(weights, lambda part: shutil.copyfile(run.weights(best), part))
+        write_atomically(weights, lambda part: shutil.copyfile(plan.weights(best), part))
         judgement = None
         if judge_on:
             clean = stages.drive_clean(best, clean_on or (*scenarios, *judge_on))
             judgement = Judgement(stages.judge(best, judge_on), clean)
         found = Hardened(
             controller=controller,
-            hardened=run.spec_with(weights),
+            hardened=plan.spec_with(weights),
             rounds=done,
             best=best,
             judgement=judgement,

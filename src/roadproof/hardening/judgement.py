@@ -24,7 +24,7 @@ from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.infractions import counted
 from roadproof.driving.intervals import Estimate, mean_95
-from roadproof.hardening.run import Run
+from roadproof.hardening.plan import HardeningPlan
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.stress_test import OnProgress
 from roadproof.recordings import load_recordings
@@ -161,18 +161,18 @@ class Judgement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judge:
+class StreetJudge:
     """Attacks a round's controller on one street by every kind of search, and drives over what each found.
 
     Args:
-        run: the hardening.
+        plan: the hardening.
         simulator: an open simulator.
         number: the number of the round whose controller is judged; 0 judges the one before hardening.
         scenario: the scenario of the street.
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
     """
 
-    run: Run
+    plan: HardeningPlan
     simulator: Simulator
     number: int
     scenario: Scenario
@@ -184,47 +184,47 @@ class Judge:
         Raises:
             RoadproofError: a stage refuses; the message says why.
         """
-        run, folder = self.run, self.run.judged(self.number, self.scenario)
-        tested = run.attack(self.simulator, self.number, self.scenario, self.on_progress, judging=True)
+        plan, folder = self.plan, self.plan.judged(self.number, self.scenario)
+        tested = plan.attack(self.simulator, self.number, self.scenario, self.on_progress, judging=True)
         calls = sum(cost.simulator_calls for cost in tested.cost.values())
         judged = [self._judged(tested.evaluation, SEARCHED, calls)]
-        controller, recordings = run.controller(self.number), load_recordings(folder / "recordings")
-        for number, (kind, (method, space)) in enumerate(run.budget.kinds(run.space).items(), 1):
+        controller, recordings = plan.controller(self.number), load_recordings(folder / "recordings")
+        for number, (kind, (method, space)) in enumerate(plan.budget.kinds(plan.space).items(), 1):
             place = folder / f"kind-{number}"
-            title, steps = f"Searching, {kind}", method.steps(run.budget.judge.objective)
+            title, steps = f"Searching, {kind}", method.steps(plan.budget.judge.objective)
             found = kept_attack(
                 place / "attack",
                 recordings,
                 controller,
                 space,
-                objective=run.budget.judge.objective,
+                objective=plan.budget.judge.objective,
                 method=method,
-                seed=run.judging_seed,
-                device=run.device,
+                seed=plan.judging_seed,
+                device=plan.device,
                 on_step=lambda step, best, title=title, steps=steps: self.on_progress(
                     title, step, steps, f"{best:.2f}"
                 ),
             )
             judged.append(self._driven(controller, found.pattern, place / "evaluation", kind))
         if self.number:
-            old = load_pattern(run.judged(0, self.scenario) / "pattern.json")
+            old = load_pattern(plan.judged(0, self.scenario) / "pattern.json")
             judged.append(self._driven(controller, old, folder / "old", OLD))
         return judged
 
     def _driven(self, controller: Controller, pattern: Pattern, place: Path, kind: str) -> Judged:
-        asked = self.run.budget.judge
+        asked = self.plan.budget.judge
         evaluation = evaluate(
             self.simulator,
             controller,
             self.scenario,
             pattern,
             folder=place,
-            driver_name=self.run.name(self.number),
+            driver_name=self.plan.name(self.number),
             weathers=asked.weathers,
             starts=asked.starts,
             start_range=asked.start_range,
             runs=asked.runs,
-            seed=self.run.judging_seed,
+            seed=self.plan.judging_seed,
             on_drive=lambda done, total: self.on_progress(f"Driving, {kind}", done, total, ""),
         )
         return self._judged(evaluation, kind, evaluation.simulator_calls)

@@ -16,9 +16,9 @@ from roadproof.controllers import CIL, ConditionalPilotNet, Controller, save_con
 from roadproof.controllers.loading import load_trainable, runs_code
 from roadproof.controllers.steering import NetworkController
 from roadproof.errors import TrainingError
-from roadproof.hardening.judgement import Clean, Judge, Judged, clean_drives
+from roadproof.hardening.judgement import Clean, Judged, StreetJudge, clean_drives
+from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.result import Round
-from roadproof.hardening.run import Run
 from roadproof.hardening.town import Town
 from roadproof.hardening.tuning import TrainingStep, tune
 from roadproof.hardening.views import Street
@@ -36,15 +36,15 @@ from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.collection import CollectionPlan, record_drive
 from roadproof.training.dataset import Dataset
 
-StreetWork: TypeAlias = Callable[[Run, int, Simulator, Scenario], object]
+StreetWork: TypeAlias = Callable[[HardeningPlan, int, Simulator, Scenario], object]
 """What is done on a street with a round's controller, in a process with a simulator of its own; the folder keeps it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stages:
+class HardeningStages:
     """The stages of one run; its other fields are arguments of `harden`, and the controller before."""
 
-    run: Run
+    plan: HardeningPlan
     simulator: Simulator
     teacher: Controller
     step: TrainingStep
@@ -74,34 +74,34 @@ class Stages:
     def attack(self, number: int) -> list[StressTest]:
         """Attack the controller of a round afresh on every street for training."""
         with self.ledger.stage("attack"):
-            self._together(f"Round {number}", _attack_street, number, self.run.scenarios)
+            self._together(f"Round {number}", _attack_street, number, self.plan.scenarios)
             return [
-                self.run.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
-                for each in self.run.scenarios
+                self.plan.attack(self.simulator, number, each, self._under(f"Round {number}, {each.name}"))
+                for each in self.plan.scenarios
             ]
 
     def tune(self, number: int, tests: Sequence[Sequence[StressTest]]) -> None:
         """Tune on what all attacks so far found, from the weights of the round before."""
-        run, tuning = self.run, self.run.budget.tuning
-        if run.weights(number).exists():
+        plan, tuning = self.plan, self.plan.budget.tuning
+        if plan.weights(number).exists():
             return
-        network, town = load_trainable(run.spec_of(number - 1)), self.town(number)
+        network, town = load_trainable(plan.spec_of(number - 1)), self.town(number)
         # It learns from paint of all kinds, also where attacks are limited.
-        space = run.space.unlimited
-        told: list[object] = [network, tuning, run.seed_of(number), self.step, space.stated]
+        space = plan.space.unlimited
+        told: list[object] = [network, tuning, plan.seed_of(number), self.step, space.stated]
         streets: list[Street] = []
         found: list[torch.Tensor] = []
         for past, attacked in enumerate(tests):
-            driver = run.controller(past)
-            for scenario, test in zip(run.scenarios, attacked, strict=True):
-                recordings = load_recordings(run.round(past) / scenario.name / "recordings")
+            driver = plan.controller(past)
+            for scenario, test in zip(plan.scenarios, attacked, strict=True):
+                recordings = load_recordings(plan.round(past) / scenario.name / "recordings")
                 points = torch.stack([space.point(each.pattern) for each in test.attack.candidates])
-                street = Street(recordings, self.teacher, device=run.device)
-                street.add_ways(driver, space.pattern(points.to(run.device)))
+                street = Street(recordings, self.teacher, device=plan.device)
+                street.add_ways(driver, space.pattern(points.to(plan.device)))
                 streets.append(street)
                 found.append(points)
                 told += [recordings.digest(), points]
-        title, path = f"Round {number}: learning", run.round(number) / "learning.safetensors"
+        title, path = f"Round {number}: learning", plan.round(number) / "learning.safetensors"
         with self.ledger.stage("learn"):
             tune(
                 network,
@@ -111,17 +111,17 @@ class Stages:
                 torch.cat(found),
                 town,
                 tuning,
-                seed=run.seed_of(number),
-                device=run.device,
+                seed=plan.seed_of(number),
+                device=plan.device,
                 step=self.step,
                 checkpoint=Checkpoint(path, stated(known_by(told))),
                 on_step=lambda step, loss: self.tell(title, step, tuning.steps, f"loss {loss:.4f}"),
             )
-        _save(network, run, number)
+        _save(network, plan, number)
         path.unlink(missing_ok=True)
 
     def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
-        """Judge the controllers before and after on other streets."""
+        """StreetJudge the controllers before and after on other streets."""
         judged: list[Judged] = []
         with self.ledger.stage("judge"):
             # All before come first: the one after also drives over what was found against the one before.
@@ -130,7 +130,7 @@ class Stages:
             for scenario in judge_on:
                 for number, when in ((0, "before"), (best, "after")):
                     told = self._under(f"Judging {when}, {scenario.name}")
-                    judged += Judge(self.run, self.simulator, number, scenario, told).judge()
+                    judged += StreetJudge(self.plan, self.simulator, number, scenario, told).judge()
             self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
         return tuple(judged)
 
@@ -140,10 +140,10 @@ class Stages:
             before, after = (
                 clean_drives(
                     self.simulator,
-                    self.run.controller(number),
+                    self.plan.controller(number),
                     scenarios,
-                    self.run.budget.clean_weathers,
-                    self.run.round(number) / "clean",
+                    self.plan.budget.clean_weathers,
+                    self.plan.round(number) / "clean",
                     on_drive=lambda done, total, when=when: self.tell(f"Bare road, {when}", done, total, "drives"),
                 )
                 for number, when in ((0, "before"), (best, "after"))
@@ -156,28 +156,28 @@ class Stages:
 
         A tuned controller drives elsewhere than the one before, and learns there what that one would do.
         """
-        run, drives = self.run, self.run.budget.town_drives
+        plan, drives = self.plan, self.plan.budget.town_drives
         if not drives or not isinstance(self.simulator, TownSimulator):
             return None
         paths: list[Path] = []
         with self.ledger.stage("town"):
             for past in range(number):
-                driver = run.controller(past)
-                seed = run.seed_of(past) if past else run.seed
-                plan = CollectionPlan(drives=drives, seed=seed, controller=run.spec_of(past))
+                driver = plan.controller(past)
+                seed = plan.seed_of(past) if past else plan.seed
+                drawn = CollectionPlan(drives=drives, seed=seed, controller=plan.spec_of(past))
                 for k in range(drives):
-                    paths.append(run.town(past) / f"drive-{k:05d}.npz")
+                    paths.append(plan.town(past) / f"drive-{k:05d}.npz")
                     if not paths[-1].exists():
-                        record_drive(self.simulator, plan, k, driver).save(paths[-1])
+                        record_drive(self.simulator, drawn, k, driver).save(paths[-1])
                     self.tell(f"Round {past}: driving through the town", k + 1, drives, "drives")
             self.ledger.calls("town", len(paths))
-        return Town(Dataset.load(paths), self.simulator.camera, self.simulator.input, device=run.device)
+        return Town(Dataset.load(paths), self.simulator.camera, self.simulator.input, device=plan.device)
 
     def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
         """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
         if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
             self.tell(title, 0, len(scenarios), "streets")
-            on_street = partial(work, self.run, number)
+            on_street = partial(work, self.plan, number)
             done = spread(on_street, scenarios, self.factory, processes=self.processes)
             for count, (scenario, _) in enumerate(done, 1):
                 self.tell(title, count, len(scenarios), f"streets, {scenario.name} is done")
@@ -187,12 +187,12 @@ class Stages:
         return lambda stage, done, total, word: self.tell(title, done, total, f"{stage.lower()} {word}".strip())
 
 
-def _attack_street(run: Run, number: int, simulator: Simulator, scenario: Scenario) -> None:
-    run.attack(simulator, number, scenario, _go_on)
+def _attack_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
+    plan.attack(simulator, number, scenario, _go_on)
 
 
-def _judge_street(run: Run, number: int, simulator: Simulator, scenario: Scenario) -> None:
-    Judge(run, simulator, number, scenario, _go_on).judge()
+def _judge_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
+    StreetJudge(plan, simulator, number, scenario, _go_on).judge()
 
 
 def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
@@ -200,10 +200,10 @@ def _go_on(_stage: str, _done: int, _total: int, _word: str) -> None:
         raise TrainingError("another street failed")
 
 
-def _save(network: nn.Module, run: Run, number: int) -> None:
-    path = run.weights(number)
-    origin = f"{run.spec}, hardened for {number} rounds on {', '.join(each.name for each in run.scenarios)}"
-    if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(run.spec):
+def _save(network: nn.Module, plan: HardeningPlan, number: int) -> None:
+    path = plan.weights(number)
+    origin = f"{plan.spec}, hardened for {number} rounds on {', '.join(each.name for each in plan.scenarios)}"
+    if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(plan.spec):
         save_controller(network, path, origin=origin)
         return
     tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}

@@ -36,7 +36,7 @@ from roadproof.simulators.protocol import Simulator
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Round:
+class ReRecordingRound:
     """One re-recording round: its search and the drives over what it found.
 
     Args:
@@ -61,7 +61,7 @@ class Rounds:
     """
 
     first: Selection
-    done: tuple[Round, ...]
+    done: tuple[ReRecordingRound, ...]
     stopped: str = ""
 
     @property
@@ -136,7 +136,7 @@ def search_on(
     steps = _gone_on(found.method).steps(objective)
     per_round = steps + best
     known, last, drives_of_last = _ranked(found, selection), selection, folder / "selection"
-    done: list[Round] = []
+    done: list[ReRecordingRound] = []
     for number in range(1, rounds + 1):
         place, before = folder / f"round-{number}", per_round * (number - 1)
 
@@ -177,7 +177,7 @@ def search_on(
             pool=pool,
             on_drive=lambda n, far, tell=tell: tell(steps + n - 1, f"{far:.2f} m"),
         )
-        done.append(Round(attack=again, selection=chosen, simulator_calls=calls + chosen.simulator_calls))
+        done.append(ReRecordingRound(attack=again, selection=chosen, simulator_calls=calls + chosen.simulator_calls))
         known = sorted([*_ranked(again, chosen), *known], key=lambda each: -each[0])
         last, drives_of_last = chosen, place / "selection"
     return Rounds(first=selection, done=tuple(done))
@@ -215,7 +215,7 @@ def _calls_of(drive: Drive, method: Calibration) -> int:
     return drive.calls + replays_needed(2, method) - replays_needed(1, method)
 
 
-def _read_round(place: Path) -> Round:
+def _read_round(place: Path) -> ReRecordingRound:
     """A finished round, from its folder."""
     attack, selection = AttackResult.load(place / "attack"), Selection.load(place / "selection")
     report = CalibrationReport.load(place / "calibration" / "report.json")
@@ -223,7 +223,7 @@ def _read_round(place: Path) -> Round:
     if drive is None:
         raise RecordingError(f"{place} lacks the drive {place.name}; give the same call again to record it")
     calls = _calls_of(drive, Calibration(report.method)) + selection.simulator_calls
-    return Round(attack=attack, selection=selection, simulator_calls=calls)
+    return ReRecordingRound(attack=attack, selection=selection, simulator_calls=calls)
 
 
 def _gone_on(method: Method) -> Method:

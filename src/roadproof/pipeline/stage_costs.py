@@ -34,14 +34,14 @@ class StageCost:
 
 
 @dataclass(frozen=True, slots=True)
-class _Run:
+class _RunFile:
     """The content of run.json."""
 
     cost: dict[str, StageCost]
     made_of: dict[str, Any]
 
 
-_FILE = RecordFile(kind=_Run, name="roadproof-run", error=RoadproofError, remedy="remove it, the stages stay")
+_FILE = RecordFile(kind=_RunFile, name="roadproof-run", error=RoadproofError, remedy="remove it, the stages stay")
 
 
 class Ledger:
@@ -96,7 +96,7 @@ class Ledger:
         self._write()
 
     def _write(self) -> None:
-        _FILE.write(self._path, _Run(self.cost, self._made_of))
+        _FILE.write(self._path, _RunFile(self.cost, self._made_of))
 
 
 def read_cost(folder: Path) -> dict[str, StageCost]:

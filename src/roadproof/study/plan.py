@@ -12,7 +12,7 @@ from roadproof.compositing import Variation
 from roadproof.controllers.loading import files_of
 from roadproof.controllers.shipped import installed_weights, shipped_names
 from roadproof.datatypes import Weather
-from roadproof.driving.starts import StartRange
+from roadproof.driving.starts import USUAL_PLAN, StartPlan
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
@@ -20,10 +20,10 @@ from roadproof.io.tables import build, check_range, each_once
 from roadproof.io.text import read_toml
 from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
 from roadproof.paint import PaintLimits
+from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
 from roadproof.simulators.loading import check_spec
 from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, method_plan
-from roadproof.study.reading import beside, chosen_scenarios, refuse_untrusted, take_head
 
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
@@ -62,30 +62,6 @@ class TrafficPlan:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class StartPlan(StartRange):
-    """Where the drives begin that judge a pattern: not where it was chosen.
-
-    Args:
-        count: how many drives alone there are in each weather, 1 to 1000.
-
-    Raises:
-        EpisodeError: a start is too far from the scenario's.
-        StudyError: there is no drive, or there are too many.
-    """
-
-    count: int = 5
-
-    def __post_init__(self) -> None:
-        StartRange.__post_init__(self)
-        check_range(self.count, "count", 1, 1000, StudyError)
-
-    @property
-    def range(self) -> StartRange:
-        """The range that the starts are drawn from, without how many there are."""
-        return StartRange(right_m=self.right_m, turned_rad=self.turned_rad, faster_mps=self.faster_mps)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Conditions:
     """Whom patterns are found against, and how they are judged.
 
@@ -102,7 +78,7 @@ class Conditions:
     controller: str
     weathers: tuple[Weather, ...] = (Weather.CLEAR_NOON,)
     traffic: TrafficPlan | None = None
-    starts: StartPlan = StartPlan()
+    starts: StartPlan = USUAL_PLAN
     simulator: str = "town"
     paint: PaintLimits | None = None
     variation: Variation | None = None
@@ -228,7 +204,7 @@ def load_study(path: AnyPath, *, trust: bool = False) -> Study:
     try:
         study = _study(content, path.parent)
         if not trust:
-            refuse_untrusted(study.controller, study.simulator)
+            refuse_untrusted(study.controller, study.simulator, StudyError)
     except RoadproofError as error:
         raise StudyError(f"{path}: {error}") from None
     return study

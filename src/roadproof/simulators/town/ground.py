@@ -68,7 +68,7 @@ def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50
         math.ceil((x1 + BORDER_M - low[0]) / cell_m) * cell_m,
         math.ceil((y1 + BORDER_M - low[1]) / cell_m) * cell_m,
     )
-    fine, coarse = _Canvas(low, size, FINE_M), _Canvas(low, size, COARSE_M)
+    fine, coarse = _Raster(low, size, FINE_M), _Raster(low, size, COARSE_M)
     surface = _surfaces(fine, roads, scenery)
     driving = [lane for lane in roads.lanes if lane.kind == "driving"]
     wheels = [lane.left * (1 - share) + lane.right * share for lane in driving for share in (0.27, 0.73)]
@@ -80,7 +80,7 @@ def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50
     return Ground(low, size, albedo, hard, hollows, _open_sky(coarse, scenery))
 
 
-class _Canvas:
+class _Raster:
     """Draws world shapes into a plane of one byte a pixel."""
 
     def __init__(self, low: tuple[float, float], size: tuple[float, float], pixel_m: float) -> None:
@@ -113,31 +113,31 @@ class _Canvas:
         return patch[rows][:, columns]
 
 
-def _surfaces(canvas: _Canvas, roads: RoadMap, scenery: Scenery) -> Image.Image:
+def _surfaces(raster: _Raster, roads: RoadMap, scenery: Scenery) -> Image.Image:
     """`Surface` of each sample: 0 lawn, 1 pavement, 2 shoulder, 3 road."""
-    image = canvas.blank()
+    image = raster.blank()
     pen = ImageDraw.Draw(image)
     for outline in scenery.paved:
-        pen.polygon(canvas.points(outline), fill=1)
+        pen.polygon(raster.points(outline), fill=1)
     for surface, outline in roads.paved():
-        pen.polygon(canvas.points(outline), fill=int(surface))
+        pen.polygon(raster.points(outline), fill=int(surface))
     # Sidewalks get an edge of stone, which also fills the chinks where strips meet at an angle.
-    near = image.point([0, 255, 0, 0] + [0] * 252).filter(ImageFilter.BoxBlur(EDGE_M / canvas.pixel_m))
+    near = image.point([0, 255, 0, 0] + [0] * 252).filter(ImageFilter.BoxBlur(EDGE_M / raster.pixel_m))
     bare = image.point([255] + [0] * 255)
     image.paste(1, mask=ImageChops.multiply(near.point([0] + [255] * 255), bare))
     return image
 
 
-def _hollows(canvas: _Canvas, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
-    low = 0.7 * canvas.noise(seed, 14, 5) + 0.3 * canvas.noise(seed + 4, 48, 3) + 0.05 * tracks + 0.08 * edges
+def _hollows(raster: _Raster, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
+    low = 0.7 * raster.noise(seed, 14, 5) + 0.3 * raster.noise(seed + 4, 48, 3) + 0.05 * tracks + 0.08 * edges
     return (np.clip((low - 0.35) / 0.40, 0, 1) * 255).astype(np.uint8)
 
 
-def _albedo(canvas: _Canvas, surface: Image.Image, tracks: Plane, edges: Plane, seed: int) -> Image.Image:
+def _albedo(raster: _Raster, surface: Image.Image, tracks: Plane, edges: Plane, seed: int) -> Image.Image:
     """Colours: asphalt with tracks, dirt at the kerb and mended patches; slabs; lawn."""
-    broad, lumps = canvas.noise(seed + 1, 8, 4), canvas.noise(seed + 2, 64, 4)
+    broad, lumps = raster.noise(seed + 1, 8, 4), raster.noise(seed + 2, 64, 4)
     road = 1 + 0.22 * (broad - 0.5) + 0.05 * (lumps - 0.5) - 0.11 * tracks - 0.16 * edges
-    road *= 1 - 0.09 * _mended(canvas, seed)
+    road *= 1 - 0.09 * _mended(raster, seed)
     lawn = 0.72 + 0.36 * broad + 0.40 * (lumps - 0.3)
     # Factors up to 1.34 as bytes; the tables make up for it.
     factors = [
@@ -155,34 +155,34 @@ def _albedo(canvas: _Canvas, surface: Image.Image, tracks: Plane, edges: Plane, 
     return Image.merge("RGB", channels).filter(ImageFilter.BoxBlur(0.6))
 
 
-def _mended(canvas: _Canvas, seed: int) -> Plane:
+def _mended(raster: _Raster, seed: int) -> Plane:
     """Rectangles of newer asphalt and sealed cracks, 0 or 1."""
     rng = np.random.default_rng(seed + 3)
-    image = canvas.blank()
+    image = raster.blank()
     pen = ImageDraw.Draw(image)
-    height, width = canvas.shape
-    for _ in range(round(height * width * canvas.pixel_m**2 / 90)):
+    height, width = raster.shape
+    for _ in range(round(height * width * raster.pixel_m**2 / 90)):
         x, y = rng.uniform(0, width), rng.uniform(0, height)
-        w, h = rng.uniform(0.7, 3.0, 2) / canvas.pixel_m
+        w, h = rng.uniform(0.7, 3.0, 2) / raster.pixel_m
         pen.rectangle((x, y, x + w, y + h), fill=255)
     return np.asarray(image, np.float32) / 255
 
 
-def _open_sky(canvas: _Canvas, scenery: Scenery) -> UInt8[np.ndarray, "h w"]:
+def _open_sky(raster: _Raster, scenery: Scenery) -> UInt8[np.ndarray, "h w"]:
     """How open the sky is: less beside walls, below trees and under parked cars."""
-    walls, low = canvas.blank(), canvas.blank()
+    walls, low = raster.blank(), raster.blank()
     tall, flat = ImageDraw.Draw(walls), ImageDraw.Draw(low)
     for solid in scenery.solids:
         if solid.name == "building":
-            tall.polygon(canvas.points(solid.corners), fill=255)
+            tall.polygon(raster.points(solid.corners), fill=255)
         elif solid.casts_shadow and solid.half_m[1] > 0.3:
-            flat.polygon(canvas.points(solid.corners), fill=255)
+            flat.polygon(raster.points(solid.corners), fill=255)
     for tree in scenery.trees:
-        (x, y), r = canvas.points(np.array([[tree.x_m, tree.y_m]]))[0], 0.34 * tree.height_m / canvas.pixel_m
+        (x, y), r = raster.points(np.array([[tree.x_m, tree.y_m]]))[0], 0.34 * tree.height_m / raster.pixel_m
         flat.ellipse((x - r, y - r, x + r, y + r), fill=90)
-    far = walls.reduce(4).filter(ImageFilter.GaussianBlur(1.5 / canvas.pixel_m)).resize(walls.size)
+    far = walls.reduce(4).filter(ImageFilter.GaussianBlur(1.5 / raster.pixel_m)).resize(walls.size)
     broad = np.asarray(far, np.float32) / 255
-    near, under = canvas.soft(walls, 1.5), canvas.soft(low, 0.4)
+    near, under = raster.soft(walls, 1.5), raster.soft(low, 0.4)
     share = 1 - np.clip(0.36 * near + 0.40 * broad + 0.5 * under, 0, 0.7)
     return (share * 255).astype(np.uint8)
 
@@ -269,20 +269,20 @@ def turned_square(
 
 def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> LitGround:
     """The ground in one weather, with the shadows that fall on it."""
-    canvas = _Canvas(ground.low_m, ground.size_m, COARSE_M)
-    image = canvas.blank()
+    raster = _Raster(ground.low_m, ground.size_m, COARSE_M)
+    image = raster.blank()
     pen = ImageDraw.Draw(image)
     sun = sky.to_sun
     run = -sun[:2] / sun[2]
     for solid in scenery.solids:
         if solid.casts_shadow:
             ends = np.concatenate([solid.corners, solid.corners + run * solid.height_m])
-            pen.polygon(canvas.points(ends[ConvexHull(ends).vertices]), fill=255)
+            pen.polygon(raster.points(ends[ConvexHull(ends).vertices]), fill=255)
     crowns = _crowns(scenery.trees, run, np.random.default_rng(seed))
     for tree, (centres, radii) in zip(scenery.trees, crowns, strict=True):
         foot = np.array([tree.x_m, tree.y_m])
-        pen.line(canvas.points(np.stack([foot, foot + run * 0.45 * tree.height_m])), fill=255, width=1)
-        for (x, y), r in zip(canvas.points(centres), (radii / COARSE_M).tolist(), strict=True):
+        pen.line(raster.points(np.stack([foot, foot + run * 0.45 * tree.height_m])), fill=255, width=1)
+        for (x, y), r in zip(raster.points(centres), (radii / COARSE_M).tolist(), strict=True):
             pen.ellipse((x - r, y - r, x + r, y + r), fill=225)
     soft = image.filter(ImageFilter.GaussianBlur(sky.shadow_blur_m / COARSE_M))
     sunlit = 255 - np.asarray(soft)

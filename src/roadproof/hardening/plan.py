@@ -23,7 +23,7 @@ _FRESH = 1000
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Run:
+class HardeningPlan:
     """What `harden` was asked for, as far as its attacks need it; it travels between processes.
 
     Args:

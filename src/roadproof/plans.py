@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from roadproof.controllers.loading import runs_code
-from roadproof.errors import RoadproofError, StudyError
+from roadproof.errors import RoadproofError
 from roadproof.scenarios import Scenario, find_scenario
 from roadproof.simulators.loading import is_elsewhere
 
@@ -67,19 +67,18 @@ def chosen_scenarios(patterns: Iterable[str], known: tuple[Scenario, ...]) -> tu
     return tuple(chosen.values())
 
 
-def refuse_untrusted(controller: str, simulator: str | None) -> None:
+def refuse_untrusted(controller: str, simulator: str | None, error: type[RoadproofError]) -> None:
     """See that following a plan of anyone's runs none of their code and calls no other machine.
 
     Args:
         controller: the spec of the controller that the plan names.
         simulator: the spec of its simulator; None where it opens none.
+        error: the type of error to raise.
 
     Raises:
-        StudyError: the plan would run code or call another machine; the message says which, and how to allow that.
+        error: the plan would run code or call another machine; the message says which, and how to allow that.
     """
     if runs_code(controller):
-        raise StudyError(
-            f"controller {controller!r} runs what its author wrote; look at it, then give --trust (trust=True)"
-        )
+        raise error(f"controller {controller!r} runs what its author wrote; look at it, then give --trust (trust=True)")
     if simulator is not None and is_elsewhere(simulator):
-        raise StudyError(f"simulator {simulator!r} is another machine; give --trust (trust=True) to call it")
+        raise error(f"simulator {simulator!r} is another machine; give --trust (trust=True) to call it")
