@@ -1,6 +1,6 @@
 """How fast is the town, how soon does it start, how much memory does it take?
 
-    python benchmarks/simulator_speed.py --json OUT
+    python benchmarks/simulator_speed.py --json OUT [--graphics egl]
 
 Frames per second are those of closed-loop drives of the expert at 200×88, rendered at 400×176: expert, traffic,
 physics, events, rendering and read-back. Each figure is the median over drives of a scenario each; two processes run
@@ -29,23 +29,23 @@ AGENTS = 20
 SCENARIOS = ("straight-01", "left-05", "right-03", "straight-08", "left-02", "right-07")
 
 STARTED = """
-import time; began = time.perf_counter()
+import sys, time; began = time.perf_counter()
 from roadproof.scenarios import builtin_scenarios
 from roadproof.simulators.town.simulator import TownSimulator
-with TownSimulator() as simulator:
+with TownSimulator(graphics=sys.argv[1]) as simulator:
     simulator.reset(builtin_scenarios()[0])
     print(time.perf_counter() - began)
 """
 
 
-def speeds(agents: int) -> tuple[list[float], float]:
+def speeds(agents: int, graphics: str) -> tuple[list[float], float]:
     """Frames per second of a drive of each scenario in this process, and its peak memory in MB."""
     from roadproof.scenarios import find_scenario
     from roadproof.simulators.town.simulator import TownSimulator
     from roadproof.training.expert import Expert
 
     found: list[float] = []
-    with TownSimulator() as simulator:
+    with TownSimulator(graphics=graphics) as simulator:
         for name in ("straight-01", *SCENARIOS):  # the first only warms up
             scenario = find_scenario(name)
             seen = simulator.reset(scenario, cars=agents, pedestrians=agents, seed=0)
@@ -57,10 +57,10 @@ def speeds(agents: int) -> tuple[list[float], float]:
     return found[1:], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def measured(processes: int, agents: int) -> dict[str, float]:
+def measured(processes: int, agents: int, graphics: str) -> dict[str, float]:
     """Median frames per second of a process while as many run, and the largest peak memory."""
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        results = pool.map(speeds, [agents] * processes, chunksize=1)
+        results = pool.starmap(speeds, [(agents, graphics)] * processes, chunksize=1)
     every = [fps for found, _ in results for fps in found]
     return {
         "median_fps": statistics.median(every),
@@ -70,10 +70,12 @@ def measured(processes: int, agents: int) -> dict[str, float]:
     }
 
 
-def start_seconds(repeats: int) -> float:
+def start_seconds(repeats: int, graphics: str) -> float:
     """Median seconds from import to first frame in fresh processes."""
     runs = [
-        float(subprocess.run([sys.executable, "-c", STARTED], check=True, capture_output=True, text=True).stdout)
+        float(
+            subprocess.run([sys.executable, "-c", STARTED, graphics], check=True, capture_output=True, text=True).stdout
+        )
         for _ in range(repeats)
     ]
     return statistics.median(runs)
@@ -84,15 +86,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--graphics", default="software", choices=["software", "egl"])
     arguments = parser.parse_args()
     load_before = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     result: dict[str, object] = {
-        "one_process_alone": measured(1, 0),
-        "one_process_traffic": measured(1, AGENTS),
-        "two_processes_alone": measured(2, 0),
-        "two_processes_traffic": measured(2, AGENTS),
-        "start_s": start_seconds(arguments.repeats),
+        "one_process_alone": measured(1, 0, arguments.graphics),
+        "one_process_traffic": measured(1, AGENTS, arguments.graphics),
+        "two_processes_alone": measured(2, 0, arguments.graphics),
+        "two_processes_traffic": measured(2, AGENTS, arguments.graphics),
+        "start_s": start_seconds(arguments.repeats, arguments.graphics),
         "goals": GOALS,
+        "graphics": arguments.graphics,
         "agents": {"cars": AGENTS, "pedestrians": AGENTS},
         "load_before": load_before,
         "platform": platform.platform(),

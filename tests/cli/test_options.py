@@ -79,7 +79,7 @@ def test_the_help_is_shown_as_it_is_written():
 
 
 SAME = ("scenarios", "simulator", "device", "processes", "seed", "trust")
-WORLDS = "Where it is driven: town, carla://HOST:PORT, or recorded:FOLDER for a prediction in recordings."
+WORLDS = "Where it is driven: town, town:egl, carla://HOST:PORT, or recorded:FOLDER to predict it in recordings."
 
 
 @pytest.mark.parametrize("name", SAME)

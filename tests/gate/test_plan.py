@@ -84,7 +84,7 @@ MISTAKES = {
     "budget": (("version = 1", 'version = 1\nbudget = "huge"'), "budget is 'huge', expected one of smoke, full"),
     "simulator": (
         (LIMITS, LIMITS + '\n[full]\nsimulator = "moon"'),
-        "simulator 'moon' is unknown, expected town or carla://",
+        "simulator 'moon' is unknown, expected town, town:egl or carla://",
     ),
     "scenario": (('scenarios = ["test-road"]', 'scenarios = ["test-raod"]'), "did you mean 'test-road'"),
     "outside": (('scenario_file = "', 'scenario_file = "../'), "leaves the plan's folder"),

@@ -137,13 +137,14 @@ WeatherName: TypeAlias = Annotated[
     str, typer.Option(help="One of the eight, for instance rainy-noon.", autocompletion=weather_names)
 ]
 SimulatorSpec: TypeAlias = Annotated[
-    str, typer.Option("--simulator", help="Where it is driven: town, or carla://HOST:PORT.", callback=_simulator)
+    str,
+    typer.Option("--simulator", help="Where it is driven: town, town:egl or carla://HOST:PORT.", callback=_simulator),
 ]
 WorldSpec: TypeAlias = Annotated[
     str,
     typer.Option(
         "--simulator",
-        help="Where it is driven: town, carla://HOST:PORT, or recorded:FOLDER for a prediction in recordings.",
+        help="Where it is driven: town, town:egl, carla://HOST:PORT, or recorded:FOLDER to predict it in recordings.",
         callback=_world,
     ),
 ]

@@ -28,7 +28,7 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Side, evenly
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, world_of
 
 TRIES = 4
 SMALLER = 0.7
@@ -86,6 +86,7 @@ def record(
         camera=simulator.camera,
         view=simulator.input,
         dt_s=simulator.dt_s,
+        world=world_of(simulator),
     )
     began = folder is not None and write_settings(settings, folder)
     plans, done = settings.trajectories.plans(), dict[str, Drive]()

@@ -187,6 +187,6 @@ def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[
     }
     if simulator.paint is not PaintKind.RENDERED:
         parts["paint"] = simulator.paint
-    if isinstance(simulator, Identified):
+    if isinstance(simulator, Identified) and simulator.identity:
         parts["world"] = simulator.identity
     return parts

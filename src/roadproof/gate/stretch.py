@@ -27,7 +27,7 @@ from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.report.formatting import in_words
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Identified, Simulator, SimulatorFactory
+from roadproof.simulators.protocol import Simulator, SimulatorFactory, world_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +158,7 @@ class Stretch:
         """
         plan, (_, weather, kind, _) = self.plan, key
         images = [] if kind is Kind.FRESH else [self.episodes.digests[paint.name] for paint in paints]
-        world = self.world.identity if isinstance(self.world, Identified) else type(self.world).__qualname__
+        world = world_of(self.world) or type(self.world).__qualname__
         told = [
             identity(self.episodes.scenario),
             weather,

@@ -15,7 +15,7 @@ from roadproof.io.known import known_by, without_addresses
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace, derived_seed
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, world_of
 
 WEIGHTS = "hardened.safetensors"
 _FRESH = 1000
@@ -90,6 +90,7 @@ class HardeningPlan:
         view = simulator.input
         return {
             "controller": self.spec,
+            "world": world_of(simulator),
             **parts_of(teacher, (view.height_px, view.width_px)),
             "scenarios": [identity(each) for each in self.scenarios],
             "budget": without_addresses(repr(replace(self.budget, judge=self.budget.attack))),

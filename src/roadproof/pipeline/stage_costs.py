@@ -66,7 +66,8 @@ class Ledger:
             self._write()
             return
         before = _FILE.read(self._path)
-        require_same(folder, what, before.made_of, self._made_of, RoadproofError)
+        # Runs in the town as software draws it are older than this word.
+        require_same(folder, what, {"world": ""} | before.made_of, self._made_of, RoadproofError)
         self.cost |= before.cost
 
     @contextmanager

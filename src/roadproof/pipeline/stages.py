@@ -34,7 +34,7 @@ from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import marks_of, site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, world_of
 
 CHEAPEST = "cheapest"
 """The folder of a run with the least paint for a deviation."""
@@ -75,6 +75,7 @@ class Stages:
             "controller": self.controller_name,
             **parts_of(self.controller, size),
             "paint": self.simulator.paint,
+            "world": world_of(self.simulator),
         }
 
     def record(self, number: int) -> Drives:

@@ -1,6 +1,6 @@
-"""Which simulator is meant: "town" is the embedded one, "carla://HOST:PORT" a CARLA server.
+"""Which simulator is meant: "town" is the embedded one, "town:egl" the same drawn by OpenGL.
 
-A server is told how to paint by `?paint=` and inject, native or auto after its port.
+"carla://HOST:PORT" is a CARLA server; it is told how to paint by `?paint=` and inject, native or auto after its port.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from roadproof.errors import SimulatorError
 from roadproof.roads.marks import Mapped
 from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
-SPECS = "town or carla://HOST:PORT"
+TOWNS = {"town": "software", "town:egl": "egl"}
+"""The specs of the town, and what draws it."""
+
+SPECS = "town, town:egl or carla://HOST:PORT"
 RECORDED = "recorded:"
 """Begins the spec of recordings that are driven in, which are no simulator."""
 
@@ -50,7 +53,7 @@ def check_spec(spec: str) -> None:
         raise SimulatorError(f"simulator {spec!r} is a recorded world, which evaluate, select and drive alone drive in")
     if is_server(spec):
         _address(spec)
-    elif spec != "town":
+    elif spec not in TOWNS:
         raise SimulatorError(f"simulator {spec!r} is unknown, expected {SPECS}")
 
 
@@ -62,11 +65,11 @@ def open_simulator(spec: str) -> Generator[MappedSimulator]:
         SimulatorError: no simulator has this name, or what it needs is not installed.
     """
     check_spec(spec)
-    if spec == "town":
+    if spec in TOWNS:
         # Panda3D is an extra.
         from roadproof.simulators.town.simulator import TownSimulator
 
-        with TownSimulator() as town:
+        with TownSimulator(graphics=TOWNS[spec]) as town:
             yield town
         return
     host, port, paint = _address(spec)

@@ -185,3 +185,8 @@ class Identified(Protocol):
     def identity(self) -> str:
         """A text that is the same for every simulator with the same world, and another for every other."""
         ...
+
+
+def world_of(simulator: object) -> str:
+    """What tells a world from others: its simulator's identity or type; empty for the town as software draws it."""
+    return simulator.identity if isinstance(simulator, Identified) else type(simulator).__qualname__

@@ -10,21 +10,32 @@ from jaxtyping import Float, UInt8
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize
 from roadproof.simulators.town.canvas import COARSEST, NEAREST_M, PATCH_PX, Raster, RoadPatch, copies, reductions_for
-from roadproof.simulators.town.engine import VERTEX, Path, Texture, fill_texture, make_node, make_texture, refill_node
+from roadproof.simulators.town.engine import (
+    VERTEX,
+    Graphics,
+    Path,
+    Texture,
+    fill_texture,
+    make_node,
+    make_texture,
+    refill_node,
+)
 from roadproof.simulators.town.shading import Layer, dress
 
 PIECE_CORNERS = 12
 CORNERS = np.array([(x, y, 1.0) for x in (-0.5, CANVAS_SIZE_PX - 0.5) for y in (-0.5, CANVAS_SIZE_PX - 0.5)])
-# The renderer interpolates between the texel hit and the one before it: half a texel too late.
-LINEAR_SHIFT = 0.5
+LINEAR_SHIFT = {Graphics.SOFTWARE: 0.5, Graphics.EGL: 0.0}
+"""By how many texels a texture is moved: software interpolates between the texel hit and the one before it."""
 
 
 class CanvasNode:
     """The patch of road with the pattern: as many nodes as there are copies, each drawn where its copy suits."""
 
-    def __init__(self, root: Path, camera: CameraModel, crops: tuple[tuple[CropResize, int], ...]) -> None:
+    def __init__(
+        self, root: Path, camera: CameraModel, crops: tuple[tuple[CropResize, int], ...], graphics: Graphics
+    ) -> None:
         self._root = root.attach_new_node("canvas")
-        self._camera, self._crops = camera, crops
+        self._camera, self._crops, self._shift = camera, crops, LINEAR_SHIFT[graphics]
         self._placement: CanvasPlacement | None = None
         self._patch: RoadPatch | None = None
         self._rasters: list[Raster] = []
@@ -102,6 +113,6 @@ class CanvasNode:
         vertices["position"] = (homogeneous @ self._world_from_canvas.T)[:, :3]
         across, along = self._reductions[copy]
         texel = np.array([2**across, 2**along]) / PATCH_PX
-        vertices["uv"] = (corners + 0.5) / CANVAS_SIZE_PX * (1, -1) + (0, 1) + LINEAR_SHIFT * texel
+        vertices["uv"] = (corners + 0.5) / CANVAS_SIZE_PX * (1, -1) + (0, 1) + self._shift * texel
         vertices["colour"] = 255
         return vertices

@@ -1,4 +1,4 @@
-"""Panda3D's software renderer, kept behind a few verbs: make a screen, make a texture, make a mesh, read a picture.
+"""Panda3D's renderers, kept behind a few verbs: make a screen, make a texture, make a mesh, read a picture.
 
 One screen is one process-private buffer with its own lens. Nothing here knows about roads.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from enum import StrEnum
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -52,22 +53,40 @@ VERTEX = np.dtype([("position", "<f4", 3), ("uv", "<f4", 2), ("ground_uv", "<f4"
 _configured = False
 
 
-def make_pipe() -> Pipe:
-    """The software renderer's pipe.
+class Graphics(StrEnum):
+    """What draws."""
+
+    SOFTWARE = "software"
+    """Panda3D's own renderer, on one CPU core; the same pixels everywhere."""
+
+    EGL = "egl"
+    """OpenGL without a screen: on the GPU where there is one, else by Mesa on the CPU."""
+
+
+_PIPES = {
+    Graphics.SOFTWARE: ("TinyOffscreenGraphicsPipe", "p3tinydisplay", "libX11.so.6", "libx11-6"),
+    Graphics.EGL: ("eglGraphicsPipe", "p3headlessgl", "libEGL.so.1 and a driver", "libegl1 libgl1-mesa-dri"),
+}
+"""Panda3D's pipe and its module, what this needs of the system, and the packages that have it."""
+
+
+def make_pipe(graphics: Graphics = Graphics.SOFTWARE) -> Pipe:
+    """The pipe of a renderer.
 
     Raises:
-        SimulatorError: the renderer cannot be loaded, which means that libX11 is missing.
+        SimulatorError: the renderer cannot be loaded, which means that a library of the system is missing.
     """
     # Panda3D's configuration is the whole process's.
     global _configured
     if not _configured:
         core.load_prc_file_data("roadproof", CONFIGURATION)
         _configured = True
-    pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
+    name, module, needed, packages = _PIPES[graphics]
+    pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe(name, module)
     if pipe is None:
         raise SimulatorError(
-            "Panda3D's software renderer did not load: it needs the system library libX11.so.6; "
-            "install it (Debian and Ubuntu: apt-get install libx11-6)"
+            f"Panda3D's {graphics} renderer did not load: it needs the system library {needed}; "
+            f"install it (Debian and Ubuntu: apt-get install {packages})"
         )
     return pipe
 
@@ -156,7 +175,7 @@ class Screen:
     """An offscreen buffer that sees the crop of a camera, magnified by a whole number and reduced again by a box.
 
     Args:
-        pipe: the software renderer's pipe (`make_pipe`).
+        pipe: the renderer's pipe (`make_pipe`).
         root: the node of the world that is shown.
         camera: the pinhole camera that sees the world.
         crop: the part of the camera's picture that is seen, and the size of what comes out.

@@ -1,7 +1,7 @@
-"""The town as it is seen: land, scenery, agents, canvas and air put together for the software renderer, back to front.
+"""The town as it is seen: land, scenery, agents, canvas and air put together for the renderer, back to front.
 
-The renderer has neither shaders nor fog nor alpha that can be trusted on edges, so all light is baked: into pictures of
-the ground, a cell at a time, and into vertex colours. Haze is a row of translucent cards.
+The software renderer has neither shaders nor fog nor alpha that can be trusted on edges, so all light is baked: into
+pictures of the ground, a cell at a time, and into vertex colours. Haze is a row of translucent cards.
 """
 
 from __future__ import annotations
@@ -22,7 +22,17 @@ from roadproof.simulators.town.agent_nodes import AgentNodes
 from roadproof.simulators.town.air import dome, haze_cards, rain_card
 from roadproof.simulators.town.canvas import road_patch
 from roadproof.simulators.town.canvas_node import CanvasNode
-from roadproof.simulators.town.engine import Node, Path, Screen, Texture, core, ground_stage, make_pipe, make_texture
+from roadproof.simulators.town.engine import (
+    Graphics,
+    Node,
+    Path,
+    Screen,
+    Texture,
+    core,
+    ground_stage,
+    make_pipe,
+    make_texture,
+)
 from roadproof.simulators.town.ground import LitGround, build_ground, light_ground
 from roadproof.simulators.town.land import CELL_M, Land
 from roadproof.simulators.town.materials import split_by_atlas, static_textures
@@ -46,9 +56,16 @@ NEAR_LAYERS = (Layer.PAINT, Layer.PAVEMENT, Layer.SMALL)
 class Renderer:
     """Draws one town from one camera."""
 
-    def __init__(self, roads: RoadMap, scenery: Scenery, camera: CameraModel, crop: CropResize) -> None:
-        self._camera = camera
-        self._pipe = make_pipe()
+    def __init__(
+        self,
+        roads: RoadMap,
+        scenery: Scenery,
+        camera: CameraModel,
+        crop: CropResize,
+        graphics: Graphics = Graphics.SOFTWARE,
+    ) -> None:
+        self._camera, self._graphics = camera, graphics
+        self._pipe = make_pipe(graphics)
         self._root = core.NodePath("town")
         self._streets = build_streets(roads)
         self._scenery = scenery
@@ -69,7 +86,7 @@ class Renderer:
         self._shown_from: tuple[int, int] | None = None
         self._districts: dict[tuple[int, int, bool], Path] = {}
         self._crops = ((crop, 2), (whole(camera), 2))
-        self._canvas = CanvasNode(self._root, camera, self._crops)
+        self._canvas = CanvasNode(self._root, camera, self._crops, graphics)
         self._agents = AgentNodes(self._root, roads, camera, self._textures["shade"])
         self._follow = self._root.attach_new_node("follow")
         self._haze = self._root.attach_new_node("haze")
@@ -166,7 +183,7 @@ class Renderer:
             key = (raised, place)
             # Taken out and put back, so that the first are those unused for longest.
             patch = self._patches.pop(key, None)
-            self._patches[key] = patch or CanvasNode(self._root, raised, ((whole(raised), 2),))
+            self._patches[key] = patch or CanvasNode(self._root, raised, ((whole(raised), 2),), self._graphics)
             seen += 1
             if self._laid.get(key) is not pattern:
                 self._patches[key].lay(place, partial(road_patch, self._lit, place, self._grain, self._streets.paint))
@@ -206,6 +223,9 @@ class Renderer:
         if ground is not None:
             path.set_texture(self._stage, ground)
         dress(path, layer)
+        if layer is Layer.GROUND and self._graphics is Graphics.EGL:
+            # OpenGL keeps no depth where it tests none.
+            path.set_attrib(core.DepthTestAttrib.make(core.RenderAttrib.M_always))
 
     def _district(self, node: Node, layer: Layer) -> Path:
         """The parent of the nodes of a part of town, of which small things are seen from near only."""

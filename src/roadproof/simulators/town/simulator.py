@@ -15,7 +15,7 @@ from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import BESIDE_M, PaintKind
-from roadproof.simulators.town.engine import make_pipe
+from roadproof.simulators.town.engine import Graphics, make_pipe
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
@@ -39,17 +39,19 @@ class _Drive(RouteTracker):
 
 
 class TownSimulator(RouteSimulator[_Drive]):
-    """A small town on one CPU core, without a screen, a GPU or a server.
+    """A small town without a screen or a server, on one CPU core unless OpenGL draws it.
 
     Args:
         camera: the camera on the car.
         input: how the controller's frame is cut from the camera picture; it is rendered at twice its resolution and
             reduced by a box, so the simulator's own `input` says "area", whatever this one said.
         dt_s: simulated seconds per step, a multiple of 0.01.
+        graphics: what draws: "software" by default, whose pixels are the same on every machine; "egl" for OpenGL, on a
+            GPU where there is one, whose pictures differ a little at edges.
 
     Raises:
-        SimulatorError: `dt_s` is not a positive multiple of 0.01, the crop leaves the camera picture, or the camera has
-            a lens.
+        SimulatorError: there are no such graphics, `dt_s` is not a positive multiple of 0.01, the crop leaves the
+            camera picture, or the camera has a lens.
     """
 
     paint = PaintKind.RENDERED
@@ -61,14 +63,23 @@ class TownSimulator(RouteSimulator[_Drive]):
         camera: CameraModel = CIL_CAMERA,
         input: CropResize = CIL_INPUT,  # noqa: A002
         dt_s: float = 0.05,
+        graphics: str = Graphics.SOFTWARE,
     ) -> None:
+        if graphics not in tuple(Graphics):
+            raise SimulatorError(f"graphics is {graphics!r}, expected {' or '.join(Graphics)}")
         substeps = dt_s / SUBSTEP_S
         if not (math.isfinite(dt_s) and round(substeps) >= 1 and abs(substeps - round(substeps)) < 1e-6):
             raise SimulatorError(f"dt_s is {dt_s}, expected a positive multiple of {SUBSTEP_S}")
         if camera.lens is not None:
             raise SimulatorError("the town is drawn as a pinhole sees it; give TownSimulator a camera without a lens")
         super().__init__(camera, replace(input, resampling="area"), dt_s)
+        self._graphics = Graphics(graphics)
         self._town: _Town | None = None
+
+    @property
+    def identity(self) -> str:
+        """What tells this town's pictures from those that software draws; empty for these."""
+        return "" if self._graphics is Graphics.SOFTWARE else f"drawn by {self._graphics}"
 
     def road_map(self, name: str) -> RoadMap:
         """The map a scenario names; it needs no drive.
@@ -107,7 +118,7 @@ class TownSimulator(RouteSimulator[_Drive]):
         return homography_from_pose(self.camera, drive.state, drive.scenario.canvas)
 
     def _open(self) -> None:
-        make_pipe()
+        make_pipe(self._graphics)
 
     def _close(self) -> None:
         if self._town is not None:
@@ -154,5 +165,7 @@ class TownSimulator(RouteSimulator[_Drive]):
             self._end_drive()
             self._close()
             scenery = build_scenery(roads)
-            self._town = _Town(map_name, roads, scenery, Renderer(roads, scenery, self.camera, self.input))
+            self._town = _Town(
+                map_name, roads, scenery, Renderer(roads, scenery, self.camera, self.input, self._graphics)
+            )
         return self._town
