@@ -187,7 +187,7 @@ def measure_path(recordings: RecordingSet, name: str, repeats: int, patterns: in
             if repeat:
                 times[key].append(elapsed)
                 cpu_times[key].append(processor)
-    many = space.pattern(space.random((patterns,), torch.Generator().manual_seed(1)))
+    many = space.drawn(patterns, 1)
     began = time.perf_counter()
     rolled.foretold(controller, many)
     return {

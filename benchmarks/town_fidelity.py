@@ -161,7 +161,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     space = SearchSpace(figures=arguments.figures)
-    drawn = space.pattern(space.random((arguments.patterns,), torch.Generator().manual_seed(arguments.seed)))
+    drawn = space.drawn(arguments.patterns, arguments.seed)
     patterns = [drawn[k] for k in range(arguments.patterns)]
     records: list[dict[str, object]] = []
     with TownSimulator() as town:

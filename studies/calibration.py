@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from roadproof.calibration import METHODS, Calibrated, Method, calibrate
+from roadproof.calibration import METHODS, Calibrated, CalibrationMethod, calibrate
 from roadproof.calibration.outline import moved
 from roadproof.calibration.replays import Replays, Target
 from roadproof.calibration.report import Spread, stated_errors_px
@@ -73,23 +73,23 @@ def covered(pattern: Pattern, recording: Recording, recordings: RecordingSet) ->
 
 
 def compare(
-    results: dict[Method, Calibrated],
+    results: dict[CalibrationMethod, Calibrated],
     painted: dict[str, list[np.ndarray]],
     drives: Drives,
     patterns: list[Pattern],
     controller: Controller | None,
-) -> dict[Method, dict[str, float]]:
+) -> dict[CalibrationMethod, dict[str, float]]:
     """Errors of each method's composites."""
-    sums: dict[Method, list[list[float]]] = {method: [] for method in results}
+    sums: dict[CalibrationMethod, list[list[float]]] = {method: [] for method in results}
     for n, drive in enumerate(drives.drives):
         kept = [set(result.recordings.recordings[n].frame_number.tolist()) for result in results.values()]
         common = set.intersection(*kept)
         rows = [k for k, number in enumerate(drive.frame_number.tolist()) if number in common]
         # Poses are exact in the town: where the paint is, is taken from them for all methods.
-        exact = at(results[Method.POSE].recordings.recordings[n], common)
+        exact = at(results[CalibrationMethod.POSE].recordings.recordings[n], common)
         for k, pattern in enumerate(patterns):
             truth = painted[drive.name][k][rows]
-            paint = covered(pattern, exact, results[Method.POSE].recordings) >= 0.5
+            paint = covered(pattern, exact, results[CalibrationMethod.POSE].recordings) >= 0.5
             for method, result in results.items():
                 one = at(result.recordings.recordings[n], common)
                 colour, view = result.recordings.colour, result.recordings.view
@@ -144,13 +144,13 @@ def stated_of(replays: Replays, drive: Drive) -> np.ndarray:
 def judge(
     town: TownSimulator,
     drives: Drives,
-    methods: list[Method],
+    methods: list[CalibrationMethod],
     patterns: list[Pattern],
     controller: Controller | None,
     keep: Path,
 ) -> list[dict[str, object]]:
     """One record a method for one scenario and weather."""
-    results: dict[Method, Calibrated] = {}
+    results: dict[CalibrationMethod, Calibrated] = {}
     for method in methods:
         began = time.process_time()
         results[method] = calibrate(town, drives, method, folder=keep)
@@ -196,9 +196,9 @@ def main() -> None:
     torch.set_num_threads(1)
     controller = load_controller(arguments.controller) if arguments.controller else None
     space = SearchSpace(figures=arguments.figures)
-    drawn = space.pattern(space.random((arguments.patterns,), torch.Generator().manual_seed(arguments.seed)))
+    drawn = space.drawn(arguments.patterns, arguments.seed)
     patterns = [drawn[k] for k in range(arguments.patterns)]
-    methods = [Method(name) for name in arguments.methods.split(",")]
+    methods = [CalibrationMethod(name) for name in arguments.methods.split(",")]
     records: list[dict[str, object]] = []
     with TownSimulator() as town:
         for weather in map(Weather, arguments.weathers.split(",")):

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw, ImageFont
 
 from roadproof import SearchSpace, TownSimulator, calibrate, composite, find_scenario, record
-from roadproof.calibration import Method
+from roadproof.calibration import CalibrationMethod
 from roadproof.compositing import view_canvas
 from roadproof.datatypes import VehicleState
 from roadproof.drives import Swerve, Trajectories, Window
@@ -102,7 +102,7 @@ def main() -> None:
     around = Trajectories(count=3, perturbation=Swerve((1.5,)))
     with TownSimulator() as town:
         drives = record(town, expert, SCENARIO, trajectories=around, window=Window(frames=40, least_px=8))
-        recordings = calibrate(town, drives, method=Method.POSE).recordings
+        recordings = calibrate(town, drives, method=CalibrationMethod.POSE).recordings
         clean, states = recordings.recordings[0], drives.drives[0].states
         away_m = [math.hypot(s.x_m - SCENARIO.canvas.x_m, s.y_m - SCENARIO.canvas.y_m) for s in states]
         at = int(np.abs(np.array(away_m) - AHEAD_M).argmin())

@@ -163,6 +163,10 @@ class SearchSpace:
         low = torch.tensor(start_low + [0.0] * (len(self.names) - len(start_low)))
         return low + (1 - low) * unit
 
+    def drawn(self, count: int, seed: int) -> Pattern:
+        """A batch of random patterns, the same for the same seed."""
+        return self.pattern(self.random((count,), torch.Generator().manual_seed(seed)))
+
     def project(self, unit: Float[Tensor, "*b k n"]) -> Float[Tensor, "*b k n"]:
         """The nearest point inside the bounds: clipped, but a free rotation wraps round (0° and 180° are the same)."""
         clipped = unit.clamp(0.0, 1.0)

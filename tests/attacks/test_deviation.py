@@ -7,7 +7,17 @@ import pytest
 import torch
 
 from painted_ground import RampFollower, known_vehicle, recorded_road
-from roadproof.attacks import CMAES, GradOpt, PathDeviation, SteeringShift, attack, methods
+from roadproof.attacks import (
+    CMAES,
+    BayesianOptimisation,
+    GradOpt,
+    PathDeviation,
+    Published,
+    SteeringShift,
+    attack,
+    methods,
+    usual_objective,
+)
 from roadproof.attacks.gradopt import BEHIND, MUTATION, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
@@ -16,6 +26,7 @@ from roadproof.recorded import RecordedWorld, Start
 from roadproof.recorded.world import UNSURE
 from roadproof.recordings import pooled
 from roadproof.search_space import SearchSpace, derived_seed
+from scenes import recording_set
 
 SPACE = SearchSpace(figures=1)
 SHORT = GradOpt(iterations=8, restarts=2, halving=False)
@@ -270,3 +281,13 @@ def test_objectives_that_make_no_sense_are_one_clear_line(road):
     with pytest.raises(RecordingError, match="where its canvas lies"):
         search(dataclasses.replace(road, canvas=None))
     assert (SteeringShift().name, PathDeviation().name) == ("steering shift", "path deviation")
+
+
+def test_the_deviation_is_searched_for_where_it_can_be_driven_and_nobody_asks_for_another(road):
+    assert isinstance(usual_objective(road, GradOpt()), PathDeviation)
+    assert isinstance(usual_objective(road, CMAES(calls=4)), PathDeviation)
+    one_side = dataclasses.replace(road, recordings=road.recordings[:1])
+    for recordings, method in ((recording_set(), GradOpt()), (one_side, GradOpt()), (road, Published())):
+        assert isinstance(usual_objective(recordings, method), SteeringShift)
+    assert isinstance(usual_objective(road, BayesianOptimisation(calls=4, random_calls=2)), SteeringShift)
+    assert attack(road, RampFollower(), SPACE, method=SHORT).objective == PathDeviation().name

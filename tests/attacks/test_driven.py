@@ -8,7 +8,16 @@ import pytest
 import torch
 
 from paint_shy import along_a_street
-from roadproof.attacks import CMAES, AttackResult, GradOpt, InSimulator, PathDeviation, SteeringShift, attack
+from roadproof.attacks import (
+    CMAES,
+    AttackResult,
+    GradOpt,
+    InSimulator,
+    PathDeviation,
+    SteeringShift,
+    attack,
+    usual_objective,
+)
 from roadproof.attacks.driven import DrivenMeasure, effect_of
 from roadproof.attacks.groups import LEFT_GROUP
 from roadproof.controllers import load_controller
@@ -108,6 +117,7 @@ def test_a_search_by_gradient_in_a_simulator_is_refused_before_it_drives():
     place = InSimulator(TownSimulator(), find_scenario("left-03"))
     with pytest.raises(RoadproofError, match="needs gradients, and a drive in a simulator has none"):
         attack(place, load_controller("pilotnet"), SPACE, method=GradOpt())
+    assert isinstance(usual_objective(place, CMAES(calls=4)), PathDeviation)
 
 
 @pytest.mark.parametrize(

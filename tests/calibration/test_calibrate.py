@@ -8,7 +8,7 @@ import torch
 
 import needs
 from paint_shy import along_a_street
-from roadproof.calibration import Calibrated, CalibrationReport, Method, calibrate, replays_needed
+from roadproof.calibration import Calibrated, CalibrationMethod, CalibrationReport, calibrate, replays_needed
 from roadproof.compositing import composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.drives import Swerve, Trajectories, Window, record
@@ -75,13 +75,13 @@ def test_what_is_composited_is_what_is_seen_of_real_paint(two_paint, town, scene
 
 @pytest.mark.slow
 def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(town, scene, drives, tmp_path):
-    assert drives.calls + replays_needed(len(drives.drives), Method.PUBLISHED) == 61
+    assert drives.calls + replays_needed(len(drives.drives), CalibrationMethod.PUBLISHED) == 61
     # Full pictures take long: one drive only, which begins 13 m before the middle of the canvas.
     near = dataclasses.replace(scene, start=dataclasses.replace(scene.start, x_m=scene.canvas.x_m - 13.0))
     one = record(town, expert, near, trajectories=Trajectories(count=1), window=Window(frames=3))
     shown = []
     with Pool(TownSimulator, 2) as pool:
-        found = calibrate(town, one, Method.PUBLISHED, folder=tmp_path, pool=pool, on_call=shown.append)
+        found = calibrate(town, one, CalibrationMethod.PUBLISHED, folder=tmp_path, pool=pool, on_call=shown.append)
     assert shown == list(range(12 + 22 + 1))
     assert found.report.calls == 1 + 12 + 22
     assert found.report.drives[0].stated_px.mean < 3.0
@@ -91,7 +91,7 @@ def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(tow
 
 def test_poses_alone_are_exact_in_the_town_and_take_no_calls_of_their_own(town, drives, two_paint, folder):
     driven = len(list(folder.iterdir()))
-    found = calibrate(town, drives, Method.POSE, folder=folder)
+    found = calibrate(town, drives, CalibrationMethod.POSE, folder=folder)
     assert len(list(folder.iterdir())) == driven, "light and dark are those of the two-paint calibration"
     assert max(drive.stated_px.p95 for drive in found.report.drives) < 0.01
 
@@ -130,24 +130,24 @@ def test_the_set_and_its_report_survive_their_files(two_paint, tmp_path):
 
 
 def test_a_calibration_is_kept_for_its_own_drives_and_method(two_paint, drives, tmp_path):
-    assert Calibrated.kept(tmp_path, drives, Method.TWO_PAINT) is None
+    assert Calibrated.kept(tmp_path, drives, CalibrationMethod.TWO_PAINT) is None
     two_paint.save(tmp_path)
-    assert Calibrated.kept(tmp_path, drives, Method.TWO_PAINT).report == two_paint.report
+    assert Calibrated.kept(tmp_path, drives, CalibrationMethod.TWO_PAINT).report == two_paint.report
     loaded = Calibrated.load(tmp_path)
     assert (loaded.report, loaded.made_of) == (two_paint.report, two_paint.made_of)
     assert [drive.name for drive in loaded.recordings.recordings] == ["clean", "right", "left"]
     assert loaded._repr_html_() == two_paint._repr_html_()
     assert loaded._repr_html_().count("<tr>") == 1 + 3
     with pytest.raises(CalibrationError, match="holds a calibration with method 'two-paint', now it is 'pose'"):
-        Calibrated.kept(tmp_path, drives, Method.POSE)
+        Calibrated.kept(tmp_path, drives, CalibrationMethod.POSE)
     clean, *others = drives.drives
     steered = dataclasses.replace(clean, episode=dataclasses.replace(clean.episode, steer=clean.episode.steer + 0.01))
     again = dataclasses.replace(drives, drives=(steered, *others))
     with pytest.raises(CalibrationError, match=r"holds a calibration with drives\.clean '"):
-        Calibrated.kept(tmp_path, again, Method.TWO_PAINT)
+        Calibrated.kept(tmp_path, again, CalibrationMethod.TWO_PAINT)
     two_paint.report.save(tmp_path / "calibration" / "report.json")  # alone, it does not say of which drives it is
     with pytest.raises(CalibrationError, match="holds a calibration that does not say what it was made of; choose ano"):
-        Calibrated.kept(tmp_path, drives, Method.TWO_PAINT)
+        Calibrated.kept(tmp_path, drives, CalibrationMethod.TWO_PAINT)
 
 
 def test_recordings_that_were_put_in_another_runs_place_are_refused(two_paint, drives, tmp_path):
@@ -156,7 +156,7 @@ def test_recordings_that_were_put_in_another_runs_place_are_refused(two_paint, d
     elsewhere = dataclasses.replace(two_paint.recordings, recordings=(turned, *others))
     dataclasses.replace(two_paint, recordings=elsewhere).save(tmp_path)
     with pytest.raises(CalibrationError, match="drive clean has other frames than were recorded in this run"):
-        Calibrated.kept(tmp_path, drives, Method.TWO_PAINT)
+        Calibrated.kept(tmp_path, drives, CalibrationMethod.TWO_PAINT)
 
 
 def test_a_replay_that_goes_another_way_is_refused(town, drives):
@@ -181,7 +181,7 @@ def test_a_canvas_that_is_not_where_the_scenario_says_is_refused(town, scene, dr
     )
     moved = dataclasses.replace(drives, settings=dataclasses.replace(drives.settings, scenario=scenario))
     with pytest.raises(CalibrationError, match=r"miss what was seen by .* px on average"):
-        calibrate(town, moved, Method.POSE)
+        calibrate(town, moved, CalibrationMethod.POSE)
 
 
 def test_a_canvas_that_never_shows_is_refused(town, drives, monkeypatch):

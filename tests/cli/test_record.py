@@ -154,7 +154,7 @@ MISTAKES = {
     "unknown scenario": (["record", "left-3"], "did you mean 'left-03'?"),
     "unknown weather": (["record", "left-03", "--weather", "dry"], "--weather is 'dry'"),
     "unknown scheme": (["record", "left-03", "--scheme", "grup"], "did you mean group?"),
-    "two ways": (["record", "left-03", "--noise-deg", "1", "2", "--deviation-m", "1"], "choose one way"),
+    "two ways": (["record", "left-03", "--noise-deg", "1", "2", "--swerve-m", "1"], "choose one way"),
     "even T": (["record", "left-03", "--trajectories", "2"], "T is 2 trajectories"),
     "no run": (["calibrate", "."], "holds no run with a folder named record"),
     "unknown method": (["calibrate", "runs", "--method", "two-paints"], "did you mean two-paint?"),

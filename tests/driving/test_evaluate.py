@@ -14,7 +14,7 @@ import needs
 from paint_shy import PaintShy, along_a_street, magenta
 from roadproof.datatypes import Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
-from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, driver_in_words, load_episodes
+from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, driver_in_words, load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluate import evaluate, random_patterns
 from roadproof.driving.evaluation import Evaluation, load_paint
@@ -277,7 +277,7 @@ def test_an_edited_function_makes_other_drives(town, street, tmp_path):
     def made(gain):
         return lambda world: lambda seen: gain
 
-    bare = Conditions(paint=CLEAN, weather=Weather.CLEAR_NOON)
+    bare = DriveConditions(paint=CLEAN, weather=Weather.CLEAR_NOON)
     drivers = made(1), made(2), lambda world: lambda seen: 1, functools.partial(made(1), None)
     names = [Episodes.of(town, each, street, {}, tmp_path).file(bare) for each in (*drivers, made(1))]
     assert len(set(names)) == 4

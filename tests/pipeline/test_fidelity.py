@@ -102,6 +102,10 @@ def test_the_recorded_clean_drive_is_rendered_over_the_paint_and_kept(drive, tow
     assert (
         measure_fidelity(town, PaintShy(), SHORT, PATTERN, recordings, tmp_path, weather=weather, clean=other) is None
     )
+    unseen = dataclasses.replace(PATTERN, boxes=PATTERN.boxes * torch.tensor([1.0, 1.0, 1e-3, 1e-3, 1.0]))
+    assert (
+        measure_fidelity(town, PaintShy(), SHORT, unseen, recordings, tmp_path, weather=weather, clean=episode) is None
+    )
 
 
 def test_it_is_saved_and_loaded(drive, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from paint_shy import along_a_street
-from roadproof.calibration import Method, calibrate
+from roadproof.calibration import CalibrationMethod, calibrate
 from roadproof.controllers import load_controller
 from roadproof.drives import Swerve, Trajectories, Window, record
 from roadproof.driving.rollout import rollout
@@ -28,7 +28,7 @@ def run(town, tmp_path_factory):
         trajectories=Trajectories(count=3, perturbation=Swerve((0.5,))),
         window=Window(frames=30),
     )
-    return controller, scenario, drives, calibrate(town, drives, Method.POSE).recordings
+    return controller, scenario, drives, calibrate(town, drives, CalibrationMethod.POSE).recordings
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import torch
 from paint_shy import PaintShy, along_a_street
 from roadproof.attacks import GradOpt, SteeringShift, methods
 from roadproof.attacks.gradopt import Rung
-from roadproof.calibration import Method
+from roadproof.calibration import CalibrationMethod
 from roadproof.cli.demo import _report
 from roadproof.datatypes import Weather
 from roadproof.drives import Swerve, Trajectories, Window
@@ -175,4 +175,4 @@ def test_budgets_that_contradict_themselves_are_refused():
     with pytest.raises(RoadproofError, match="attack_weathers are clear-noon, clear-noon; expected each once"):
         dataclasses.replace(BUDGET, attack_weathers=(NOON, NOON))
     with pytest.raises(RoadproofError, match="published calibration holds in one weather"):
-        dataclasses.replace(BUDGET, calibration=Method.PUBLISHED, attack_weathers=(NOON, RAIN))
+        dataclasses.replace(BUDGET, calibration=CalibrationMethod.PUBLISHED, attack_weathers=(NOON, RAIN))

@@ -8,7 +8,7 @@ import torch
 
 from paint_shy import along_a_street
 from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
-from roadproof.calibration import CalibrationReport, Method
+from roadproof.calibration import CalibrationMethod, CalibrationReport
 from roadproof.controllers import load_controller
 from roadproof.datatypes import Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window
@@ -114,7 +114,7 @@ def test_budgets_say_what_they_spend():
     [
         ({"select": 2}, "select 2: as published it is 0"),
         ({"objective": PathDeviation()}, "objective path deviation: as published it is steering shift"),
-        ({"calibration": Method.TWO_PAINT}, "calibration two-paint: as published it is published"),
+        ({"calibration": CalibrationMethod.TWO_PAINT}, "calibration two-paint: as published it is published"),
         ({"trajectories": Trajectories()}, "perturbation Swerve: as published it is SteeringNoise"),
     ],
     ids=lambda value: "" if isinstance(value, str) else next(iter(value)),

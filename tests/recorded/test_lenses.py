@@ -42,7 +42,7 @@ def levels(frames):
 
 def patterns(count):
     space = SearchSpace(figures=3)
-    return space.pattern(space.random((count,), torch.Generator().manual_seed(4)))
+    return space.drawn(count, 4)
 
 
 def test_at_a_recorded_pose_the_picture_is_the_frame_bit_for_bit(bank):

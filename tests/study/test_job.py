@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 import needs
 from paint_shy import along_a_street
 from roadproof.attacks import CMAES, AttackResult, GradOpt, PathDeviation, Published, SteeringShift, proposals
-from roadproof.calibration import Method
+from roadproof.calibration import CalibrationMethod
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.starts import StartPlan
@@ -191,7 +191,7 @@ def test_a_method_says_what_is_spent():
     )
     plan = GradOptPlan(name="b", objective="steering", trajectories=5, swerves_m=(1.5, 0.8), weaves_m=(), select=3)
     budget = budget_of(plan, Weather.CLEAR_NOON)
-    assert (budget.objective, budget.calibration) == (SteeringShift(), Method.TWO_PAINT)
+    assert (budget.objective, budget.calibration) == (SteeringShift(), CalibrationMethod.TWO_PAINT)
     assert budget.trajectories == Trajectories(count=5, perturbation=Swerve((1.5, 0.8)))
     assert (budget.pooled, budget.select) == (False, 3)
     for scheme, recorded in (("group-all", Scheme.GROUP), ("random", Scheme.RANDOM)):

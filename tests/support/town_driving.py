@@ -4,7 +4,7 @@ import hashlib
 import math
 
 from roadproof.datatypes import Control
-from roadproof.simulators.town.physics import MAX_STEER_RAD, WHEELBASE_M
+from roadproof.simulators.town.physics import CAR_WHEELBASE_M, MAX_STEER_RAD
 
 
 def pursue(simulator, speed_mps=7.0):
@@ -13,7 +13,7 @@ def pursue(simulator, speed_mps=7.0):
     x, y, _, _ = route.at(here.arclength_m + max(4.0, 0.7 * state.speed_mps))
     bearing = math.atan2(y - state.y_m, x - state.x_m) - state.yaw_rad
     distance = math.hypot(x - state.x_m, y - state.y_m)
-    steer = -math.atan2(2 * WHEELBASE_M * math.sin(bearing), distance) / MAX_STEER_RAD
+    steer = -math.atan2(2 * CAR_WHEELBASE_M * math.sin(bearing), distance) / MAX_STEER_RAD
     wish = 0.4 * (speed_mps - state.speed_mps)
     return Control(steer, throttle=max(wish + 0.05, 0.0), brake=max(-wish - 0.5, 0.0))
 

@@ -2,6 +2,7 @@
 
 from roadproof.attacks.attack import attack as attack
 from roadproof.attacks.attack import kept_attack as kept_attack
+from roadproof.attacks.attack import usual_objective as usual_objective
 from roadproof.attacks.blackbox import CMAES as CMAES
 from roadproof.attacks.blackbox import TPE as TPE
 from roadproof.attacks.blackbox import BayesianOptimisation as BayesianOptimisation

@@ -27,8 +27,8 @@ from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
 from roadproof.attacks.method import Method
-from roadproof.attacks.methods import GradOpt, stored
-from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, SteeringShift, own_objective
+from roadproof.attacks.methods import BayesianOptimisation, GradOpt, Published, stored
+from roadproof.attacks.objective import Measure, Objective, PathDeviation, RecordedMeasure, SteeringShift, own_objective
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
@@ -69,8 +69,8 @@ def attack(
             where every pattern takes a drive, and the method has to do without gradients.
         controller: the controller that is attacked; it computes on `device`.
         space: the search space: the patterns that are allowed.
-        objective: what is made large: `SteeringShift()` by default, as published; `PathDeviation()` or
-            `SpeedChange()`, which drive in the recordings and need their tracks; or one of your own.
+        objective: what is made large: `PathDeviation()` or `SpeedChange()`, which drive in the recordings and need
+            their tracks; `SteeringShift()`, as published; or one of your own. By default `usual_objective`.
         method: `GradOpt()` by default; `Published()`, or one that needs no gradient, as `CMAES()` or `TPE()`.
         groups: groups of recorded drives, each attacked together; none in a simulator. By default, for a method with
             gradients and drives perturbed to both sides, the paper's two sides, of which the stronger is kept, or for a
@@ -89,7 +89,8 @@ def attack(
         RoadproofError: the method needs gradients, which a simulator does not give; groups, a device or random patterns
             are given for one; or `rollout` fails there.
     """
-    objective, method = objective or SteeringShift(), method or GradOpt()
+    method = method or GradOpt()
+    objective = objective or usual_objective(recordings, method)
     method.check_space(space)
     made_of: dict[str, Any] = {}
     if isinstance(recordings, RecordingSet):
@@ -140,6 +141,16 @@ def attack(
         conspicuousness=conspicuousness(first.pattern, space.site or site),
         made_of=made_of,
     )
+
+
+def usual_objective(recordings: RecordingSet | InSimulator, method: Method) -> Objective:
+    """What an attack makes large where nobody says.
+
+    It is the deviation in a simulator, and where recordings can be driven in to both sides; the steering shift in other
+    recordings, and for the published searches.
+    """
+    driven = isinstance(recordings, InSimulator) or (recordings.is_placed and recordings.has_both_sides)
+    return PathDeviation() if driven and not isinstance(method, Published | BayesianOptimisation) else SteeringShift()
 
 
 def _refuse_in_simulator(**given: object) -> None:

@@ -1,4 +1,4 @@
-"""What an attack drives up: how far a painted pattern shifts a controller's steering on recorded drives.
+"""Groups of recorded drives that are attacked together, each in a direction, and the divergence of such a group.
 
 The divergence δ of the paper compares the controller's answers to composited frames with its answers to the clean
 ones. Signed for a group of drives (clean and right: to the right is positive; clean and left: to the

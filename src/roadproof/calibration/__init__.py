@@ -2,7 +2,7 @@
 
 from roadproof.calibration.calibrate import METHODS as METHODS
 from roadproof.calibration.calibrate import Calibrated as Calibrated
-from roadproof.calibration.calibrate import Method as Method
+from roadproof.calibration.calibrate import CalibrationMethod as CalibrationMethod
 from roadproof.calibration.calibrate import calibrate as calibrate
 from roadproof.calibration.calibrate import replays_needed as replays_needed
 from roadproof.calibration.report import CalibrationReport as CalibrationReport

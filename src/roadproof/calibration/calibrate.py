@@ -38,11 +38,11 @@ WORST_PX = 3.0
 LEAST_SHARE = 0.5
 
 
-class Method(StrEnum):
+class CalibrationMethod(StrEnum):
     """How drives are calibrated.
 
-    two-paint: the canvas all white and all black, two replays a drive; homographies from its outline.
-    pose: the same colours; homographies from the camera model and the poses, unrefined.
+    two-paint: the canvas black, and black with grey squares, two replays a drive; homographies from its outline.
+    pose: the same paints; homographies from the camera model and the poses, unrefined.
     published: 12 replays a drive over coloured points, 22 of the clean drive over painted colours.
     """
 
@@ -51,7 +51,7 @@ class Method(StrEnum):
     PUBLISHED = "published"
 
 
-METHODS = tuple(Method)
+METHODS = tuple(CalibrationMethod)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Calibrated:
         return Calibrated(load_recordings(run / "recordings"), report, content.get("made_of", {}))
 
     @staticmethod
-    def kept(run: Path, drives: Drives, method: Method) -> Calibrated | None:
+    def kept(run: Path, drives: Drives, method: CalibrationMethod) -> Calibrated | None:
         """Read what `save` wrote; None if the run has not been calibrated.
 
         Args:
@@ -134,18 +134,18 @@ def _same_frames(recording: Recording, drives: Drives) -> bool:
     return kept.sum() == len(recording.frames) and np.array_equal(drive.frames[kept], recording.frames)
 
 
-def _parts(drives: Drives, method: Method) -> dict[str, object]:
+def _parts(drives: Drives, method: CalibrationMethod) -> dict[str, object]:
     return {"method": str(method), "drives": {drive.name: digest(*told_apart(drive))[:16] for drive in drives.drives}}
 
 
-def replays_needed(count: int, method: Method) -> int:
+def replays_needed(count: int, method: CalibrationMethod) -> int:
     """Number of replays in the simulator that a calibration of so many recorded drives takes on top of them."""
-    return RUNS * count + len(PAINTS) if method is Method.PUBLISHED else len(TARGETS) * count
+    return RUNS * count + len(PAINTS) if method is CalibrationMethod.PUBLISHED else len(TARGETS) * count
 
 
-def _wanted(drives: Drives, method: Method) -> list[Wanted]:
+def _wanted(drives: Drives, method: CalibrationMethod) -> list[Wanted]:
     """The replays of a calibration."""
-    if method is not Method.PUBLISHED:
+    if method is not CalibrationMethod.PUBLISHED:
         return [(drive, target) for drive in drives.drives for target in TARGETS]
     points, clean = point_targets(), drives.drives[0]
     return [
@@ -157,7 +157,7 @@ def _wanted(drives: Drives, method: Method) -> list[Wanted]:
 def calibrate(
     simulator: Simulator,
     drives: Drives,
-    method: Method = Method.TWO_PAINT,
+    method: CalibrationMethod = CalibrationMethod.TWO_PAINT,
     *,
     folder: AnyPath | None = None,
     pool: Pool[Simulator] | None = None,
@@ -192,12 +192,12 @@ def calibrate(
         replays = Replays(simulator, drives, folder)
     else:
         replays = Replays(simulator, drives, folder, on_call)
-    if method is Method.PUBLISHED:
+    if method is CalibrationMethod.PUBLISHED:
         geometry = [homographies_from_points(replays, drive, settings.camera) for drive in drives.drives]
         maps: Sequence[PixelMaps | None] = [None] * len(geometry)
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
-        looks = [_look(replays, drives, drive, refine=method is Method.TWO_PAINT) for drive in drives.drives]
+        looks = [_look(replays, drives, drive, refine=method is CalibrationMethod.TWO_PAINT) for drive in drives.drives]
         geometry, maps = [found for found, _ in looks], [shading for _, shading in looks]
         colour, residual = ColourTransform(AffineResponse.identity()), None
     for drive, found in zip(drives.drives, geometry, strict=True):

@@ -27,7 +27,7 @@ def attack(
     controller: options.ControllerSpec,
     figures: options.Figures = 5,
     family: Annotated[
-        str, typer.Option(help="Where figures may lie: published, published-canvas-centre or free.")
+        str, typer.Option(help="Where figures may lie: published, published-canvas-centre, published-bo or free.")
     ] = "published",
     shape: Annotated[str, typer.Option(help="rectangle, ellipse, triangle or diamond.")] = "rectangle",
     black: Annotated[bool, typer.Option("--black", help="All paint is black; only shapes are searched.")] = False,
@@ -40,7 +40,7 @@ def attack(
         unset(
             "deviation: metres aside, driven in the recordings; speed: m/s slower or faster there; steering: shift on "
             "recorded frames, as published.",
-            default="deviation where the set has poses and both sides",
+            default="deviation where the set has poses and both sides, unless the method is published",
         ),
     ] = None,
     groups: Annotated[
@@ -78,7 +78,15 @@ def attack(
     paint: Paint,
 ) -> None:
     """Find the painted pattern that moves a controller most on recorded drives."""
-    from roadproof.attacks import OBJECTIVES, kept_attack, method_of, parse_groups, show_pattern, site_of
+    from roadproof.attacks import (
+        OBJECTIVES,
+        kept_attack,
+        method_of,
+        parse_groups,
+        show_pattern,
+        site_of,
+        usual_objective,
+    )
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
@@ -101,12 +109,11 @@ def attack(
     searched = method_of(method, **{name: value for name, value in given.items() if value is not None})
     searched.check_space(space)
     drives = load_recordings(recordings)
-    driven_in = method != "published" and drives.is_placed and drives.has_both_sides
-    word = options.choice(objective or ("deviation" if driven_in else "steering"), "objective", tuple(OBJECTIVES))
-    goal = varied(OBJECTIVES[word], paint.variation)
+    chosen_goal = None if objective is None else OBJECTIVES[options.choice(objective, "objective", tuple(OBJECTIVES))]
+    goal = varied(chosen_goal or usual_objective(drives, searched), paint.variation)
     space = space.on(site_of(drives))
     if cheapest is not None:
-        _check_cheapest(drives, word)
+        _check_cheapest(drives, goal)
     attacked = load_controller(controller, device=device, dtype=dtype)
     _check_attacked(attacked, drives, searched, goal, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
@@ -154,13 +161,14 @@ def _check_attacked(
         typer.echo("this processor has no bfloat16 arithmetic: --dtype float32 is about 16 times faster here", err=True)
 
 
-def _check_cheapest(drives: RecordingSet, objective: str) -> None:
+def _check_cheapest(drives: RecordingSet, objective: Objective) -> None:
     """Refuse to look for the least paint where it cannot be told."""
+    from roadproof.attacks import SpeedChange
     from roadproof.errors import RecordingError, RoadproofError
 
     if not drives.is_placed:
         raise RecordingError("--cheapest drives in the recordings, which need poses and a canvas; these have none")
-    if objective == "speed":
+    if isinstance(objective, SpeedChange):
         raise RoadproofError("--cheapest is in metres of deviation, --objective speed in m/s; leave one of them out")
 
 

@@ -84,7 +84,7 @@ def _workload(plan: CheckPlan, who: Controller, processes: int) -> Workload:
     if not full:
         return replace(driven, drives=0)
     attack = replace(QUICK, weathers=plan.weathers[:1], starts=0)
-    return of_run(attack, who).times(len(plan.scenarios) * seeds) + driven
+    return of_run(attack, who, film=False).times(len(plan.scenarios) * seeds) + driven
 
 
 def _summarise(result: CheckResult, out: Path) -> None:

@@ -28,7 +28,7 @@ def compare(
     runs = write_comparison(folders, out)
     kinds = sorted({each.predicted for each in runs})
     names = ("predicted m" if kind else "driven m" for kind in kinds)
-    shown = table(("run", "controller", "street"), (*names, "change m", "leaves lane"))
+    shown = table(("run", "controller", "scenario"), (*names, "change m", "leaves lane"))
     for each in runs:
         metres = (each.whole.metres if kind == each.predicted else "" for kind in kinds)
         evaluation, left = each.judged.evaluation, f"{each.whole.left_lane:.0%}"

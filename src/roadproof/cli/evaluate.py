@@ -82,7 +82,7 @@ def evaluate(
     from roadproof.pipeline.fidelity import measure_fidelity
     from roadproof.pipeline.film import film_drives
     from roadproof.pipeline.workload import of_evaluation
-    from roadproof.recorded.simulator import check_canvas
+    from roadproof.recorded.simulator import check_recorded_canvas
     from roadproof.recordings import load_recordings
 
     where = world_asked(simulator, device, controller, scenario, scenarios)
@@ -98,7 +98,7 @@ def evaluate(
     figures, paint = _figures(pattern, needed=bool(random or recordings)), read_paint(pattern)
     recorded = None if recordings is None else load_recordings(recordings)
     if recorded is not None and recorded.canvas is not None and where.scenario is not None:
-        check_canvas(where.scenario.canvas, recorded.canvas)
+        check_recorded_canvas(where.scenario.canvas, recorded.canvas)
     who = options.driver_of(controller, device)
     runs = 10 if runs is None else runs
     if runs and not cars + pedestrians:
@@ -199,10 +199,10 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
         found = fidelity.agreement
         say(
             f"Surrogate on {found.frames} frames of {fidelity.drive}: {found.paint_error:.1f} of 255 levels off in the "
-            f"paint, steering shift {found.predicted_shift:+.3f} predicted, {found.rendered_shift:+.3f} rendered"
+            f"paint, steering shift {found.predicted_shift:+.3f} composited, {found.rendered_shift:+.3f} rendered"
         )
     elif compared:
-        say("The recordings are not of this clean drive, so composites were not compared with renders")
+        say("Composites were not compared with renders: the recordings are of another drive, or show none of the paint")
     say(
         f"{evaluation.drives} {'predicted ' if evaluation.predicted else ''}drives, paint {evaluation.paint}, "
         f"{evaluation.seconds:.0f} s; results in {out}: evaluation.json, episodes"

@@ -28,9 +28,9 @@ def record(
     scheme: Annotated[
         str, typer.Option(help="group: pairs to the right and left; random: each to both sides.")
     ] = "group",
-    deviation_m: Annotated[
+    swerve_m: Annotated[
         list[float] | None,
-        number("How far drives are perturbed; several are taken in turn.", 0.1, 5.0, default="the budget's"),
+        number("How far drives swerve; several are taken in turn.", 0.1, 5.0, default="the budget's"),
     ] = None,
     noise_deg: Annotated[
         tuple[int, int] | None,
@@ -57,12 +57,12 @@ def record(
 
     chosen = [options.scenario_of(name, scenarios) for name in dict.fromkeys(names)]
     sky = options.weather_of(weather)
-    if noise_deg is not None and deviation_m:
-        raise RecordingError("both --noise-deg and --deviation-m are given; choose one way to perturb drives")
+    if noise_deg is not None and swerve_m:
+        raise RecordingError("both --noise-deg and --swerve-m are given; choose one way to perturb drives")
     usual = BUDGETS[options.choice(budget, "budget", tuple(BUDGETS))]
     perturbation = usual.trajectories.perturbation
-    if deviation_m:
-        perturbation = Swerve(tuple(deviation_m))
+    if swerve_m:
+        perturbation = Swerve(tuple(swerve_m), perturbation.weaves_m if isinstance(perturbation, Swerve) else ())
     if noise_deg is not None:
         perturbation = SteeringNoise(*noise_deg)
     wanted = Trajectories(

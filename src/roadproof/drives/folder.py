@@ -267,7 +267,7 @@ def _stated(trajectories: Trajectories) -> dict[str, object]:
     stated: dict[str, object] = {"count": trajectories.count, "scheme": trajectories.scheme}
     if isinstance(how, SteeringNoise):
         return stated | {"noise_deg": (how.low_deg, how.high_deg)}
-    return stated | {"swerve_m": how.deviations_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
+    return stated | {"swerve_m": how.swerves_m} | ({"weave_m": how.weaves_m} if how.weaves_m else {})
 
 
 def _meant(stated: _Trajectories) -> Trajectories:

@@ -28,7 +28,7 @@ class Swerve:
     this size more than on how many drives there are.
 
     Args:
-        deviations_m: sizes of the swerves, metres; the pairs of a Group (or the drives of Random) take them in turn.
+        swerves_m: sizes of the swerves, metres; the pairs of a Group (or the drives of Random) take them in turn.
         weaves_m: sizes of further drives, metres, that weave from side to side, so that frames show what a car sees
             that has turned, as an attacked one has.
 
@@ -36,13 +36,13 @@ class Swerve:
         RecordingError: there is no size, or a size is outside 0.1…5 m.
     """
 
-    deviations_m: tuple[float, ...] = (1.5,)
+    swerves_m: tuple[float, ...] = (1.5,)
     weaves_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        sizes = self.deviations_m + self.weaves_m
+        sizes = self.swerves_m + self.weaves_m
         if not sizes or not all(0.1 <= size <= 5.0 for size in sizes):
-            raise RecordingError(f"deviations are {sizes} m, expected one or more between 0.1 and 5")
+            raise RecordingError(f"swerves are {sizes} m, expected one or more between 0.1 and 5")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class Trajectories:
         sides = (Side.RANDOM,) if self.scheme is Scheme.RANDOM else (Side.RIGHT, Side.LEFT)
         how, sizes = self.perturbation, [(0.0, False)]
         if isinstance(how, Swerve):
-            sizes = [*((size, False) for size in how.deviations_m), *((size, True) for size in how.weaves_m)]
+            sizes = [*((size, False) for size in how.swerves_m), *((size, True) for size in how.weaves_m)]
         perturbed = (
             Plan(str(side) if k == 1 else f"{side}-{k}", side, size, k, weaves)
             for k, (size, weaves) in enumerate(cycle(sizes), 1)

@@ -8,7 +8,7 @@ again, and one of other inputs is never mistaken for it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from roadproof.errors import EpisodeError
 from roadproof.io.files import inside
 from roadproof.io.identity import ANSWERS, CONTROLLER, digest, stated
 from roadproof.io.known import without_addresses
+from roadproof.processes import Pool
 from roadproof.scenarios import Scenario
 from roadproof.scenarios import identity as identity_of_scenario
 from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
@@ -36,7 +37,7 @@ AnyDriver: TypeAlias = Controller | Driver[Any]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Conditions:
+class DriveConditions:
     """What tells a drive from the others in its folder.
 
     Args:
@@ -100,7 +101,7 @@ class Episodes:
         driver, answers, which = cast("list[object]", self.parts["driver"])
         return {**self.parts, "driver": driver, ANSWERS: digest(stated(answers)), CONTROLLER: which}
 
-    def file(self, drive: Conditions) -> str:
+    def file(self, drive: DriveConditions) -> str:
         """The file name of a drive's episode."""
         parts = [stated(self.parts), self.digests[drive.paint]]
         parts += [drive.weather, str(drive.cars), str(drive.pedestrians), str(drive.seed)]
@@ -108,11 +109,11 @@ class Episodes:
         among = f"traffic-{drive.seed}" if drive.cars + drive.pedestrians else "alone"
         return f"{drive.weather}-{among}-{drive.paint}-{digest(stated(parts))[:12]}.npz"
 
-    def has(self, drive: Conditions) -> bool:
+    def has(self, drive: DriveConditions) -> bool:
         """Whether a drive is in the folder already."""
         return self._path(drive).exists()
 
-    def make(self, simulator: Simulator, drive: Conditions) -> None:
+    def make(self, simulator: Simulator, drive: DriveConditions) -> None:
         """Make a drive and keep it; a drive that is in the folder already is left as it is.
 
         Raises:
@@ -133,11 +134,11 @@ class Episodes:
         )
         self.put(drive, episode)
 
-    def put(self, drive: Conditions, episode: Episode) -> None:
+    def put(self, drive: DriveConditions, episode: Episode) -> None:
         """Keep an episode that was made elsewhere."""
         episode.save(self._path(drive))
 
-    def trial(self, clean: Conditions, painted: Conditions) -> Trial:
+    def trial(self, clean: DriveConditions, painted: DriveConditions) -> Trial:
         """What paint did, from two drives that differ in it alone.
 
         Raises:
@@ -153,8 +154,35 @@ class Episodes:
             start=painted.start,
         )
 
-    def _path(self, drive: Conditions) -> Path:
+    def _path(self, drive: DriveConditions) -> Path:
         return self.folder / "episodes" / self.file(drive)
+
+
+def make_missing(
+    pool: Pool[Simulator], episodes: Episodes, drives: Sequence[DriveConditions], on_done: Callable[[int], object]
+) -> None:
+    """Make the drives that a store lacks.
+
+    Args:
+        pool: the processes, each with an open simulator, that make the drives.
+        episodes: store of the drives.
+        drives: drives that are wanted.
+        on_done: called with the number of these drives that are done.
+
+    Raises:
+        SimulatorError: a process died, or the simulator refuses the conditions.
+        ControllerError: the driver raises, or answers wrongly.
+        OutputError: the drives cannot be written.
+    """
+    missing = [drive for drive in drives if not episodes.has(drive)]
+    made = len(drives) - len(missing)
+    on_done(made)
+    for done, _ in enumerate(pool.each(partial(_make, episodes), missing), made + 1):
+        on_done(done)
+
+
+def _make(episodes: Episodes, simulator: Simulator, drive: DriveConditions) -> None:
+    episodes.make(simulator, drive)
 
 
 def load_episodes(folder: Path, names: Iterable[str]) -> tuple[Episode, ...]:

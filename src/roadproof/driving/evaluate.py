@@ -9,13 +9,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from itertools import cycle
 
-import torch
-
 from roadproof.datatypes import Weather
-from roadproof.driving.drive_store import CLEAN, AnyDriver, Conditions, Episodes, driver_in_words
+from roadproof.driving.drive_store import CLEAN, AnyDriver, DriveConditions, Episodes, driver_in_words, make_missing
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.errors import EpisodeError, PatternError
@@ -124,8 +121,7 @@ def evaluate(
 
 def random_patterns(pattern: Pattern, count: int, *, seed: int = 0) -> tuple[Pattern, ...]:
     """Patterns with as many figures as another, drawn as the paper's searches start: what chance alone does."""
-    space = SearchSpace(figures=len(pattern.shapes))
-    drawn = space.pattern(space.random((count,), torch.Generator().manual_seed(seed)))
+    drawn = SearchSpace(figures=len(pattern.shapes)).drawn(count, seed)
     return tuple(drawn[k] for k in range(count))
 
 
@@ -144,12 +140,12 @@ def _planned(
     cars: int,
     pedestrians: int,
     seed: int,
-) -> list[tuple[Conditions, Conditions]]:
+) -> list[tuple[DriveConditions, DriveConditions]]:
     """Pairs of every clean drive with each painted drive that is compared with it."""
     random = [name for name in paints if name != ATTACK]
-    pairs: list[tuple[Conditions, Conditions]] = []
+    pairs: list[tuple[DriveConditions, DriveConditions]] = []
     for weather in weathers:
-        alone = [Conditions(paint=CLEAN, weather=weather, seed=seed, start=start) for start in starts]
+        alone = [DriveConditions(paint=CLEAN, weather=weather, seed=seed, start=start) for start in starts]
         pairs += [(clean, replace(clean, paint=ATTACK)) for clean in alone]
         pairs += [(clean, replace(clean, paint=paint)) for clean, paint in zip(cycle(alone), random, strict=False)]
         for run in range(runs):
@@ -157,30 +153,3 @@ def _planned(
             clean = replace(alone[run % len(alone)], cars=cars, pedestrians=pedestrians, seed=seed + run)
             pairs += [(clean, replace(clean, paint=paint)) for paint in painted]
     return pairs
-
-
-def make_missing(
-    pool: Pool[Simulator], episodes: Episodes, drives: Sequence[Conditions], on_done: Callable[[int], object]
-) -> None:
-    """Make the drives that a store lacks.
-
-    Args:
-        pool: the processes, each with an open simulator, that make the drives.
-        episodes: store of the drives.
-        drives: drives that are wanted.
-        on_done: called with the number of these drives that are done.
-
-    Raises:
-        SimulatorError: a process died, or the simulator refuses the conditions.
-        ControllerError: the driver raises, or answers wrongly.
-        OutputError: the drives cannot be written.
-    """
-    missing = [drive for drive in drives if not episodes.has(drive)]
-    made = len(drives) - len(missing)
-    on_done(made)
-    for done, _ in enumerate(pool.each(partial(_make, episodes), missing), made + 1):
-        on_done(done)
-
-
-def _make(episodes: Episodes, simulator: Simulator, drive: Conditions) -> None:
-    episodes.make(simulator, drive)

@@ -1,9 +1,7 @@
 """Driving a scenario closed loop, and the episode that comes of it.
 
-    with TownSimulator() as town:
-        episode = rollout(town, controller, scenario, weather=Weather.RAINY_NOON, pattern=pattern)
-
-An episode is one file that explains itself: a NumPy archive of named arrays and a JSON header. Nothing is pickled.
+with TownSimulator() as town:
+episode = rollout(town, controller, scenario, weather=Weather.RAINY_NOON, pattern=pattern)
 """
 
 from __future__ import annotations

@@ -209,6 +209,7 @@ class _Check:
             seed=seed,
             controller_name=plan.controller,
             device=self.device,
+            film=False,
             on_progress=lambda stage, done, total, word: self.on_progress(
                 f"{scenario.name}, seed {seed}: {stage}", done, total, word
             ),

@@ -124,7 +124,7 @@ class _Stated:
 
 
 def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False) -> CheckPlan:
-    """Read a plan for one budget, with everything that it names; see the head of this module.
+    """Read a plan for one budget, with everything that it names.
 
     Args:
         path: the plan's TOML file; the files and folders that it names are looked for beside it.

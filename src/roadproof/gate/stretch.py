@@ -8,13 +8,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from roadproof.datatypes import Ending, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, path_of
-from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
+from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, load_episodes, make_missing
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import make_missing
 from roadproof.driving.infractions import counted
 from roadproof.gate.plan import RANDOM, CheckPlan, Key
 from roadproof.gate.result import JudgedDrive
@@ -67,7 +65,7 @@ def known_paints(plan: CheckPlan, scenario: Scenario, site: Site, folder: Path) 
     if plan.random:
         space = space.on(site)
     for seed in plan.seeds if plan.random else ():
-        drawn = space.pattern(space.random((plan.random,), torch.Generator().manual_seed(seed)))
+        drawn = space.drawn(plan.random, seed)
         for k in range(plan.random):
             path = folder / f"random-{seed}-{k + 1}.json"
             save_pattern(drawn[k], path)
@@ -114,7 +112,7 @@ class Stretch:
             total = len(alone) + len(painted)
             make_missing(pool, self.episodes, painted, lambda done: on_drive(len(alone) + done, total))
 
-    def _pairs(self, weather: Weather, paints: Iterable[Paint]) -> list[tuple[Paint, Conditions, Conditions]]:
+    def _pairs(self, weather: Weather, paints: Iterable[Paint]) -> list[tuple[Paint, DriveConditions, DriveConditions]]:
         """Patterns, with each drive over them after the one that it is compared with, where that went well."""
         alone = self._alone(weather)
         good = {each.clean for each in self.bare(weather) if not each.wrong}
@@ -173,10 +171,10 @@ class Stretch:
         ]
         return digest(json.dumps(told, default=str))[:16]
 
-    def _alone(self, weather: Weather) -> dict[tuple[int, int], Conditions]:
+    def _alone(self, weather: Weather) -> dict[tuple[int, int], DriveConditions]:
         plan = self.plan
         return {
-            (seed, k): Conditions(paint=CLEAN, weather=weather, seed=seed, start=start)
+            (seed, k): DriveConditions(paint=CLEAN, weather=weather, seed=seed, start=start)
             for seed in plan.seeds
             for k, start in enumerate(plan.starts.range.draw(plan.starts.count, seed))
         }

@@ -12,7 +12,7 @@ from torch import Tensor
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of
 from roadproof.controllers.conditional import ConditionalNetwork
-from roadproof.controllers.precision import multiplies_bfloat16
+from roadproof.controllers.precision import mixed_precision
 from roadproof.hardening.town import Town
 from roadproof.hardening.views import Street, Views
 from roadproof.patterns import Pattern
@@ -50,11 +50,6 @@ def answers(
         if isinstance(controller, ConditionalNetwork):
             return controller(frames, speed_mps, command).controls.float()
         return next_controls_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
-
-
-def mixed_precision(place: torch.device) -> torch.autocast:
-    """For networks alone: geometry and colours need all their digits."""
-    return torch.autocast(place.type, torch.bfloat16, enabled=multiplies_bfloat16(place))
 
 
 class Shown(NamedTuple):

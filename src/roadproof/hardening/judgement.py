@@ -19,7 +19,7 @@ import numpy as np
 from roadproof.attacks import kept_attack
 from roadproof.controllers import Controller
 from roadproof.datatypes import Ending, Weather
-from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
+from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.infractions import counted
@@ -260,7 +260,7 @@ def clean_drives(
     asked = [(scenario, weather) for scenario in scenarios for weather in weathers]
     for done, (scenario, weather) in enumerate(asked, 1):
         episodes = Episodes.of(simulator, controller, scenario, {}, folder / scenario.name)
-        drive = Conditions(paint=CLEAN, weather=weather)
+        drive = DriveConditions(paint=CLEAN, weather=weather)
         episodes.make(simulator, drive)
         (episode,) = load_episodes(episodes.folder, [episodes.file(drive)])
         if episode.ending is not Ending.GOAL_REACHED or counted(episode.events):

@@ -121,7 +121,7 @@ class HardeningStages:
         path.unlink(missing_ok=True)
 
     def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
-        """StreetJudge the controllers before and after on other streets."""
+        """Judge the controllers before and after on other streets."""
         judged: list[Judged] = []
         with self.ledger.stage("judge"):
             # All before come first: the one after also drives over what was found against the one before.

@@ -25,9 +25,10 @@ from torch.nn import functional
 
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import Controller
+from roadproof.controllers.precision import mixed_precision
 from roadproof.errors import TrainingError
 from roadproof.foreign import call
-from roadproof.hardening.batches import Pictures, TuningBatch, answers, mixed_precision
+from roadproof.hardening.batches import Pictures, TuningBatch, answers
 from roadproof.hardening.town import Town
 from roadproof.hardening.views import Street
 from roadproof.search_space import SearchSpace

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from roadproof.attacks import GradOpt, Method, Objective, PathDeviation, Published, SpeedChange, SteeringShift
 from roadproof.attacks.objective import ClosedLoop
-from roadproof.calibration import Method as Calibration
+from roadproof.calibration import CalibrationMethod
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.evaluate import PAPER_WEATHERS
@@ -48,7 +48,7 @@ class Budget:
     )
     window: Window = field(default_factory=lambda: Window(frames=40, least_px=8))
     pooled: bool = False
-    calibration: Calibration = Calibration.TWO_PAINT
+    calibration: CalibrationMethod = CalibrationMethod.TWO_PAINT
     select: int = 1
     weathers: tuple[Weather, ...] = PAPER_WEATHERS
     starts: int = 5
@@ -71,10 +71,10 @@ class Budget:
             raise RoadproofError(f"{self.rounds} rounds follow the path that was driven; a speed change has 0 rounds")
         if len(set(self.recorded_in)) < len(self.recorded_in):
             raise RoadproofError(f"attack_weathers are {', '.join(self.recorded_in)}; expected each once")
-        if len(self.recorded_in) > 1 and self.calibration is Calibration.PUBLISHED:
+        if len(self.recorded_in) > 1 and self.calibration is CalibrationMethod.PUBLISHED:
             raise RoadproofError(
                 f"a {self.calibration} calibration holds in one weather, {len(self.recorded_in)} are to be attacked; "
-                f"choose {Calibration.TWO_PAINT}"
+                f"choose {CalibrationMethod.TWO_PAINT}"
             )
         at_random = self.trajectories.scheme is Scheme.RANDOM
         if self.is_predicted and (self.pooled or at_random):
@@ -87,7 +87,7 @@ class Budget:
         told: dict[str, tuple[object, object]] = {
             "objective": (self.objective.name, SteeringShift().name),
             "perturbation": (type(self.trajectories.perturbation).__name__, SteeringNoise.__name__),
-            "calibration": (str(self.calibration), str(Calibration.PUBLISHED)),
+            "calibration": (str(self.calibration), str(CalibrationMethod.PUBLISHED)),
             "select": (self.select, 0),
             "rounds": (self.rounds, 0),
             "weathers attacked": (len(self.recorded_in), 1),
@@ -129,7 +129,7 @@ PUBLISHED = Budget(
     objective=SteeringShift(),
     trajectories=Trajectories(perturbation=SteeringNoise()),
     window=Window(least_px=600, frames=100),
-    calibration=Calibration.PUBLISHED,
+    calibration=CalibrationMethod.PUBLISHED,
     select=0,
 )
 """As the paper and its code: 61 calls to calibrate, steering noise, all frames in which the canvas is as large as in

@@ -103,10 +103,10 @@ def measure_fidelity(
         device: torch device on which frames are composited.
 
     Returns:
-        The comparison; None where the set holds no clean drive, or one that this controller would not drive here.
+        The comparison; None where the set holds no clean drive, or one that this controller would not drive here, and
+        where no recorded frame shows any of the paint.
 
     Raises:
-        EpisodeError: no frame shows any of the paint.
         OutputError: the folder cannot be written.
     """
     recorded = recordings.clean
@@ -114,9 +114,8 @@ def measure_fidelity(
         return None
     if clean is None:
         clean = rollout(simulator, controller, scenario, weather=weather)
-    if not is_drive_of(recorded, clean):
+    if not is_drive_of(recorded, clean) or not _covered(pattern, recordings, recorded).any():
         return None
-    _require_paint(_covered(pattern, recordings, recorded))
     rendered = rendered_frames(simulator, scenario, clean, pattern, recorded.frame_number)
     fidelity = compare_with_rendered(pattern, recordings, controller, rendered, drive=recorded.name, device=device)
     fidelity.save(folder / "fidelity.npz")
@@ -212,11 +211,6 @@ def _covered(pattern: Pattern, recordings: RecordingSet, recorded: Recording) ->
     return composite(white, dark)[:, 0].numpy() >= 0.5
 
 
-def _require_paint(paint: Bool[np.ndarray, "f h w"]) -> None:
-    if not paint.any():
-        raise EpisodeError("no frame shows any paint, so there is nothing to compare; check the pattern and the drive")
-
-
 def agreement(
     composited: UInt8[np.ndarray, "f h w 3"],
     rendered: UInt8[np.ndarray, "f h w 3"],
@@ -239,7 +233,8 @@ def agreement(
     Raises:
         EpisodeError: no pixel shows paint.
     """
-    _require_paint(paint)
+    if not paint.any():
+        raise EpisodeError("no frame shows any paint, so there is nothing to compare; check the pattern and the drive")
     error = np.abs(composited.astype(np.float32) - rendered).mean(-1)
     return Agreement(
         frames=len(composited),

@@ -41,7 +41,7 @@ MOMENTS = 25
 """Pictures of a passage: enough to move through it, a picture every third step or so."""
 
 STRIP_SIZE = (400, 300)
-HORIZON_M = 14.0
+FILMED_M = 14.0
 """Distance before the canvas at which the first picture is taken; the last is taken at the canvas' end."""
 
 EVENT_SHOWN_S = 3.0
@@ -159,8 +159,8 @@ def film_drives(
 
 
 def passage_steps(clean: Episode, painted: Episode, canvas: CanvasPlacement, count: int) -> list[int]:
-    """Steps evenly spread over the clean drive's passage, from `HORIZON_M` on, as far as the painted drive goes."""
-    seen, last = passage(path_of(clean), canvas, horizon_m=HORIZON_M), len(painted) - 1
+    """Steps evenly spread over the clean drive's passage, from `FILMED_M` on, as far as the painted drive goes."""
+    seen, last = passage(path_of(clean), canvas, horizon_m=FILMED_M), len(painted) - 1
     first, end = min(seen.start, last), min(seen.stop - 1, last)
     return [round(first + (end - first) * k / (count - 1)) for k in range(count)]
 

@@ -22,8 +22,7 @@ import torch
 
 from roadproof.attacks import AttackResult, Candidate, GradOpt, Method, Objective, kept_attack
 from roadproof.attacks.groups import Direction, Group, parse_groups
-from roadproof.calibration import Calibrated, CalibrationReport, calibrate, replays_needed
-from roadproof.calibration import Method as Calibration
+from roadproof.calibration import Calibrated, CalibrationMethod, CalibrationReport, calibrate, replays_needed
 from roadproof.controllers import Controller
 from roadproof.drives import Drive, Drives, record_along
 from roadproof.drives.folder import read_drive
@@ -101,7 +100,7 @@ def search_on(
     objective: Objective,
     rounds: int,
     best: int,
-    method: Calibration,
+    method: CalibrationMethod,
     folder: Path,
     device: torch.device | str = "cpu",
     pool: Pool[Simulator] | None = None,
@@ -195,7 +194,7 @@ def _recorded(
     controller: Controller,
     clean: Drives,
     last: Episode,
-    method: Calibration,
+    method: CalibrationMethod,
     place: Path,
     pool: Pool[Simulator] | None,
 ) -> tuple[Recording, int]:
@@ -210,7 +209,7 @@ def _recorded(
     return calibrated.recordings.recordings[1], _calls_of(drive, method)
 
 
-def _calls_of(drive: Drive, method: Calibration) -> int:
+def _calls_of(drive: Drive, method: CalibrationMethod) -> int:
     """Number of drives that recording a round's drive and calibrating it beside the clean one takes."""
     return drive.calls + replays_needed(2, method) - replays_needed(1, method)
 
@@ -222,7 +221,7 @@ def _read_round(place: Path) -> ReRecordingRound:
     drive = read_drive(place.name, place)
     if drive is None:
         raise RecordingError(f"{place} lacks the drive {place.name}; give the same call again to record it")
-    calls = _calls_of(drive, Calibration(report.method)) + selection.simulator_calls
+    calls = _calls_of(drive, CalibrationMethod(report.method)) + selection.simulator_calls
     return ReRecordingRound(attack=attack, selection=selection, simulator_calls=calls)
 
 

@@ -1,4 +1,4 @@
-"""Choosing among what a search found by driving over it: the surrogate ranks only coarsely.
+"""Choosing among what a search found by driving over it: a search ranks only coarsely.
 
 SELECTION/selection.json      every candidate driven, with what came of it
 SELECTION/pattern.json, .png  the one that was chosen
@@ -17,9 +17,8 @@ from roadproof.attacks import Candidate, PathDeviation, SpeedChange
 from roadproof.attacks.groups import Direction
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
-from roadproof.driving.drive_store import CLEAN, Conditions, Episodes, load_episodes
+from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, load_episodes, make_missing
 from roadproof.driving.episode import Episode
-from roadproof.driving.evaluate import make_missing
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
@@ -47,7 +46,7 @@ class Driven:
 
     Args:
         group: name of the group of drives that the candidate was found on.
-        rank: rank of the candidate by the surrogate, 1 for the strongest.
+        rank: rank of the candidate by the search, 1 for the strongest.
         trial: comparison of the drive over the candidate with the clean drive.
     """
 
@@ -71,7 +70,7 @@ class Selection:
 
     Args:
         pattern: pattern of the chosen candidate.
-        driven: candidates that were driven over, in the surrogate's order.
+        driven: candidates that were driven over, in the search's order.
         chosen: index of the chosen candidate in `driven`.
         simulator_calls: number of drives, the clean one included if it was made for this; 0 if they are predicted.
         predicted: whether the drives are predicted, and nothing was driven for real.
@@ -186,7 +185,7 @@ def select_by_driving(
     paints = {f"candidate-{rank}": raster(candidate.pattern) for rank, candidate in chosen}
     by = chosen_by(candidates)
     episodes = Episodes.of(simulator, controller, scenario, paints, folder)
-    bare = Conditions(paint=CLEAN, weather=weather)
+    bare = DriveConditions(paint=CLEAN, weather=weather)
     over = [replace(bare, paint=name) for name in paints]
     made_of = {
         **episodes.made_of,

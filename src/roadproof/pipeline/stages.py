@@ -17,7 +17,7 @@ from roadproof.controllers.identity import identity_of, parts_of
 from roadproof.drives import Drives, record
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import EpisodeError, RoadproofError
+from roadproof.errors import RoadproofError
 from roadproof.io.files import write_json
 from roadproof.io.identity import digest, require_same, stated
 from roadproof.io.known import known_by, without_addresses
@@ -276,21 +276,17 @@ class Stages:
         folder, shown = self.folder / "evaluation", evaluation.shown()
         start = shown.start.of(evaluation.scenario)
         film_drives(self.simulator, start, (shown.clean, shown.painted), raster(pattern), folder, pool=self.pool)
-        try:
-            return measure_fidelity(
-                self.simulator,
-                self.controller,
-                self.scenario,
-                pattern,
-                recordings,
-                folder,
-                weather=drives.settings.weather,
-                clean=drives.drives[0].episode,
-                device=self.device,
-            )
-        except EpisodeError:
-            # No recorded frame shows any of the paint: there is nothing to compare.
-            return None
+        return measure_fidelity(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            pattern,
+            recordings,
+            folder,
+            weather=drives.settings.weather,
+            clean=drives.drives[0].episode,
+            device=self.device,
+        )
 
     def _folder_of(self, number: int) -> Path:
         """The folder of the drives in the weather of this number."""

@@ -21,9 +21,10 @@ from torch import Tensor
 
 from roadproof.datatypes import Obstacle
 from roadproof.recorded.vehicle import Motion
+from roadproof.traffic.agents import CAR_WIDTH_M
 
-AHEAD_M, RADIUS_M = (-1.3, 0.0, 1.3), 0.95
-"""The circles of an ordinary car, 4.5 m long and 1.9 m wide: their middles along its axis, and their radius."""
+AHEAD_M, RADIUS_M = (-1.3, 0.0, 1.3), CAR_WIDTH_M / 2
+"""The circles of an ordinary car: their middles along its axis, and their radius."""
 
 GYRATION_M, SLOWED_MPS2 = 0.75, 3.0
 """The k and μ of the formulas above."""

@@ -161,7 +161,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
                 f"{request.cars} cars and {request.pedestrians} pedestrians are asked for, but recordings hold no "
                 "others on the road; expected 0 of both"
             )
-        check_canvas(scenario.canvas, self._world.bank.canvas)
+        check_recorded_canvas(scenario.canvas, self._world.bank.canvas)
         drive = _Drive(request, self.dt_s)
         drive.pattern = request.pattern
         self._put(drive, self._world.begin((self._start(scenario.start),)))
@@ -226,7 +226,7 @@ def _can_be_shown(aside_m: float, turned_rad: float) -> bool:
     return abs(aside_m) <= FURTHEST_ASIDE_M and abs(turned_rad) <= FURTHEST_TURNED_RAD
 
 
-def check_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
+def check_recorded_canvas(asked: CanvasPlacement, recorded: CanvasPlacement) -> None:
     """Check that recordings are of the stretch of road that is to be driven.
 
     Args:

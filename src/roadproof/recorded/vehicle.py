@@ -32,6 +32,7 @@ from torch import Tensor
 
 from roadproof.errors import RecordingError
 from roadproof.recordings import Track
+from roadproof.traffic.agents import CAR_WHEELBASE_M
 
 _MOVING_MPS = 2.0
 _LEAST_STEPS = 12
@@ -82,16 +83,13 @@ class Vehicle:
     r2: float = 1.0
 
     @staticmethod
-    def bicycle(
-        *, wheelbase_m: float, steer_range_rad: float, lag_s: float = 0.1, origin_m: float | None = None, dt_s: float
-    ) -> Vehicle:
+    def bicycle(*, wheelbase_m: float, steer_range_rad: float, lag_s: float = 0.1, dt_s: float) -> Vehicle:
         """A kinematic bicycle whose wheels follow the steer with a lag.
 
         Args:
             wheelbase_m: distance between the axles, metres, above 0.
             steer_range_rad: angle of the front wheels at full steer, radians, above 0 and below π/2.
             lag_s: time constant of the steering, seconds, 0 or more.
-            origin_m: distance of the vehicle's origin ahead of the rear axle, metres; half the wheelbase by default.
             dt_s: seconds per step, above 0.
 
         Raises:
@@ -104,8 +102,9 @@ class Vehicle:
             )
         kept = math.exp(-dt_s / lag_s) if lag_s else 0.0
         gain = -steer_range_rad / wheelbase_m
-        behind = wheelbase_m / 2 if origin_m is None else origin_m
-        return Vehicle(dt_s=dt_s, curving=(kept, (1 - kept) * gain, 0.0, 0.0), pulling=_PULLING, slipping=(behind, 0.0))
+        return Vehicle(
+            dt_s=dt_s, curving=(kept, (1 - kept) * gain, 0.0, 0.0), pulling=_PULLING, slipping=(wheelbase_m / 2, 0.0)
+        )
 
     @staticmethod
     def identified(tracks: Sequence[Track]) -> Vehicle:
@@ -124,7 +123,7 @@ class Vehicle:
         if len(steps) != 1:
             raise RecordingError(f"the drives have time steps {sorted(steps)} s, expected one and the same")
         dt_s = steps.pop()
-        prior = Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=dt_s)
+        prior = Vehicle.bicycle(wheelbase_m=CAR_WHEELBASE_M, steer_range_rad=0.7, dt_s=dt_s)
         stretches = [(track, part) for track in tracks for part in track.stretches()]
         rate = _steer_rate(stretches)
         parts = [_Rows.of(track, part, rate) for track, part in stretches]

@@ -25,6 +25,7 @@ from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
 from roadproof.report.formatting import in_words
 from roadproof.report.plots import LINE_STYLES, draw_search, in_units, show_as_it_is
+from roadproof.roads.polylines import polyline_stations
 
 _NAMES = "ink muted rule clean painted predicted canvas third fourth asphalt kerb grass marking paper"
 VARIABLES = {name: f"#{0x010100 + k:06x}" for k, name in enumerate(_NAMES.split(), 1)}
@@ -110,7 +111,7 @@ def _dots(figure: Figure, mark: Mark) -> str:
 def metres_past(episode: Episode, canvas: CanvasPlacement) -> Float[np.ndarray, " n"]:
     """How far the car had driven at each observation, from the canvas' near edge; before it negative."""
     path = path_of(episode)
-    driven = np.concatenate([np.zeros(1), np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    driven = polyline_stations(path)
     at = int(np.hypot(path[:, 0] - canvas.x_m, path[:, 1] - canvas.y_m).argmin())
     return driven - driven[at] + canvas.length_m / 2
 
@@ -122,7 +123,7 @@ def steering(
     canvas: CanvasPlacement,
     steps: Int[np.ndarray, " n"] = NO_MOMENTS,
 ) -> Chart:
-    """Steering of the clean drive, what the surrogate predicts, and what the car did over the paint.
+    """Steering of the clean drive, what it answers to composites, and what the car did over the paint.
 
     Args:
         clean: the drive without paint.
@@ -147,11 +148,11 @@ def steering(
         along, frames = metres_past(clean, canvas), fidelity.frame_number
         kept = frames < len(along)
         for values, style, label in (
-            (fidelity.composited_steer, "o", "predicted on composites"),
+            (fidelity.composited_steer, "o", "composited along the clean path"),
             (fidelity.rendered_steer, "x", "same places, rendered"),
         ):
             axes.plot(along[frames[kept]], values[kept], style, color=PREDICTED, markersize=3.6, label=label)
-        words += ", and what the surrogate predicts along the clean path"
+        words += ", and what the controller answers to composites along the clean path"
     return _finished(figure, axes, "steering", words, until_m=canvas.length_m + BEHIND_M, marks=marks)
 
 

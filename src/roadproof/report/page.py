@@ -17,6 +17,7 @@ from roadproof.driving.infractions import counted
 from roadproof.io.files import AnyPath, as_path, write_json, write_text
 from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
+from roadproof.paint.site import metres_per_px
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording, evenly
 from roadproof.report import charts
@@ -207,8 +208,8 @@ def _conspicuous(run: Run) -> list[tuple[str, Conspicuousness]]:
 
 def _figures(pattern: Pattern, size: tuple[float, float] | None) -> list[Fields]:
     """The figures in the order they are painted, in metres where the size of the canvas is known, else in pixels."""
-    scale_x, scale_y, unit = (size[0] / 400, size[1] / 400, "m") if size else (1.0, 1.0, "px")
-    digits = 2 if size else 0
+    (scale_x, scale_y), unit, digits = (metres_per_px(size), "m", 2) if size else ((1.0, 1.0), "px", 0)
+    middle = 0.5 if size else 0.0
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())
     rows: list[Fields] = []
@@ -219,7 +220,7 @@ def _figures(pattern: Pattern, size: tuple[float, float] | None) -> list[Fields]
             {
                 "number": number,
                 "shape": str(shape),
-                "at": f"{x * scale_x:.{digits}f}, {y * scale_y:.{digits}f} {unit}",
+                "at": f"{(x + middle) * scale_x:.{digits}f}, {(y + middle) * scale_y:.{digits}f} {unit}",
                 "size": f"{width * scale_x:.{digits}f} × {length * scale_y:.{digits}f} {unit}",
                 "turned": f"{turned:.0f}°",
                 "colour": f"#{red:02x}{green:02x}{blue:02x}",

@@ -78,7 +78,7 @@ def _film_strip(drive: ShownDrive) -> Figure:
     shown = evenly(len(drive.clean), _COLUMNS)
     rows = (("clean", drive.clean, drive.clean_steer), ("painted", drive.painted, drive.painted_steer))
     figure = Figure(figsize=(2.3 * len(shown) + 0.6, 4.6), layout="constrained")
-    title = f"{drive.name}: predicted steering on composited frames, mean shift {drive.mean_shift:+.2f}"
+    title = f"{drive.name}: steering on composited frames, mean shift {drive.mean_shift:+.2f}"
     figure.suptitle(title, fontsize=11)
     grid = figure.add_gridspec(3, len(shown), height_ratios=(1, 1, 1.5))
     for column, frame in enumerate(shown):

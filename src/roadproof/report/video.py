@@ -20,9 +20,11 @@ from roadproof.io.video import film_file
 from roadproof.recorded import RecordedSimulator
 from roadproof.report.road_view import DAYLIGHT, DPI, Plan, draw_canvas, draw_road, in_world, pixels_of, plan_of
 from roadproof.roads.maps import scenario_route
+from roadproof.roads.polylines import polyline_stations
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage
+from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WIDTH_M
 
 if TYPE_CHECKING:
     from roadproof.simulators.loading import MappedSimulator
@@ -69,7 +71,7 @@ def film_drive(
 
 def length_m(world: MappedSimulator | RecordedSimulator, scenario: Scenario) -> float:
     """How long the way from a scenario's start to its goal is, in metres."""
-    return float(np.hypot(*np.diff(_map_of(world, scenario)[1], axis=0).T).sum())
+    return float(polyline_stations(_map_of(world, scenario)[1])[-1])
 
 
 def _map_of(world: MappedSimulator | RecordedSimulator, scenario: Scenario) -> tuple[RoadMap | None, Plan]:
@@ -152,7 +154,7 @@ class DriveView:
             for x, y in at(points.tolist()):
                 pen.ellipse((x - size, y - size, x + size, y + size), fill=colour)
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
-        corners = [(2.25 * a, 0.95 * b) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+        corners = [(CAR_LENGTH_M / 2 * a, CAR_WIDTH_M / 2 * b) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
         outline = at([(state.x_m + a * c - b * s, state.y_m + a * s + b * c) for a, b in corners])
         pen.polygon(outline, fill=CAR, outline=INK)
         return view

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias, cast
 import msgspec
 
 from roadproof.attacks import METHODS, OBJECTIVES, BayesianOptimisation, BlackBox, GradOpt, Published, method_of
-from roadproof.calibration import Method as Calibration
+from roadproof.calibration import CalibrationMethod
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.errors import StudyError
@@ -46,7 +46,7 @@ class GradOptPlan:
     weaves_m: tuple[float, ...] = (0.5,)
     noise_deg: tuple[int, int] | None = None  # perturbed by steering noise instead, as published
     frames: Many = 40  # kept of every recorded drive
-    calibration: Calibration = Calibration.TWO_PAINT
+    calibration: CalibrationMethod = CalibrationMethod.TWO_PAINT
     restarts: Thousand = 3
     iterations: Many | None = None  # None: what suits the objective
     halving: bool = True  # whether many starts compete first
@@ -149,7 +149,7 @@ def budget_of(method: MethodPlan, weather: Weather) -> Budget:
                 ),
                 window=Window(frames=method.frames, least_px=least_px),
                 pooled=method.scheme != "group",
-                calibration=Calibration(method.calibration),
+                calibration=CalibrationMethod(method.calibration),
                 select=method.select,
                 rounds=method.rounds,
                 attack_weathers=method.attack_weathers,

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from roadproof.patterns import raster
-from roadproof.pipeline.film import HORIZON_M
+from roadproof.pipeline.film import FILMED_M
 from roadproof.recordings import evenly
 from roadproof.report.formatting import in_words
 from roadproof.report.road_view import Ground, around_canvas, draw_canvas, draw_road, on_asphalt, road_of
@@ -147,7 +147,7 @@ def passages(results: Results, jobs: Jobs) -> list[Picture]:
         if figure is not None:
             words = (
                 f"What the car’s camera sees on {plain(scenario)} as it passes each method’s pattern, K = {figures}, "
-                f"seed {results.seeds[0]}: one drive in each condition, from {HORIZON_M:.0f} m before the canvas to "
+                f"seed {results.seeds[0]}: one drive in each condition, from {FILMED_M:.0f} m before the canvas to "
                 "its end. Under each the mean deviation of all drives in that condition."
             )
             pictures.append(Picture(f"passage-{kind}", words, figure))

@@ -9,8 +9,9 @@ from jaxtyping import Float, Int
 
 from roadproof.datatypes import VehicleState
 
-CAR_LENGTH_M = 4.5
-CAR_WIDTH_M = 1.9
+CAR_LENGTH_M, CAR_WIDTH_M, CAR_WHEELBASE_M = 4.5, 1.9, 2.8
+"""An ordinary car's: that of the controller, and of others."""
+
 CAR_DISC_M = 1.0
 CAR_DISCS_M = (-1.6, 0.0, 1.6)
 PERSON_M = 0.35

@@ -20,6 +20,7 @@ from roadproof.roads.routes import Route
 from roadproof.simulators.protocol import OpenWorld
 from roadproof.traffic.agents import (
     CAR_LENGTH_M,
+    CAR_WHEELBASE_M,
     CAR_WIDTH_M,
     NOBODY,
     Agents,
@@ -28,7 +29,6 @@ from roadproof.traffic.agents import (
     obstacles,
 )
 
-WHEELBASE_M = 2.8
 MAX_STEER_RAD = 0.65
 FULL_THROTTLE_MPS2 = 4.2
 FULL_BRAKE_MPS2 = 7.9
@@ -79,12 +79,12 @@ class Expert:
         """Pure pursuit: the arc from the rear axle through a point of the route ahead; positive to the right."""
         assert self._at_m is not None
         c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
-        rear_x, rear_y = state.x_m - 0.5 * WHEELBASE_M * c, state.y_m - 0.5 * WHEELBASE_M * s
+        rear_x, rear_y = state.x_m - 0.5 * CAR_WHEELBASE_M * c, state.y_m - 0.5 * CAR_WHEELBASE_M * s
         sight = max(SIGHT_M, SIGHT_S * state.speed_mps)
-        x, y = self._route.ahead(np.array([self._at_m - 0.5 * WHEELBASE_M + sight]))[0].tolist()
+        x, y = self._route.ahead(np.array([self._at_m - 0.5 * CAR_WHEELBASE_M + sight]))[0].tolist()
         dx, dy = x - rear_x, y - rear_y
         aside, apart = dy * c - dx * s, math.hypot(dx, dy)
-        wheel = math.atan(2.0 * WHEELBASE_M * aside / max(apart * apart, 1e-6))
+        wheel = math.atan(2.0 * CAR_WHEELBASE_M * aside / max(apart * apart, 1e-6))
         return min(max(-wheel / MAX_STEER_RAD, -1.0), 1.0)
 
     def _behind(self, state: VehicleState, wanted: float, cars: Agents, pedestrians: Agents) -> float:

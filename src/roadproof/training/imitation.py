@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
-from roadproof.controllers.precision import multiplies_bfloat16
+from roadproof.controllers.precision import mixed_precision
 from roadproof.controllers.steering import CruiseControl
 from roadproof.controllers.temporal import WINDOW, TemporalPlanner
 from roadproof.controllers.trajectory import Plan
@@ -174,10 +174,8 @@ def _step(
     network: Learner, batch: Batch, plan: TrainingPlan, optimiser: torch.optim.Optimizer, step: int
 ) -> Float[Tensor, ""]:
     """Learn from one batch; its loss."""
-    device = batch.frames.device
-    mixed = torch.autocast(device.type, torch.bfloat16, enabled=multiplies_bfloat16(device))
     ask = network.along if isinstance(network, TemporalPlanner) else network
-    with seeded(plan.seed * 1_000_003 + step), mixed:
+    with seeded(plan.seed * 1_000_003 + step), mixed_precision(batch.frames.device):
         answer: ConditionalOutput | Plan = ask(batch.frames, batch.speed_mps, batch.command)
     if isinstance(network, TrajectoryController):
         assert isinstance(answer, Plan)

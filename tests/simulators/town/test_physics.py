@@ -10,7 +10,7 @@ needs.town()
 from roadproof.roads.maps import load_map
 from roadproof.roads.roadmap import Surface
 from roadproof.simulators.town.meshes import Pose
-from roadproof.simulators.town.physics import MAX_STEER_RAD, WHEELBASE_M, Contact, Physics
+from roadproof.simulators.town.physics import CAR_WHEELBASE_M, MAX_STEER_RAD, Contact, Physics
 from roadproof.simulators.town.scenery import Solid
 from roadproof.simulators.tracker.judge import Judge, people_hit
 
@@ -49,7 +49,7 @@ def test_it_turns_on_the_circle_of_the_bicycle_model(steer):
     yaw = np.unwrap([state.yaw_rad for state in seen])
     turned = (yaw[-1] - yaw[0]) / ((len(seen) - 1) * 0.05)
     speed = np.mean([state.speed_mps for state in seen])
-    wanted = math.hypot(WHEELBASE_M / math.tan(abs(steer) * MAX_STEER_RAD), WHEELBASE_M / 2)
+    wanted = math.hypot(CAR_WHEELBASE_M / math.tan(abs(steer) * MAX_STEER_RAD), CAR_WHEELBASE_M / 2)
     assert speed / abs(turned) == pytest.approx(wanted, rel=0.05)
     assert np.sign(turned) == -np.sign(steer)
 

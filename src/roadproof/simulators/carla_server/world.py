@@ -28,7 +28,8 @@ from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.physics import SUBSTEP_S, Physics
 from roadproof.simulators.town.renderer import Renderer
 from roadproof.simulators.town.scenery import Scenery, build_scenery
-from roadproof.simulators.tracker.judge import LENGTH_M, people_hit
+from roadproof.simulators.tracker.judge import people_hit
+from roadproof.traffic.agents import CAR_LENGTH_M
 
 FREE_RUN_S = 0.05
 SYNCHRONOUS, NO_RENDERING, FIXED_DT = 0, 1, 2
@@ -324,7 +325,7 @@ class World:
         c, s = math.cos(math.radians(other.pose[4])), math.sin(math.radians(other.pose[4]))
         dx, dy = one.pose[0] - other.pose[0], one.pose[1] - other.pose[1]
         beside = abs(c * dy - s * dx)
-        return away < LENGTH_M and (beside < 2.0 or turned > 0.3)
+        return away < CAR_LENGTH_M and (beside < 2.0 or turned > 0.3)
 
     def _stop_physics(self, key: int) -> None:
         """The next step starts from where the actor is then."""

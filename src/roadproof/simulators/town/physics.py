@@ -17,7 +17,8 @@ from roadproof.datatypes import Control, VehicleState
 from roadproof.simulators.town.engine import Node, Path, bullet, core
 from roadproof.simulators.town.meshes import Pose
 from roadproof.simulators.town.scenery import Solid
-from roadproof.simulators.tracker.judge import HEIGHT_M, LENGTH_M, TRACK_M, WHEELBASE_M, WIDTH_M, Contact
+from roadproof.simulators.tracker.judge import HEIGHT_M, TRACK_M, Contact
+from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WHEELBASE_M, CAR_WIDTH_M
 
 WHEEL_RADIUS_M = 0.33
 MASS_KG = 1500.0
@@ -172,7 +173,7 @@ class Physics:
     def _make_car(self, start: VehicleState) -> tuple[Node, Path, Node]:
         chassis = bullet.BulletRigidBodyNode("ego")
         chassis.set_mass(MASS_KG)
-        shape = bullet.BulletBoxShape(core.Vec3(WIDTH_M / 2, LENGTH_M / 2, 0.5))
+        shape = bullet.BulletBoxShape(core.Vec3(CAR_WIDTH_M / 2, CAR_LENGTH_M / 2, 0.5))
         chassis.add_shape(shape, core.TransformState.make_pos(core.Vec3(0, 0, 0.75)))
         chassis.set_deactivation_enabled(False)
         path = self._place(chassis)
@@ -180,7 +181,7 @@ class Physics:
         vehicle = bullet.BulletVehicle(self._world, chassis)
         vehicle.set_coordinate_system(bullet.ZUp)
         self._world.attach(vehicle)
-        for y in (WHEELBASE_M / 2, -WHEELBASE_M / 2):
+        for y in (CAR_WHEELBASE_M / 2, -CAR_WHEELBASE_M / 2):
             for x in (-TRACK_M / 2, TRACK_M / 2):
                 wheel = vehicle.create_wheel()
                 wheel.set_chassis_connection_point_cs(core.Point3(x, y, 0.55))

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from roadproof.datatypes import Ending, Event, EventKind, VehicleState
 from roadproof.roads.roadmap import RoadMap, Surface
 from roadproof.roads.routes import Route, RoutePosition
+from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WHEELBASE_M, CAR_WIDTH_M
 
-LENGTH_M, WIDTH_M, HEIGHT_M = 4.5, 1.9, 1.45
-WHEELBASE_M, TRACK_M = 2.8, 1.6
+HEIGHT_M, TRACK_M = 1.45, 1.6
 """Measures of the driven car."""
 
 PERSON_RADIUS_M = 0.3
@@ -145,7 +145,7 @@ def time_is_up(time_s: float, limit_s: float) -> bool:
 def wheels(state: VehicleState) -> list[tuple[float, float]]:
     """World x, y where the wheels touch the ground."""
     c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
-    half, side = WHEELBASE_M / 2, TRACK_M / 2
+    half, side = CAR_WHEELBASE_M / 2, TRACK_M / 2
     return [
         (state.x_m + c * a - s * b, state.y_m + s * a + c * b)
         for a, b in ((half, side), (half, -side), (-half, side), (-half, -side))
@@ -159,6 +159,6 @@ def people_hit(state: VehicleState, people: Float[np.ndarray, "m 2"]) -> list[in
     c, s = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
     away = people - (state.x_m, state.y_m)
     ahead, left = away @ (c, s), away @ (-s, c)
-    gap_x = np.maximum(np.abs(ahead) - LENGTH_M / 2, 0)
-    gap_y = np.maximum(np.abs(left) - WIDTH_M / 2, 0)
+    gap_x = np.maximum(np.abs(ahead) - CAR_LENGTH_M / 2, 0)
+    gap_y = np.maximum(np.abs(left) - CAR_WIDTH_M / 2, 0)
     return [int(i) for i in np.flatnonzero(np.hypot(gap_x, gap_y) < PERSON_RADIUS_M)]
