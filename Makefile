@@ -38,6 +38,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --pythonpath $(BIN)/python --project .ci/scripts.json
 	$(BIN)/lint-imports
 
 # The documentation as a site that needs no network: out/docs/index.html. A warning is an error, and every page is read

@@ -17,6 +17,7 @@ import csv
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -72,7 +73,7 @@ def fitted_transforms(
         group=(torch.tensor(fit.keys) + 1) // 2,
     )
     transforms: dict[str, ColourTransform] = {}
-    reports: list[dict[str, object]] = []
+    reports: list[dict[str, Any]] = []
     for kind, name in ((AffineResponse, "affine"), (FilmResponse, "film")):
         for shading in (False, True):
             result = fit_colour(samples, response=kind, shading=shading)

@@ -25,6 +25,7 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -68,10 +69,13 @@ def synthetic_drive(frames: int) -> RecordingSet:
     return RecordingSet(camera=CIL_CAMERA, view=CIL_INPUT, colour=colour, recordings=(drive,))
 
 
-def placed(controller: torch.nn.Module, device: str, dtype: torch.dtype) -> torch.nn.Module:
+Network = TypeVar("Network", bound=torch.nn.Module)
+
+
+def placed(controller: Network, device: str, dtype: torch.dtype) -> Network:
     """As `load_controller` leaves a network: evaluation mode, frozen, channels last."""
     controller.eval().requires_grad_(False)
-    return controller.to(device=device, dtype=dtype, memory_format=torch.channels_last)
+    return controller.to(device, dtype).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # not in its stubs
 
 
 def milliseconds(function: Callable[[], object], device: str) -> tuple[float, float]:
@@ -89,8 +93,7 @@ def measure(
     recordings: RecordingSet, name: str, figures: int, dtype: torch.dtype, device: str, repeats: int, published: bool
 ) -> dict[str, object]:
     """One case: medians of alternating repeats after a warm-up."""
-    controller = CIL(seed=0).folded() if name == "cil" else pilotnet_controller(seed=0)
-    controller = placed(controller, device, dtype)
+    controller = placed(CIL(seed=0).folded() if name == "cil" else pilotnet_controller(seed=0), device, dtype)
     groups = parse_groups("all", recordings)
     surrogate = Surrogate(recordings, controller, groups, device=device)
     space = SearchSpace(figures=figures)

@@ -111,7 +111,7 @@ def summary(name: str, each: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "cell": name,
         "patterns": len(each),
-        "spearman": float(spearmanr(predicted, driven).statistic),
+        "spearman": float(spearmanr(predicted, driven)[0]),
         "r2": 1.0 - left / float(np.square(driven - driven.mean()).sum()),
         "mae_m": float(np.abs(predicted - driven).mean()),
     }

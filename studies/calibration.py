@@ -117,9 +117,10 @@ def from_poses_that_are_off(replays: Replays, drives: Drives) -> dict[str, Sprea
     for drive in drives.drives:
         exact = np.stack([homography_from_pose(settings.camera, s, settings.scenario.canvas) for s in drive.states])
         prior = moved(exact, np.tile(OFF, (len(exact), 1)), settings.camera)
-        paints = look_at_paints(replays, drive, prior, settings.camera, settings.view, refine=True)
+        seen, _ = look_at_paints(replays, drive, prior, settings.camera, settings.view, refine=True)
         before.append(stated_errors_px(prior, exact, settings.camera))
-        after.append(stated_errors_px(paints.image_from_canvas, exact, settings.camera))
+        mended = np.stack(list(seen.found.values()))
+        after.append(stated_errors_px(mended, exact[list(seen.found)], settings.camera))
     parts = {"pose, off": before, "two-paint, from poses that are off": after}
     return {name: Spread.of(np.concatenate(errors)) for name, errors in parts.items()}
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, site_of
-from roadproof.attacks.cheapest import in_words
+from roadproof.attacks.cheapest import cheapest_in_words
 from roadproof.attacks.objective import varied
 from roadproof.compositing import Variation
 from roadproof.controllers import Controller, load_controller
@@ -121,7 +121,7 @@ class Cell:
             groups = BUDGET.method.groups(recordings)
             searched = cheapest(recordings, self.controller, found, WANTED_M, groups=groups)
             if searched is None:
-                print(f"{self.spec}, {self.scenario.name}: {in_words(None, WANTED_M)}", flush=True)
+                print(f"{self.spec}, {self.scenario.name}: {cheapest_in_words(None, WANTED_M)}", flush=True)
                 return
             searched.save(place)
             less = searched
