@@ -142,6 +142,7 @@ def test_a_missing_libx11_is_named(refused, monkeypatch):
     class NoPipes:
         get_global_ptr = make_pipe = staticmethod(lambda *_: NoPipes if not _ else None)
 
+    monkeypatch.setattr(engine, "_pipes", {})
     monkeypatch.setattr(engine.core, "GraphicsPipeSelection", NoPipes)
     assert "apt-get install libx11-6" in refused()
 

@@ -10,10 +10,10 @@ from typer.core import TyperCommand, TyperGroup
 SEVERAL = {
     "albedo": "DARKEST BRIGHTEST",
     "contrast": "LEAST MOST",
-    "deviation_m": "METRES",
     "map_file": "FILE",
     "noise_deg": "LEAST MOST",
     "start_range": "METRES RADIANS M/S",
+    "swerve_m": "METRES",
 }
 """What stands in the help for the values of an option that takes several."""
 

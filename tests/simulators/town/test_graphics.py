@@ -50,6 +50,14 @@ def test_its_pictures_are_those_of_the_software_but_for_edges(opengl, weather):
     assert rows.max() < 25, rows.round(1)
 
 
+def test_towns_come_and_go_and_leave_each_other_alone(opengl):
+    before = opengl.reset(SCENARIO).frame
+    for graphics in ("egl", "software", "egl"):
+        with TownSimulator(graphics=graphics) as another:
+            another.reset(SCENARIO, weather=Weather.RAINY_NOON)
+    assert (opengl.reset(SCENARIO).frame == before).all()
+
+
 def test_other_graphics_are_refused_and_a_missing_library_is_named(monkeypatch):
     with pytest.raises(SimulatorError, match="graphics is 'vulkan', expected software or egl"):
         TownSimulator(graphics="vulkan")
@@ -57,6 +65,7 @@ def test_other_graphics_are_refused_and_a_missing_library_is_named(monkeypatch):
     class NoPipe:
         get_global_ptr = make_pipe = staticmethod(lambda *_: NoPipe if not _ else None)
 
+    monkeypatch.setattr(engine, "_pipes", {})
     monkeypatch.setattr(engine.core, "GraphicsPipeSelection", NoPipe)
     with (
         pytest.raises(SimulatorError, match=r"libEGL\.so\.1 and a driver; install it"),

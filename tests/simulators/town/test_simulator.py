@@ -342,6 +342,7 @@ def test_a_missing_libx11_is_named(monkeypatch):
         def make_pipe(*_):
             return None
 
+    monkeypatch.setattr(engine, "_pipes", {})
     monkeypatch.setattr(engine.core, "GraphicsPipeSelection", NoPipe)
     with pytest.raises(SimulatorError, match="libx11-6") as caught, TownSimulator():
         pass

@@ -50,8 +50,6 @@ NEAR_M, FAR_M = 0.25, 100_000.0
 VERTEX = np.dtype([("position", "<f4", 3), ("uv", "<f4", 2), ("ground_uv", "<f4", 2), ("colour", "u1", 4)])
 """One vertex: metres, texture coordinates, coordinates in the ground texture of its cell, RGBA."""
 
-_configured = False
-
 
 class Graphics(StrEnum):
     """What draws."""
@@ -70,25 +68,29 @@ _PIPES = {
 """Panda3D's pipe and its module, what this needs of the system, and the packages that have it."""
 
 
+_pipes: dict[Graphics, Pipe] = {}
+
+
 def make_pipe(graphics: Graphics = Graphics.SOFTWARE) -> Pipe:
-    """The pipe of a renderer.
+    """The pipe of a renderer, the same for the whole process.
 
     Raises:
         SimulatorError: the renderer cannot be loaded, which means that a library of the system is missing.
     """
-    # Panda3D's configuration is the whole process's.
-    global _configured
-    if not _configured:
+    if not _pipes:
+        # Panda3D's configuration is the whole process's.
         core.load_prc_file_data("roadproof", CONFIGURATION)
-        _configured = True
-    name, module, needed, packages = _PIPES[graphics]
-    pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe(name, module)
-    if pipe is None:
-        raise SimulatorError(
-            f"Panda3D's {graphics} renderer did not load: it needs the system library {needed}; "
-            f"install it (Debian and Ubuntu: apt-get install {packages})"
-        )
-    return pipe
+    if graphics not in _pipes:
+        name, module, needed, packages = _PIPES[graphics]
+        pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe(name, module)
+        if pipe is None:
+            raise SimulatorError(
+                f"Panda3D's {graphics} renderer did not load: it needs the system library {needed}; "
+                f"install it (Debian and Ubuntu: apt-get install {packages})"
+            )
+        # Whichever pipe of EGL's goes first ends the display of all.
+        _pipes[graphics] = pipe
+    return _pipes[graphics]
 
 
 def vertex_format() -> VertexFormat:
