@@ -96,6 +96,28 @@ def test_a_batch_is_its_parts_and_the_same_twice(world):
     assert torch.allclose(together.right_m, torch.cat([each.right_m for each in apart]), atol=2e-3)
 
 
+def test_cars_go_on_from_the_drive_up_to_the_canvas_as_if_they_had_driven_all_the_way(world):
+    rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (Start(), Start(right_m=0.3))
+    after = world.approach(RampFollower(), starts, every=2)
+    assert after is not None
+    assert 0 < after.step < world.course.count and after.step % 2 == 0
+    with torch.no_grad():
+        whole = world.roll(RampFollower(), painted(*rows), starts=starts, every=2)
+        gone_on = world.roll(RampFollower(), painted(*rows), starts=starts, every=2, after=after)
+        bare = world.roll(RampFollower(), starts=starts, every=2)
+        # Over the bare road nothing can tell where the drive was cut, to the last digit of a smaller batch.
+        again = world.roll(RampFollower(), starts=starts, every=2, after=after)
+    assert torch.equal(again.right_m, bare.right_m)
+    assert torch.equal(gone_on.right_m[:, : after.step], bare.right_m[:, : after.step].repeat(2, 1))
+    assert (gone_on.right_m - bare.right_m.repeat(2, 1)).abs().amax(1).min() > 0.1
+    # What is left out is paint on less than a hundredth of a picture.
+    assert float((gone_on.right_m - whole.right_m).abs().max()) < 0.05 * float(whole.right_m.abs().max())
+
+
+def test_a_controller_that_remembers_drives_all_the_way(world):
+    assert world.approach(Smoothed(), (Start(),)) is None
+
+
 def test_gradients_of_a_drive_on_one_picture_are_central_differences(world):
     """Same start and frame: the loop is open, so that the gradient through the paint is all there is."""
     once = world.course.count

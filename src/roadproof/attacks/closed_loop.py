@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Sequence
-from threading import Lock
+from threading import RLock
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -26,7 +26,7 @@ from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.io.identity import digest
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, Foretold, RecordedWorld, Rolled, Start
+from roadproof.recorded.world import UNSURE, Approach, Foretold, RecordedWorld, Rolled, Start
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -34,7 +34,7 @@ MAX_PICTURES = 800
 """Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
 
 
-_ONCE = Lock()
+_ONCE = RLock()
 
 
 class Rolling(TypedDict, total=False):
@@ -85,6 +85,7 @@ class ClosedLoopMeasure(BatchedMeasure):
         self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
         self._bare: dict[tuple[int, int], Rolled] = {}
         self._unsure: dict[int, Rolled] = {}
+        self._approaches: dict[tuple[int, int], Approach | None] = {}
 
     def steered(self, groups: Sequence[Group]) -> tuple[Group, ...]:
         """The groups whose steering shift stands beside a prediction: by default the same."""
@@ -121,7 +122,10 @@ class ClosedLoopMeasure(BatchedMeasure):
             return None
         same = copy.copy(self)
         worlds = tuple(world.replayable() for world in self.worlds)
-        vars(same).update(worlds=worlds, frames_evaluated=0, _bare={}, _unsure={})
+        # They ask for numbers from the device, which a replayed step may not.
+        pairs = zip(worlds, self.worlds, strict=True)
+        approaches = {(id(new), self.every): self._approach(usual) for new, usual in pairs}
+        vars(same).update(worlds=worlds, frames_evaluated=0, _bare={}, _unsure={}, _approaches=approaches)
         return same
 
     def redraw(self, seed: int) -> None:
@@ -185,10 +189,25 @@ class ClosedLoopMeasure(BatchedMeasure):
         return torch.stack(sides).mean(-1).float()
 
     def roll(self, world: RecordedWorld, patterns: Pattern | None) -> Rolled:
-        """The drives over each pattern in one world, or over the bare road: each start once with every look."""
+        """The drives over each pattern in one world, or over the bare road: each start once with every look.
+
+        Over patterns they begin where the canvas is well seen; up to there they are those over the bare road.
+        """
         starts = tuple(start for start in self._starts for _ in range(self._times))
-        self.frames_evaluated += (1 if patterns is None else len(patterns.boxes)) * self._pictures(world)
-        return world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks)
+        after = None if patterns is None else self._approach(world)
+        pictures = len(starts) * -(-(world.course.count - (after.step if after else 0)) // self.every)
+        self.frames_evaluated += (1 if patterns is None else len(patterns.boxes)) * pictures
+        return world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks, after=after)
+
+    def _approach(self, world: RecordedWorld) -> Approach | None:
+        """The drives over the bare road up to where the canvas is well seen; made once, and not where looks change."""
+        if self._looks is not None:
+            return None
+        key = (id(world), self.every)
+        with _ONCE:
+            if key not in self._approaches:
+                self._approaches[key] = world.approach(self.controller, self._starts, self.every)
+        return self._approaches[key]
 
     def bare(self, world: RecordedWorld) -> Rolled:
         """The drives over the bare road in one world, from each start with every look; made once."""
@@ -201,7 +220,9 @@ class ClosedLoopMeasure(BatchedMeasure):
 
     def _pictures(self, world: RecordedWorld) -> int:
         """Number of pictures that all drives over one pattern take."""
-        return len(self._starts) * self._times * -(-world.course.count // self.every)
+        after = self._approach(world)
+        steps = world.course.count - (0 if after is None else after.step)
+        return len(self._starts) * self._times * -(-steps // self.every)
 
     @property
     def _times(self) -> int:

@@ -89,15 +89,8 @@ class Street:
                 way = (rolled.x_m - canvas.x_m, rolled.y_m - canvas.y_m, rolled.yaw_rad, rolled.speed_mps)
                 poses = torch.stack([column.flatten() for column in way], 1)
                 parts = cast("tuple[Tensor, ...]", poses[:, :3].split(128))
-                covers = [self._covered(Poses(*part.unbind(1))) for part in parts]
+                covers = [self.world.covered(Poses(*part.unbind(1))) for part in parts]
                 self._poses, self._covers = torch.cat([self._poses, poses]), torch.cat([self._covers, *covers])
-
-    def _covered(self, poses: Poses) -> Float[Tensor, " r"]:
-        """Which share of the picture at each pose the canvas covers, on the CPU."""
-        canvas = self.world.bank.show(poses, self.world.bank.nearest(poses)).canvas
-        view = self.world.bank.view
-        shown = torch.zeros(len(poses.x_m)) if canvas is None else canvas.valid.sum(1).cpu()
-        return shown / (view.height_px * view.width_px)
 
     def draw(self, count: int, generator: torch.Generator, *, to_paint: bool = True) -> Views:
         """Draw so many pictures, or a few less: poses far from every recorded one are left out.

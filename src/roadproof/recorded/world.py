@@ -34,6 +34,9 @@ PAST_M = 1.0
 AT_ONCE = 32
 """Drives rolled side by side where there may be thousands: more make no CPU faster."""
 
+SEEN = 0.01
+"""Where the canvas covers less of the picture than this share, paint hardly moves a car (measured)."""
+
 _LOOK_AHEAD_M, _LOOK_AHEAD_S = 1.5, 0.5
 
 
@@ -89,6 +92,31 @@ class Rolled:
     def path(self, index: int) -> Float[np.ndarray, "t 2"]:
         """World x, y of one drive."""
         return torch.stack([self.x_m[index], self.y_m[index]], 1).detach().cpu().numpy()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Approach:
+    """Drives over the bare road from S starts, up to a step that cars may go on from.
+
+    Args:
+        step: the number of steps done.
+        car: where the cars are then.
+        controls: steer, throttle and brake that they were given last, (S, 3).
+        memory: what the controller remembers.
+        rows: the columns of `Rolled` at each step done.
+    """
+
+    step: int
+    car: Motion
+    controls: Float[Tensor, "s 3"]
+    memory: object
+    rows: tuple[tuple[Tensor, ...], ...]
+
+    def repeated(self, times: int) -> Approach:
+        """The same drives so many times, one set after the other; nothing may be remembered in them."""
+        rows = tuple(tuple(column.repeat(times) for column in row) for row in self.rows)
+        car = Motion(*(part.repeat(times) for part in self.car))
+        return Approach(self.step, car, self.controls.repeat(times, 1), self.memory, rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,6 +202,7 @@ class RecordedWorld:
         starts: tuple[Start, ...] = (Start(),),
         every: int = 1,
         looks: Looks | None = None,
+        after: Approach | None = None,
     ) -> Rolled:
         """Drive R cars past the canvas, closed loop.
 
@@ -184,22 +213,68 @@ class RecordedWorld:
             starts: offsets from the clean drive at which the drives begin.
             every: number of steps from one picture to the next, 1 or more; controls are held in between.
             looks: looks of paint and camera, given to the drives in turn; None for paint and camera as recorded.
+            after: drives over the bare road from these starts (`approach`), which all go on from; None drives all the
+                way.
 
         Raises:
             RecordingError: a car leaves all bounds, or its pose is NaN.
         """
         count = len(starts) * (1 if pattern is None else len(pattern.boxes))
+        begun = self._at_start(starts) if after is None else after
         if pattern is not None:
             pattern = pattern.mapped(lambda part: part.repeat_interleave(len(starts), 0))
             pattern = pattern if looks is None else looks.placed(pattern, self.bank.canvas)
-        car = self.begin(starts, count // len(starts))
-        course = self.course
-        rows: list[tuple[Tensor, ...]] = []
-        controls = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
         off = self._offsets_of(starts)[:, 3].repeat(count // len(starts))
-        gap = self.bank.nearest(Poses(*car[:3]))
-        memory: object = None
-        for step in range(course.count):
+        begun = begun.repeated(count // len(starts))
+        whole = self._driven(controller, pattern, begun, self.course.count, off, every=every, looks=looks)
+        columns = [torch.stack(each, 1) for each in zip(*whole.rows, strict=True)]
+        columns[0], columns[1] = columns[0] + self.course.canvas.x_m, columns[1] + self.course.canvas.y_m
+        return Rolled(*columns)
+
+    def approach(self, controller: Controller, starts: tuple[Start, ...], every: int = 1) -> Approach | None:
+        """The drives over the bare road from each start, up to where the canvas covers `SEEN` of a picture.
+
+        Returns:
+            The drives; None where the canvas is seen from the first picture on, or the controller remembers pictures.
+        """
+        with torch.no_grad():
+            begun, off = self._at_start(starts), self._offsets_of(starts)[:, 3]
+            whole = self._driven(controller, None, begun, self.course.count, off, every=every)
+            seen = [
+                step
+                for step in range(0, self.course.count, every)
+                if float(self.covered(Poses(*whole.rows[step][:3])).max()) >= SEEN
+            ]
+            if whole.memory is not None or not seen or seen[0] == 0:
+                return None
+            return self._driven(controller, None, begun, seen[0], off, every=every)
+
+    def covered(self, poses: Poses) -> Float[Tensor, " r"]:
+        """Which share of the picture at each pose the canvas covers, on the CPU."""
+        canvas, view = self.bank.show(poses, self.bank.nearest(poses)).canvas, self.bank.view
+        shown = torch.zeros(len(poses.x_m)) if canvas is None else canvas.valid.sum(1).cpu()
+        return shown / (view.height_px * view.width_px)
+
+    def _at_start(self, starts: tuple[Start, ...]) -> Approach:
+        car = self.begin(starts)
+        return Approach(0, car, torch.zeros(len(starts), 3, dtype=torch.float64, device=self.device), None, ())
+
+    def _driven(
+        self,
+        controller: Controller,
+        pattern: Pattern | None,
+        begun: Approach,
+        until: int,
+        off: Float[Tensor, " r"],
+        *,
+        every: int,
+        looks: Looks | None = None,
+    ) -> Approach:
+        """Drive on from where cars are, up to a step; `off` is added to the controller's steer."""
+        course, car, controls, memory = self.course, begun.car, begun.controls, begun.memory
+        rows = list(begun.rows)
+        gap = self.bank.nearest(Poses(*car[:3]).detached())
+        for step in range(begun.step, until):
             poses = Poses(*car[:3])
             place = course.locate(poses)
             if step % every == 0:
@@ -217,9 +292,7 @@ class RecordedWorld:
             here = (car.x_m, car.y_m, car.yaw_rad, car.speed_mps, place.right_m)
             rows.append((*here, controls[:, 0], gap.left_m, gap.turned_rad))
             car = self.step(car, controls)
-        columns = [torch.stack(each, 1) for each in zip(*rows, strict=True)]
-        columns[0], columns[1] = columns[0] + course.canvas.x_m, columns[1] + course.canvas.y_m
-        return Rolled(*columns)
+        return Approach(until, car, controls, memory, tuple(rows))
 
     def step(self, car: Motion, controls: Float[Tensor, "r 3"]) -> Motion:
         """Where R cars are a time step later, given steer, throttle and brake; what stands in their way holds them."""
