@@ -1,7 +1,9 @@
 """Driving a scenario closed loop, and the episode that comes of it.
 
-with TownSimulator() as town:
-episode = rollout(town, controller, scenario, weather=Weather.RAINY_NOON, pattern=pattern)
+For example:
+
+    with TownSimulator() as town:
+        episode = rollout(town, controller, scenario, weather=Weather.RAINY_NOON, pattern=pattern)
 """
 
 from __future__ import annotations
