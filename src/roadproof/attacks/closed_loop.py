@@ -178,7 +178,9 @@ class ClosedLoopMeasure(BatchedMeasure):
     @property
     def at_once(self) -> int:
         """How many points of each group make no more than MAX_PICTURES pictures."""
-        return MAX_PICTURES // (len(self.groups) * sum(self._pictures(world) for world in self.worlds))
+        return MAX_PICTURES // (
+            len(self.groups) * sum(self._pictures(each, self._approach(each)) for each in self.worlds)
+        )
 
     def valued(self, space: SearchSpace, unit: Points) -> Values:
         """Mean towards each group's direction, at R points per group, all at once and differentiable in the points."""
@@ -195,8 +197,7 @@ class ClosedLoopMeasure(BatchedMeasure):
         """
         starts = tuple(start for start in self._starts for _ in range(self._times))
         after = None if patterns is None else self._approach(world)
-        pictures = len(starts) * -(-(world.course.count - (after.step if after else 0)) // self.every)
-        self.frames_evaluated += (1 if patterns is None else len(patterns.boxes)) * pictures
+        self.frames_evaluated += (1 if patterns is None else len(patterns.boxes)) * self._pictures(world, after)
         return world.roll(self.controller, patterns, starts=starts, every=self.every, looks=self._looks, after=after)
 
     def _approach(self, world: RecordedWorld) -> Approach | None:
@@ -218,9 +219,8 @@ class ClosedLoopMeasure(BatchedMeasure):
                     self._bare[key] = self.roll(world, None)
         return self._bare[key]
 
-    def _pictures(self, world: RecordedWorld) -> int:
-        """Number of pictures that all drives over one pattern take."""
-        after = self._approach(world)
+    def _pictures(self, world: RecordedWorld, after: Approach | None) -> int:
+        """Number of pictures that all drives over one pattern take, or those that go on from an approach."""
         steps = world.course.count - (0 if after is None else after.step)
         return len(self._starts) * self._times * -(-steps // self.every)
 

@@ -237,17 +237,11 @@ class RecordedWorld:
         Returns:
             The drives; None where the canvas is seen from the first picture on, or the controller remembers pictures.
         """
+        begun, off, end = self._at_start(starts), self._offsets_of(starts)[:, 3], self.course.count
         with torch.no_grad():
-            begun, off = self._at_start(starts), self._offsets_of(starts)[:, 3]
-            whole = self._driven(controller, None, begun, self.course.count, off, every=every)
-            seen = [
-                step
-                for step in range(0, self.course.count, every)
-                if float(self.covered(Poses(*whole.rows[step][:3])).max()) >= SEEN
-            ]
-            if whole.memory is not None or not seen or seen[0] == 0:
-                return None
-            return self._driven(controller, None, begun, seen[0], off, every=every)
+            while begun.step < end and float(self.covered(Poses(*begun.car[:3])).max()) < SEEN:
+                begun = self._driven(controller, None, begun, min(begun.step + every, end), off, every=every)
+        return None if begun.memory is not None or begun.step in (0, end) else begun
 
     def covered(self, poses: Poses) -> Float[Tensor, " r"]:
         """Which share of the picture at each pose the canvas covers, on the CPU."""

@@ -61,7 +61,7 @@ class Graphics(StrEnum):
     """OpenGL without a screen: on the GPU where there is one, else by Mesa on the CPU."""
 
 
-_PIPES = {
+_RENDERERS = {
     Graphics.SOFTWARE: ("TinyOffscreenGraphicsPipe", "p3tinydisplay", "libX11.so.6", "libx11-6"),
     Graphics.EGL: ("eglGraphicsPipe", "p3headlessgl", "libEGL.so.1 and a driver", "libegl1 libgl1-mesa-dri"),
 }
@@ -81,7 +81,7 @@ def make_pipe(graphics: Graphics = Graphics.SOFTWARE) -> Pipe:
         # Panda3D's configuration is the whole process's.
         core.load_prc_file_data("roadproof", CONFIGURATION)
     if graphics not in _pipes:
-        name, module, needed, packages = _PIPES[graphics]
+        name, module, needed, packages = _RENDERERS[graphics]
         pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe(name, module)
         if pipe is None:
             raise SimulatorError(
