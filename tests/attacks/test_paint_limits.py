@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
 from recorded_drives import CANVAS, PLAIN, drivable_set
-from roadproof.attacks import METHODS, GradOpt, PathDeviation, Published, attack, method_of, proposals
+from roadproof.attacks import METHODS, GradOpt, PathDeviation, Published, SteeringShift, attack, method_of, proposals
 from roadproof.attacks.result import AttackResult
 from roadproof.attacks.site import site_of
 from roadproof.errors import PatternError
@@ -44,7 +45,9 @@ def test_whatever_the_search_its_patterns_obey(word, monkeypatch, tmp_path):
         asked["random_calls"] = 6
     recordings = drivable_set(12.0, marks=MARKS)
     space = SearchSpace(figures=3, family=getattr(kind, "family", "published"), limits=LIMITS)
-    result = attack(recordings, PullsToBrightPaint(), space, method=method_of(word, **asked), seed=3)
+    result = attack(
+        recordings, PullsToBrightPaint(), space, objective=SteeringShift(), method=method_of(word, **asked), seed=3
+    )
     site = site_of(recordings)
     assert len(result.candidates) > 1
     for candidate in result.candidates:
@@ -63,8 +66,9 @@ def test_whatever_the_search_its_patterns_obey(word, monkeypatch, tmp_path):
 def test_a_limited_search_by_gradient_beats_random_patterns_of_the_same_limits():
     recordings, controller = drivable_set(12.0, marks=MARKS), PullsToBrightPaint()
     space = SearchSpace(figures=3, limits=LIMITS)
-    climbed = attack(recordings, controller, space, method=GradOpt(iterations=20, restarts=2, halving=False))
-    drawn = attack(recordings, controller, space, method=method_of("random", calls=60))
+    search = partial(attack, recordings, controller, space, objective=SteeringShift())
+    climbed = search(method=GradOpt(iterations=20, restarts=2, halving=False))
+    drawn = search(method=method_of("random", calls=60))
     assert max(climbed.by_group.values()) > max(drawn.by_group.values())
 
 
@@ -79,7 +83,8 @@ def test_recordings_without_marks_or_canvas_are_one_line():
     with pytest.raises(PatternError, match="needs the lane marks"):
         attack(drivable_set(), PullsToBrightPaint(), keep_out)
     given = replace(keep_out, limits=PaintLimits(keep_out_m=0.2, marks=MARKS))
-    attack(drivable_set(), PullsToBrightPaint(), given, method=GradOpt(iterations=1, restarts=1, halving=False))
+    once = GradOpt(iterations=1, restarts=1, halving=False)
+    attack(drivable_set(), PullsToBrightPaint(), given, objective=SteeringShift(), method=once)
     area = SearchSpace(figures=1, limits=PaintLimits(max_area_m2=2.0))
     with pytest.raises(PatternError, match="size of the canvas"):
         attack(recording_set(frames=3), PullsToBrightPaint(), area)
