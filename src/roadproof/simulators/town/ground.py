@@ -22,6 +22,7 @@ from roadproof.simulators.town.scenery import Scenery, Tree
 from roadproof.simulators.town.textures import fractal_noise
 from roadproof.simulators.town.weather import Sky
 
+SEED, CROWN_SEED = 50, 60
 FINE_M = 0.125
 COARSE_M = 0.25
 BORDER_M = 30.0
@@ -60,7 +61,7 @@ class Ground:
 
 
 @lru_cache(maxsize=2)
-def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50) -> Ground:
+def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float) -> Ground:
     """Draw the ground of a map; its extent is a whole number of cells. Kept, so that the next call is free."""
     x0, y0, x1, y1 = roads.bounds_m
     low = (math.floor((x0 - BORDER_M) / cell_m) * cell_m, math.floor((y0 - BORDER_M) / cell_m) * cell_m)
@@ -74,8 +75,8 @@ def build_ground(roads: RoadMap, scenery: Scenery, cell_m: float, seed: int = 50
     wheels = [lane.left * (1 - share) + lane.right * share for lane in driving for share in (0.27, 0.73)]
     tracks = coarse.lines(wheels, 2, 0.22)
     edges = coarse.lines([lane.left for lane in roads.lanes if lane.kind == "sidewalk"], round(1.0 / COARSE_M), 0.3)
-    hollows = _hollows(coarse, tracks, edges, seed)
-    albedo = _albedo(coarse, surface, tracks, edges, seed)
+    hollows = _hollows(coarse, tracks, edges)
+    albedo = _albedo(coarse, surface, tracks, edges)
     hard = surface.point([0] + [255] * 255)
     return Ground(low, size, albedo, hard, hollows, _open_sky(coarse, scenery))
 
@@ -128,16 +129,16 @@ def _surfaces(raster: _Raster, roads: RoadMap, scenery: Scenery) -> Image.Image:
     return image
 
 
-def _hollows(raster: _Raster, tracks: Plane, edges: Plane, seed: int) -> UInt8[np.ndarray, "h w"]:
-    low = 0.7 * raster.noise(seed, 14, 5) + 0.3 * raster.noise(seed + 4, 48, 3) + 0.05 * tracks + 0.08 * edges
+def _hollows(raster: _Raster, tracks: Plane, edges: Plane) -> UInt8[np.ndarray, "h w"]:
+    low = 0.7 * raster.noise(SEED, 14, 5) + 0.3 * raster.noise(SEED + 4, 48, 3) + 0.05 * tracks + 0.08 * edges
     return (np.clip((low - 0.35) / 0.40, 0, 1) * 255).astype(np.uint8)
 
 
-def _albedo(raster: _Raster, surface: Image.Image, tracks: Plane, edges: Plane, seed: int) -> Image.Image:
+def _albedo(raster: _Raster, surface: Image.Image, tracks: Plane, edges: Plane) -> Image.Image:
     """Colours: asphalt with tracks, dirt at the kerb and mended patches; slabs; lawn."""
-    broad, lumps = raster.noise(seed + 1, 8, 4), raster.noise(seed + 2, 64, 4)
+    broad, lumps = raster.noise(SEED + 1, 8, 4), raster.noise(SEED + 2, 64, 4)
     road = 1 + 0.22 * (broad - 0.5) + 0.05 * (lumps - 0.5) - 0.11 * tracks - 0.16 * edges
-    road *= 1 - 0.09 * _mended(raster, seed)
+    road *= 1 - 0.09 * _mended(raster)
     lawn = 0.72 + 0.36 * broad + 0.40 * (lumps - 0.3)
     # Factors up to 1.34 as bytes; the tables make up for it.
     factors = [
@@ -155,9 +156,9 @@ def _albedo(raster: _Raster, surface: Image.Image, tracks: Plane, edges: Plane, 
     return Image.merge("RGB", channels).filter(ImageFilter.BoxBlur(0.6))
 
 
-def _mended(raster: _Raster, seed: int) -> Plane:
+def _mended(raster: _Raster) -> Plane:
     """Rectangles of newer asphalt and sealed cracks, 0 or 1."""
-    rng = np.random.default_rng(seed + 3)
+    rng = np.random.default_rng(SEED + 3)
     image = raster.blank()
     pen = ImageDraw.Draw(image)
     height, width = raster.shape
@@ -267,7 +268,7 @@ def turned_square(
     return array if array.ndim == 3 else array[..., None]
 
 
-def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> LitGround:
+def light_ground(ground: Ground, scenery: Scenery, sky: Sky) -> LitGround:
     """The ground in one weather, with the shadows that fall on it."""
     raster = _Raster(ground.low_m, ground.size_m, COARSE_M)
     image = raster.blank()
@@ -278,7 +279,7 @@ def light_ground(ground: Ground, scenery: Scenery, sky: Sky, seed: int = 60) -> 
         if solid.casts_shadow:
             ends = np.concatenate([solid.corners, solid.corners + run * solid.height_m])
             pen.polygon(raster.points(ends[ConvexHull(ends).vertices]), fill=255)
-    crowns = _crowns(scenery.trees, run, np.random.default_rng(seed))
+    crowns = _crowns(scenery.trees, run, np.random.default_rng(CROWN_SEED))
     for tree, (centres, radii) in zip(scenery.trees, crowns, strict=True):
         foot = np.array([tree.x_m, tree.y_m])
         pen.line(raster.points(np.stack([foot, foot + run * 0.45 * tree.height_m])), fill=255, width=1)

@@ -16,6 +16,7 @@ from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import FACE, UNIT, Mesh, MeshBuilder, Pose, Rgb
 from roadproof.simulators.town.models import PAINTS, Body, car
 
+SEED = 40
 MARGIN_M = 45.0
 GRID_M = 0.5
 STOREY_M, SHOP_M = 3.1, 3.6
@@ -106,12 +107,12 @@ class _Site:
 
 
 @lru_cache(maxsize=2)
-def build_scenery(roads: RoadMap, seed: int = 40) -> Scenery:
+def build_scenery(roads: RoadMap) -> Scenery:
     """Fill the land beside the roads of a map; kept, so that the next call is free."""
     x0, y0, x1, y1 = roads.bounds_m
     low = np.array([x0 - MARGIN_M, y0 - MARGIN_M])
     size = (int((x1 - x0 + 2 * MARGIN_M) / GRID_M) + 1, int((y1 - y0 + 2 * MARGIN_M) / GRID_M) + 1)
-    site = _Site(low, Image.new("L", size, 0), np.random.default_rng(seed))
+    site = _Site(low, Image.new("L", size, 0), np.random.default_rng(SEED))
     pen = ImageDraw.Draw(site.taken)
     for lane in roads.lanes:
         pen.polygon(site.pixels(np.concatenate([lane.left, lane.right[::-1]])), fill=255, outline=255)

@@ -12,6 +12,7 @@ from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.town.meshes import Mesh, MeshBuilder
 
+SEED = 30
 KERB_M = 0.13
 KERB_STONE_M = 0.22
 PAVEMENT_STEP_M, KERB_STEP_M, PAINT_STEP_M = 2.0, 5.0, 2.5
@@ -41,8 +42,8 @@ class Streets:
     paint: Mesh
 
 
-def build_streets(roads: RoadMap, seed: int = 30) -> Streets:
-    """Meshes of a map's streets; the seed picks which arms of junctions have a zebra crossing."""
+def build_streets(roads: RoadMap) -> Streets:
+    """Meshes of a map's streets; chance picks which arms of junctions have a zebra crossing."""
     pavement, kerbs, paint = MeshBuilder(), MeshBuilder(), MeshBuilder()
     for lane in roads.lanes:
         if lane.kind == "sidewalk":
@@ -51,7 +52,7 @@ def build_streets(roads: RoadMap, seed: int = 30) -> Streets:
         # Files paint every way through a junction; real junctions are bare.
         if line.junction is None:
             _mark(paint, line)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(SEED)
     for lane in roads.lanes:
         ahead = [roads.lanes[i] for i in lane.successors]
         if lane.kind == "driving" and lane.junction is None and any(after.junction is not None for after in ahead):
