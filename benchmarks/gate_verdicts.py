@@ -90,7 +90,7 @@ def mildest(recordings: Path) -> Pattern:
     world = RecordedWorld(load_recordings(recordings))
     world.fit(controller)
     with torch.no_grad():
-        return patterns[int(world.foretold(controller, patterns).deviation_m.mean(1).argmin())]
+        return patterns[int(world.predict(controller, patterns).deviation_m.mean(1).argmin())]
 
 
 def spoilt(town: TownSimulator, seed: int, noise: float) -> tuple[ConditionalPilotNet, int]:

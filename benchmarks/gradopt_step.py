@@ -192,7 +192,7 @@ def measure_path(recordings: RecordingSet, name: str, repeats: int, patterns: in
                 cpu_times[key].append(processor)
     many = space.drawn(patterns, 1)
     began = time.perf_counter()
-    rolled.foretold(controller, many)
+    rolled.predict(controller, many)
     return {
         "controller": name,
         "figures": 5,

@@ -86,7 +86,7 @@ def cell(controller_name: str, scenario: Scenario, seed: int, spec: str) -> dict
         calibrated = calibrate(simulator, drives, QUICK.calibration)
         names, painted, world = patterns(calibrated.recordings, controller, space, seed)
         rolling = time.perf_counter()
-        predicted = world.worlds[0].foretold(controller, painted).deviation_m[:, 0]
+        predicted = world.worlds[0].predict(controller, painted).deviation_m[:, 0]
         rolled_s = time.perf_counter() - rolling
         driving = DrivenMeasure(InSimulator(simulator, scenario), controller, PathDeviation())
         driven = [driving.effect(painted[k]).deviation for k in range(len(names))]

@@ -24,7 +24,7 @@ from rich.progress import Progress, TaskID
 
 from roadproof.hardening import Hardened, harden, write_hardening
 from roadproof.hardening.budget import HARDENING_BUDGETS
-from roadproof.hardening.judgement import Judged
+from roadproof.hardening.judgement import JudgedAttack
 from roadproof.machine import keep_freed_memory
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.simulators.loading import open_simulator
@@ -109,7 +109,7 @@ def table(found: Hardened) -> str:
     return "\n".join(lines)
 
 
-def in_words(streets: Sequence[Judged]) -> str:
+def in_words(streets: Sequence[JudgedAttack]) -> str:
     """Deviation over streets, and the share of drives that leave their lane."""
     if not streets:
         return "– | –"

@@ -330,7 +330,7 @@ def real_renders(folder: Path, keys: list[int]) -> tuple[torch.Tensor, torch.Ten
     return torch.tensor([painted[key] for key in keys], dtype=F64), torch.from_numpy(pictures)
 
 
-def test_unseen_hues_of_real_renders_are_foretold_within_three_and_a_half_levels(carla_data):
+def test_unseen_hues_of_real_renders_are_predicted_within_three_and_a_half_levels(carla_data):
     folder = carla_data / "colour"
     mask = torch.from_numpy(np.asarray(Image.open(folder / "painted_mask.png").convert("L")) > 0)
     keys = [1, 2, 7, 8, 13, 14, 17, 18, 19, 20]

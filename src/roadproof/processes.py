@@ -20,7 +20,7 @@ from typing import Any, Generic, TypeAlias, TypeVar, cast
 import torch
 
 from roadproof import foreign
-from roadproof.errors import ControllerError, SimulatorError
+from roadproof.errors import ControllerError, RoadproofError, SimulatorError
 from roadproof.machine import keep_freed_memory
 
 DIED = "a driving process died; is there memory for all of them? try with fewer processes"
@@ -154,6 +154,18 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
     return ProcessPoolExecutor(
         count, mp_context=context, initializer=_begin, initargs=(foreign.limit_s(), begin, arguments)
     )
+
+
+def require_opened(processes: int, opens: object | None) -> None:
+    """Refuse several processes where nothing opens a simulator for each, and fewer than one.
+
+    Raises:
+        RoadproofError: the number of processes is not one that can work.
+    """
+    if processes < 1 or (processes > 1 and opens is None):
+        raise RoadproofError(
+            f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
+        )
 
 
 def require_picklable(driver: object) -> None:

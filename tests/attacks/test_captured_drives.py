@@ -18,7 +18,7 @@ from roadproof.datatypes import Obstacle
 from roadproof.errors import RoadproofError
 from roadproof.photometry import ColourTransform
 from roadproof.photometry.responses import FilmResponse
-from roadproof.recorded import RecordedWorld, Start
+from roadproof.recorded import BiasedStart, RecordedWorld
 from roadproof.search_space import SearchSpace
 from waiting import no_waiting, on_meta
 
@@ -89,7 +89,10 @@ def test_a_car_drives_there_as_it_does_elsewhere(road, name):
         road = dataclasses.replace(road, colour=FILM)
     world = RecordedWorld(road)
     world.fit(RampFollower())
-    starts = (Start(), Start(right_m=0.7, turned_rad=-0.25 if name == "turned away" else -0.05, faster_mps=0.5))
+    starts = (
+        BiasedStart(),
+        BiasedStart(right_m=0.7, turned_rad=-0.25 if name == "turned away" else -0.05, faster_mps=0.5),
+    )
     unit = SPACE.random((3,), torch.Generator().manual_seed(2))
     drives, gradients = [], []
     for each in (world, world.replayable()):

@@ -70,7 +70,7 @@ def test_less_paint_still_reaches_the_deviation_and_keeps_the_limits(searched, t
     from roadproof.recorded.world import UNSURE
 
     batch = Pattern(kept.pattern.shapes, kept.pattern.boxes[None], kept.pattern.colours[None])
-    again = measure.worlds[0].foretold(PullsToBrightPaint(), batch, UNSURE).deviation_m.min()
+    again = measure.worlds[0].predict(PullsToBrightPaint(), batch, UNSURE).deviation_m.min()
     assert again == pytest.approx(less.predicted_m, abs=1e-3)
     assert kept.levels == less.levels
     site = site_of(road)

@@ -22,7 +22,7 @@ from roadproof.attacks.gradopt import BEHIND, MUTATION, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
-from roadproof.recorded import RecordedWorld, Start
+from roadproof.recorded import BiasedStart, RecordedWorld
 from roadproof.recorded.world import UNSURE
 from roadproof.recordings import pooled
 from roadproof.search_space import SearchSpace, derived_seed
@@ -67,14 +67,14 @@ def test_a_search_in_the_recorded_world_beats_chance_and_its_own_start(road, who
     world = RecordedWorld(road)
     world.fit(RampFollower())
     by_chance = SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9)))
-    assert result.predicted_m > 1.2 * np.mean(world.foretold(RampFollower(), by_chance).deviation_m)
+    assert result.predicted_m > 1.2 * np.mean(world.predict(RampFollower(), by_chance).deviation_m)
     assert (result.history[-1] >= result.history[0] - 1e-3).all()
     found = [candidate.predicted_m for candidate in result.candidates]
     least = [candidate.predicted_range_m[0] for candidate in result.candidates]
     assert least == sorted(least, reverse=True)
     assert all(each.predicted_range_m[0] <= each.predicted_m <= each.predicted_range_m[1] for each in result.candidates)
     assert result.predicted_m == found[0]
-    again = world.foretold(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE).deviation_m[0]
+    again = world.predict(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE).deviation_m[0]
     assert again.mean() == pytest.approx(found[0], abs=0.02)
     assert result.predicted_range_m == pytest.approx((again.min(), again.max()), abs=0.02)
     result.save(tmp_path)
@@ -98,7 +98,7 @@ def test_a_search_drives_in_every_weather_that_was_recorded(road):
     result = attack(both, RampFollower(), SPACE, objective=GOAL, method=ONE_STEP)
     apart = [
         RecordedWorld(each)
-        .foretold(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)
+        .predict(RampFollower(), SPACE.pattern(SPACE.point(result.pattern)[None]), UNSURE)
         .deviation_m
         for each in both.by_weather()
     ]
@@ -137,7 +137,7 @@ def test_the_same_seed_finds_the_same_and_an_interrupted_search_goes_on_to_it(ro
 
 def test_several_starts_are_valued_by_their_mean(road):
     unit = SPACE.random((2, 1), torch.Generator().manual_seed(2))
-    starts = (Start(right_m=0.3), Start(right_m=-0.3))
+    starts = (BiasedStart(right_m=0.3), BiasedStart(right_m=-0.3))
 
     def value(*chosen):
         goal = dataclasses.replace(GOAL, starts=chosen)
@@ -146,7 +146,7 @@ def test_several_starts_are_valued_by_their_mean(road):
     apart = (value(starts[0]) + value(starts[1])) / 2
     assert torch.allclose(value(*starts), apart, atol=2e-3)
     # What goes to the right for one group counts against the other.
-    right, left = value(Start())[:, 0].tolist()
+    right, left = value(BiasedStart())[:, 0].tolist()
     same = GOAL.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
     both = same.values(SPACE, unit[:1].expand(2, -1, -1, -1))[:, 0]
     assert float(both[0]) == pytest.approx(-float(both[1]))

@@ -12,7 +12,7 @@ from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.result import AttackResult
 from roadproof.compositing import Variation
 from roadproof.errors import ControllerError, RecordingError, RoadproofError
-from roadproof.recorded import RecordedWorld, Start
+from roadproof.recorded import BiasedStart, RecordedWorld
 from roadproof.recorded.world import UNSURE
 from roadproof.search_space import SearchSpace
 
@@ -45,14 +45,14 @@ def whole(road):
     return search(road)
 
 
-def foretold(road, patterns, starts):
+def predictions(road, patterns, starts):
     world = RecordedWorld(road)
     world.fit(Careful())
-    return world.foretold(Careful(), patterns, starts)
+    return world.predict(Careful(), patterns, starts)
 
 
 def test_a_search_for_the_speed_beats_chance_and_says_how_much_in_metres_a_second(road, whole, tmp_path):
-    by_chance = foretold(road, SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9))), UNSURE[:1])
+    by_chance = predictions(road, SPACE.pattern(SPACE.random((6,), torch.Generator().manual_seed(9))), UNSURE[:1])
     assert abs(whole.predicted_mps) > 1.2 * np.abs(by_chance.speed_change_mps).mean()
     assert (whole.history[-1] >= whole.history[0] - 1e-3).all()
     assert list(whole.by_group) == ["slower", "faster"]
@@ -63,7 +63,7 @@ def test_a_search_for_the_speed_beats_chance_and_says_how_much_in_metres_a_secon
     assert all(low <= each.predicted_mps <= high for each, (_, low, high) in zip(whole.candidates, ranges, strict=True))
     least = [-high if group == "slower" else low for group, low, high in ranges]
     assert least == sorted(least, reverse=True)
-    again = foretold(road, SPACE.pattern(SPACE.point(whole.pattern)[None]), UNSURE).speed_change_mps[0]
+    again = predictions(road, SPACE.pattern(SPACE.point(whole.pattern)[None]), UNSURE).speed_change_mps[0]
     assert whole.predicted_range_mps == pytest.approx((again.min(), again.max()), abs=0.02)
     whole.save(tmp_path)
     loaded, content = AttackResult.load(tmp_path), json.loads((tmp_path / "result.json").read_text())
@@ -80,7 +80,7 @@ def test_paint_is_worth_as_much_to_one_side_as_it_costs_the_other(road):
     (either,) = measure_on(road, "all").values(SPACE, unit[:1])
     assert torch.allclose(either, faster.abs(), atol=1e-3)
     # The change is from the bare road's drive from the same start, however fast that is.
-    quick = measure_on(road, starts=(Start(faster_mps=1.0),)).values(SPACE, unit)[1]
+    quick = measure_on(road, starts=(BiasedStart(faster_mps=1.0),)).values(SPACE, unit)[1]
     assert torch.allclose(quick, faster, atol=0.5 * float(faster.abs().max()))
 
 

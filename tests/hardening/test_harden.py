@@ -14,7 +14,7 @@ from roadproof.controllers import ConditionalPilotNet, load_controller, save_con
 from roadproof.controllers.loading import load_trainable
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives import Trajectories, Window
-from roadproof.errors import RoadproofError, TrainingError
+from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
 from roadproof.hardening.harden import STAGES, harden
@@ -194,6 +194,6 @@ def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
         ({"rounds": 0}, "rounds is 0"),
         ({"processes": 2}, "2 processes; expected 1, or more with a factory"),
     ):
-        with pytest.raises(TrainingError, match=message):
+        with pytest.raises(RoadproofError, match=message):
             run(town, folder, **options)
     assert not folder.exists()

@@ -2,12 +2,12 @@
 
 import pytest
 
-from roadproof.hardening.judgement import Clean, Judged, Judgement
+from roadproof.hardening.judgement import BareDrives, JudgedAttack, Judgement
 
 
 def judged(scenario, kind, before, after):
     return [
-        Judged(
+        JudgedAttack(
             scenario=scenario,
             kind=kind,
             after=bool(number),
@@ -21,7 +21,7 @@ def judged(scenario, kind, before, after):
 
 
 def verdict(*rows, clean=(4, 4)):
-    drives = tuple(Clean(4, count, ("left-03, rainy-noon",) * (4 - count)) for count in clean)
+    drives = tuple(BareDrives(4, count, ("left-03, rainy-noon",) * (4 - count)) for count in clean)
     return Judgement(tuple(each for row in rows for each in judged(*row)), drives).verdict()
 
 

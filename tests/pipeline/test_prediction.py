@@ -32,7 +32,7 @@ def run(town, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_is_foretold_of_a_pattern_is_close_to_what_the_town_drives(town, run, tmp_path):
+def test_what_is_predicted_of_a_pattern_is_close_to_what_the_town_drives(town, run, tmp_path):
     controller, scenario, drives, recordings = run
     assert recordings.is_placed
     space = SearchSpace(figures=5)

@@ -96,9 +96,9 @@ def test_predicted_deviation_is_over_the_stretch_that_driven_ones_are_over():
 def test_the_report_says_that_nothing_was_driven(predicted):
     run, done = predicted
     result = json.loads((run / "result.json").read_text())
-    assert result["verdict"]["key"] == "foreseen"
+    assert result["verdict"]["key"] == "predicted"
     assert "closed_loop" not in result
-    assert result["foreseen"]["trials"][0]["deviation_m"] == done.trials[0].deviation_m
+    assert result["predicted"]["trials"][0]["deviation_m"] == done.trials[0].deviation_m
     page = (run / "report.html").read_text()
     for words in (
         "Predicted, not driven",
@@ -134,16 +134,16 @@ def test_a_selection_in_recordings_is_called_predicted(recordings, tmp_path):
     assert Selection.load(tmp_path).predicted
 
 
-def test_the_speed_foretold_in_a_batch_is_that_of_a_drive_step_by_step(recordings):
+def test_the_speed_predicted_in_a_batch_is_that_of_a_drive_step_by_step(recordings):
     with RecordedSimulator(recordings) as simulator:
         scenario = briefly(simulator)
         clean, painted = (rollout(simulator, BrakeShy(), scenario, pattern=pattern) for pattern in (None, BAR))
     driven = speed_difference(clean, painted, CANVAS)
     world = RecordedWorld(recordings)
     world.fit(BrakeShy())
-    foretold = world.foretold(BrakeShy(), Pattern(BAR.shapes, BAR.boxes[None], BAR.colours[None]))
+    predicted = world.predict(BrakeShy(), Pattern(BAR.shapes, BAR.boxes[None], BAR.colours[None]))
     assert driven.most_mps < driven.mean_mps < -0.1
-    assert foretold.speed_change_mps[0, 0] == pytest.approx(driven.mean_mps, abs=0.03)
+    assert predicted.speed_change_mps[0, 0] == pytest.approx(driven.mean_mps, abs=0.03)
 
 
 def test_what_was_searched_to_change_the_speed_is_chosen_by_it(recordings, tmp_path):

@@ -11,7 +11,7 @@ from roadproof.coverage import Shape
 from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
 from roadproof.recorded.vehicle import Vehicle
-from roadproof.recorded.world import UNSURE, RecordedWorld, Start
+from roadproof.recorded.world import UNSURE, BiasedStart, RecordedWorld
 from roadproof.recordings import Side
 
 VEHICLE = dataclasses.replace(
@@ -42,7 +42,9 @@ def test_the_bare_road_is_driven_as_it_was_recorded(world):
 
 
 def test_a_car_that_starts_aside_is_brought_back(world):
-    rolled = world.roll(RampFollower(), starts=(Start(right_m=0.5), Start(right_m=-0.5), Start(turned_rad=0.03)))
+    rolled = world.roll(
+        RampFollower(), starts=(BiasedStart(right_m=0.5), BiasedStart(right_m=-0.5), BiasedStart(turned_rad=0.03))
+    )
     assert rolled.right_m[:2, 0].tolist() == pytest.approx([0.5, -0.5])
     assert (rolled.right_m[:2, -1].abs() < 0.35).all()
     # Turned to the left it goes to the left first.
@@ -50,7 +52,7 @@ def test_a_car_that_starts_aside_is_brought_back(world):
 
 
 def test_a_car_whose_steering_is_off_goes_its_way_and_no_further(world):
-    right, left = world.roll(RampFollower(), starts=(Start(steer=0.02), Start(steer=-0.02))).right_m
+    right, left = world.roll(RampFollower(), starts=(BiasedStart(steer=0.02), BiasedStart(steer=-0.02))).right_m
     # It drifts until the controller answers with as much the other way.
     assert right[-1] > 0.03
     assert left[-1] < -0.03
@@ -58,10 +60,10 @@ def test_a_car_whose_steering_is_off_goes_its_way_and_no_further(world):
 
 
 def test_a_prediction_has_a_value_for_every_start(world):
-    found = world.foretold(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)), UNSURE).deviation_m
+    found = world.predict(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43)), UNSURE).deviation_m
     assert found.shape == (2, len(UNSURE))
-    alone = world.foretold(RampFollower(), painted((200, 300, 1.0))).deviation_m
-    assert found[0, UNSURE.index(Start())] == pytest.approx(alone[0, 0], abs=1e-6)
+    alone = world.predict(RampFollower(), painted((200, 300, 1.0))).deviation_m
+    assert found[0, UNSURE.index(BiasedStart())] == pytest.approx(alone[0, 0], abs=1e-6)
     # Against the bare road with the same error: thin grey paint does next to nothing.
     assert found[1].max() < 0.1
 
@@ -82,12 +84,12 @@ def test_bright_paint_pulls_to_the_right_and_dark_paint_to_the_left(world):
     bright, dark = world.roll(RampFollower(), painted((200, 300, 1.0), (200, 300, 0.0))).right_m
     assert bright.max() > 0.3
     assert dark.min() < -0.1
-    deviations = world.foretold(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43))).deviation_m[:, 0]
+    deviations = world.predict(RampFollower(), painted((200, 300, 1.0), (200, 5, 0.43))).deviation_m[:, 0]
     assert deviations[0] > 5 * deviations[1]
 
 
 def test_a_batch_is_its_parts_and_the_same_twice(world):
-    rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (Start(), Start(right_m=0.3))
+    rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (BiasedStart(), BiasedStart(right_m=0.3))
     with torch.no_grad():
         together = world.roll(RampFollower(), painted(*rows), starts=starts)
         again = world.roll(RampFollower(), painted(*rows), starts=starts)
@@ -97,7 +99,7 @@ def test_a_batch_is_its_parts_and_the_same_twice(world):
 
 
 def test_cars_go_on_from_the_drive_up_to_the_canvas_as_if_they_had_driven_all_the_way(world):
-    rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (Start(), Start(right_m=0.3))
+    rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (BiasedStart(), BiasedStart(right_m=0.3))
     after = world.approach(RampFollower(), starts, every=2)
     assert after is not None
     assert 0 < after.step < world.course.count and after.step % 2 == 0
@@ -115,7 +117,7 @@ def test_cars_go_on_from_the_drive_up_to_the_canvas_as_if_they_had_driven_all_th
 
 
 def test_a_controller_that_remembers_drives_all_the_way(world):
-    assert world.approach(Smoothed(), (Start(),)) is None
+    assert world.approach(Smoothed(), (BiasedStart(),)) is None
 
 
 def test_gradients_of_a_drive_on_one_picture_are_central_differences(world):
@@ -150,7 +152,7 @@ def test_gradients_through_the_loop_point_where_the_car_goes(world):
 
 
 def test_the_gap_says_how_far_the_pictures_are_from_recorded_ones(world):
-    rolled = world.roll(RampFollower(), starts=(Start(right_m=0.6),))
+    rolled = world.roll(RampFollower(), starts=(BiasedStart(right_m=0.6),))
     assert float(rolled.left_m[0, 0]) == pytest.approx(-0.6, abs=1e-6)
 
 

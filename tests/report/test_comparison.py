@@ -115,10 +115,12 @@ def test_the_command_answers_programs_with_what_result_json_says(runs, tmp_path,
         kept = result_of(read_run(run))["closed_loop"]
         rows = [row for row in kept["rows"] if not row["traffic"]]
         assert [row["median_m"] for row in one["closed_loop"]["rows"]] == [row["median_m"] for row in rows]
-    assert ["foreseen" in each for each in told] == ["closed_loop" not in each for each in told] == [False, False, True]
+    assert (
+        ["predicted" in each for each in told] == ["closed_loop" not in each for each in told] == [False, False, True]
+    )
     assert told[1]["closed_loop"]["change_m"]["value"] < -0.1
     # What is driven is not compared with what is predicted.
-    assert told[2]["foreseen"]["change_m"] is None
+    assert told[2]["predicted"]["change_m"] is None
 
 
 def test_runs_are_called_by_what_tells_them_apart():

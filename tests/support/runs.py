@@ -19,7 +19,7 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.trial import judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
-from roadproof.hardening.judgement import Clean, Judged, Judgement
+from roadproof.hardening.judgement import BareDrives, JudgedAttack, Judgement
 from roadproof.hardening.result import Hardened, Round
 from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.film import Strip
@@ -233,7 +233,7 @@ def write_record(folder, scenario):
 def hardened():
     """A hardening that helped."""
     judged = [
-        Judged(
+        JudgedAttack(
             scenario="left-03",
             kind=kind,
             after=after,
@@ -248,7 +248,7 @@ def hardened():
         Round(number=number, deviation_m={"right-02": metres}, left_lane=metres / 2)
         for number, metres in ((0, 1.1), (1, 0.4))
     )
-    clean = (Clean(4, 4, ()), Clean(4, 3, ("left-03, rainy-noon",)))
+    clean = (BareDrives(4, 4, ()), BareDrives(4, 3, ("left-03, rainy-noon",)))
     return Hardened(
         controller="pilotnet",
         hardened="hardened.safetensors",

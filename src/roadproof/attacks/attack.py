@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
@@ -92,19 +91,15 @@ def attack(
     method = method or GradOpt()
     objective = objective or usual_objective(recordings, method)
     method.check_space(space)
-    made_of: dict[str, Any] = {}
-    if isinstance(recordings, RecordingSet):
-        with suppress(ControllerError):  # one that cannot drive is attacked all the same, but nothing goes on with it
-            made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
-    start = time.perf_counter()
+    made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
     if isinstance(recordings, InSimulator):
-        _refuse_in_simulator(groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
+        _refuse_in_simulator(method, groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
         site = site_at(recordings.simulator, recordings.scenario)
-        measure = _driven(recordings, controller, objective, method)
+        measure = DrivenMeasure(recordings, controller, objective)
     else:
         site, groups = site_of(recordings), groups or method.groups(recordings, objective)
         measure = method.measure(objective, recordings, controller, groups, device=device)
-        start = time.perf_counter()
+    start = time.perf_counter()
     groups, space = measure.groups, space.on(site)
     search = method.search(
         measure,
@@ -118,27 +113,24 @@ def attack(
     frames = measure.frames_evaluated
     if search.gave_way and isinstance(measure, BatchedMeasure):
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
-    told, groups = groups, measure.groups
-    candidates = _candidates(measure, search, space, groups)
-    first = candidates[0]
+    candidates = _candidates(measure, search, space)
     cost = Cost(
         controller_frames=frames,
         seconds=time.perf_counter() - start,
         simulator_calls=measure.calls if isinstance(measure, DrivenMeasure) else 0,
     )
-    checks = _checks(measure, method, space, search, first, random_patterns, seed)
     return AttackResult(
-        **{each.name: getattr(first, each.name) for each in fields(first)},
+        **{each.name: getattr(candidates[0], each.name) for each in fields(Candidate)},
         objective=objective.name,
-        by_group={str(group): float(best) for group, best in zip(groups, search.best.amax(1), strict=True)},
+        by_group={str(group): float(best) for group, best in zip(measure.groups, search.best.amax(1), strict=True)},
         candidates=candidates,
         history=search.history.double().numpy(),
         cost=cost,
-        checks=(*checks, *check_groups(told, search), *check_steps(search)),
+        checks=_checks(measure, method, space, search, groups, candidates[0], random_patterns, seed),
         space=space,
         method=method,
         seed=seed,
-        conspicuousness=conspicuousness(first.pattern, space.site or site),
+        conspicuousness=conspicuousness(candidates[0].pattern, space.site or site),
         made_of=made_of,
     )
 
@@ -153,14 +145,19 @@ def usual_objective(recordings: RecordingSet | InSimulator, method: Method) -> O
     return PathDeviation() if driven and not isinstance(method, Published | BayesianOptimisation) else SteeringShift()
 
 
-def _refuse_in_simulator(**given: object) -> None:
-    """Refuse what an attack in a simulator would not use."""
+def _refuse_in_simulator(method: Method, **given: object) -> None:
+    """Refuse a method that drives cannot serve, and what an attack in a simulator would not use."""
+    if method.by_gradient:
+        raise RoadproofError(
+            f"method {method.word} needs gradients, and a drive in a simulator has none; record and calibrate the "
+            "stretch and attack the recordings, or give a method without gradients, as CMAES(calls=140)"
+        )
     if names := " and ".join(name for name, value in given.items() if value):
         raise RoadproofError(f"an attack in a simulator does not use {names}; leave it out, or attack recordings")
 
 
 def _made_of(
-    recordings: RecordingSet,
+    recordings: RecordingSet | InSimulator,
     controller: Controller,
     space: SearchSpace,
     objective: Objective,
@@ -170,7 +167,13 @@ def _made_of(
     starts: Sequence[Candidate],
     random_patterns: int,
 ) -> dict[str, Any]:
-    """What identifies a search on recordings, by name, as JSON has it."""
+    """What identifies a search on recordings, by name, as JSON has it; empty where no search goes on from it."""
+    if not isinstance(recordings, RecordingSet):
+        return {}
+    try:
+        parts = parts_of(controller, (recordings.view.height_px, recordings.view.width_px))
+    except ControllerError:  # one that cannot drive is attacked all the same
+        return {}
     begun = [(each.group, known_by(each.pattern)) for each in starts]
     made_of = {
         "space": space.stated,
@@ -182,21 +185,11 @@ def _made_of(
         "drives": recordings.digest()[:16],
         "marks": recordings.marks_digest()[:16],
         "starts": digest(as_text(begun))[:16],
-        **parts_of(controller, (recordings.view.height_px, recordings.view.width_px)),
+        **parts,
     }
     # Results are older than this part; those of the pipeline compare with no random patterns.
     made_of |= {"random_patterns": random_patterns} if random_patterns else {}
     return cast("dict[str, Any]", plain(made_of))
-
-
-def _driven(recordings: InSimulator, controller: Controller, objective: Objective, method: Method) -> DrivenMeasure:
-    """The measure of drives in a simulator, for a method that needs no gradients."""
-    if method.by_gradient:
-        raise RoadproofError(
-            f"method {method.word} needs gradients, and a drive in a simulator has none; record and calibrate the "
-            "stretch and attack the recordings, or give a method without gradients, as CMAES(calls=140)"
-        )
-    return DrivenMeasure(recordings, controller, objective)
 
 
 def _checks(
@@ -204,17 +197,21 @@ def _checks(
     method: Method,
     space: SearchSpace,
     search: Search,
+    groups: Sequence[Group],
     found: Candidate,
     random_patterns: int,
     seed: int,
 ) -> tuple[Check, ...]:
     """The self-checks that suit what a search ran on: recordings, a recorded world or a simulator."""
+    of_search = (*check_groups(groups, search), *check_steps(search))
     if not isinstance(measure, RecordedMeasure):
-        return (check_bounds(space, search),)
+        return check_bounds(space, search), *of_search
     checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
     if method.by_gradient:
         checks = (check_gradients(measure, space, search), *checks)
-    return checks + check_world(measure, found.pattern) if isinstance(measure, ClosedLoopMeasure) else checks
+    if isinstance(measure, ClosedLoopMeasure):
+        checks += check_world(measure, found.pattern)
+    return *checks, *of_search
 
 
 def kept_attack(
@@ -276,7 +273,7 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
-def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Sequence[Group]) -> tuple[Candidate, ...]:
+def _candidates(measure: Measure, search: Search, space: SearchSpace) -> tuple[Candidate, ...]:
     """Every start's best, the strongest first: by what is predicted where that is known, else by its own value.
 
     Of what is predicted with small errors the least counts: where the way forks, a pattern that depends on
@@ -292,7 +289,7 @@ def _candidates(measure: Measure, search: Search, space: SearchSpace, groups: Se
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
     candidates: list[Candidate] = []
     for group, restart in (divmod(index, restarts) for index in order):
-        pattern, name = space.pattern(search.best_unit[group, restart].cpu()), str(groups[group])
+        pattern, name = space.pattern(search.best_unit[group, restart].cpu()), str(measure.groups[group])
         if isinstance(measure, DrivenMeasure):
             candidates.append(Candidate(pattern, name, driven=measure.effect(pattern)))
             continue

@@ -26,7 +26,7 @@ from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.io.identity import digest
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, Approach, Foretold, RecordedWorld, Rolled, Start
+from roadproof.recorded.world import UNSURE, Approach, BiasedStart, Predicted, RecordedWorld, Rolled
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -47,7 +47,7 @@ class Rolling(TypedDict, total=False):
         variation: variation of paint and camera over which the mean is taken; None for paint and camera as recorded.
     """
 
-    starts: tuple[Start, ...]
+    starts: tuple[BiasedStart, ...]
     every: int
     device: torch.device | str
     variation: Variation | None
@@ -81,7 +81,7 @@ class ClosedLoopMeasure(BatchedMeasure):
             world.fit(controller)
         self.device = torch.device(device)
         self.frames_evaluated = 0
-        self._starts, self.every = rolling.get("starts", (Start(),)), rolling.get("every", 2)
+        self._starts, self.every = rolling.get("starts", (BiasedStart(),)), rolling.get("every", 2)
         self.variation, self._looks = variation, variation and variation.draw(FIXED, self.device)
         self._bare: dict[tuple[int, int], Rolled] = {}
         self._unsure: dict[int, Rolled] = {}
@@ -96,7 +96,7 @@ class ClosedLoopMeasure(BatchedMeasure):
         """What is made large, of each drive in one world: signed, differentiable in the patterns."""
 
     @abstractmethod
-    def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
+    def predict(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """What is predicted of R patterns in one world, in each of the S drives with small errors."""
 
     @abstractmethod
@@ -152,16 +152,16 @@ class ClosedLoopMeasure(BatchedMeasure):
         patterns = space.pattern(unit.flatten(0, 1))
         looks = self.variation and self.variation.draw(FIXED, self.device, len(UNSURE))
         self._steering.redraw(FIXED)
-        predicted = np.concatenate([self.predicted(world, patterns, looks) for world in self.worlds], 1)
+        predicted = np.concatenate([self.predict(world, patterns, looks) for world in self.worlds], 1)
         return self._steering.values(space, unit), torch.tensor(predicted).view(*unit.shape[:2], -1)
 
-    def foretold(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Foretold:
+    def predictions(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Predicted:
         """What is predicted in one world with small errors; the drives over the bare road are made once."""
         # `readings` draws the same looks each time.
         if id(world) not in self._unsure:
             with torch.no_grad():
                 self._unsure[id(world)] = world.roll(self.controller, starts=UNSURE, looks=looks)
-        return world.foretold(self.controller, patterns, UNSURE, looks, self._unsure[id(world)])
+        return world.predict(self.controller, patterns, UNSURE, looks, self._unsure[id(world)])
 
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""

@@ -56,9 +56,9 @@ class DeviationMeasure(ClosedLoopMeasure):
         del world
         return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
 
-    def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
+    def predict(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The paper's deviation, metres, 0 or more, of R patterns in each of S drives."""
-        return self.foretold(world, patterns, looks).deviation_m
+        return self.predictions(world, patterns, looks).deviation_m
 
     def told(self) -> tuple[object, ...]:
         """What tells this measure from others on the same drives."""

@@ -25,7 +25,7 @@ from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.io.known import known_by
-from roadproof.recorded.world import Start
+from roadproof.recorded.world import BiasedStart
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -134,7 +134,7 @@ class ClosedLoop:
     """
 
     word: ClassVar[str]
-    starts: tuple[Start, ...] = (Start(),)
+    starts: tuple[BiasedStart, ...] = (BiasedStart(),)
     every: int = 2
     variation: Variation | None = field(default=None, repr=False)
 

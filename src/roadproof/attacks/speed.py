@@ -50,9 +50,9 @@ class SpeedMeasure(ClosedLoopMeasure):
         bare_mps = self.bare(world).speed_mps
         return (rolled.speed_mps - bare_mps.repeat(len(rolled.speed_mps) // len(bare_mps), 1)).mean(1)
 
-    def predicted(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
+    def predict(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The mean change of the speed, m/s, negative where the car is slower, of R patterns in each of S drives."""
-        return self.foretold(world, patterns, looks).speed_change_mps
+        return self.predictions(world, patterns, looks).speed_change_mps
 
     def rank(self, predicted: Float[Tensor, "g r s"]) -> Values:
         """The least change over small errors in each group's direction, m/s."""

@@ -48,7 +48,7 @@ def _answer(run: Compared) -> dict[str, object]:
         "controller": evaluation.controller,
         "scenario": evaluation.scenario.name,
         "verdict": asdict(run.verdict),
-        "foreseen" if run.predicted else "closed_loop": {
+        "predicted" if run.predicted else "closed_loop": {
             "rows": [asdict(row) for row in run.alone.values()],
             "change_m": run.change and asdict(run.change),
         },

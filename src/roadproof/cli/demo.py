@@ -96,11 +96,11 @@ def _report(result: StressTest, out: Path) -> None:
     say(stored(out / "result.json")["verdict"]["sentence"])
     if result.rounds is not None and result.rounds.stopped:
         say(f"Searching on ended early: {result.rounds.stopped}")
-    if (foretold := result.prediction) is not None:
+    if (prediction := result.prediction) is not None:
         say(
-            f"Predicted in the recordings {foretold.predicted_m:.2f} m of deviation ({foretold.least_m:.2f} to "
-            f"{foretold.most_m:.2f} over small errors), driven {foretold.driven_m:.2f} m; "
-            f"{foretold.path_error_m:.2f} m between the paths on average"
+            f"Predicted in the recordings {prediction.predicted_m:.2f} m of deviation ({prediction.least_m:.2f} to "
+            f"{prediction.most_m:.2f} over small errors), driven {prediction.driven_m:.2f} m; "
+            f"{prediction.path_error_m:.2f} m between the paths on average"
         )
     spent = [(stage, cost) for stage, cost in result.cost.items() if cost != StageCost()]
     drives = [f" ({cost.simulator_calls} drives)" if cost.simulator_calls else "" for _, cost in spent]

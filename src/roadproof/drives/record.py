@@ -19,7 +19,7 @@ from roadproof.controllers.identity import parts_of
 from roadproof.datatypes import Control, EventKind, Observation, VehicleState, Weather
 from roadproof.drives.folder import Drive, Drives, Settings, forget_settings, read_drive, write_drive, write_settings
 from roadproof.drives.perturb import CleanPath, noisy, offsets, steering_noise, steering_test, swerving
-from roadproof.drives.trajectories import Plan, SteeringNoise, Trajectories, Window
+from roadproof.drives.trajectories import DrivePlan, SteeringNoise, Trajectories, Window
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError, RoadproofError
@@ -173,7 +173,7 @@ def record_along(
         answers[step] = act_of(controller, frame, float(again.speed_mps[step]), int(again.command[step])).steer
     right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in which])
     side = Side.RIGHT if right_m[np.abs(right_m).argmax()] > 0 else Side.LEFT
-    drive = _drive(Plan(name, side, 0.0, 0), again, chosen, answers, right_m)
+    drive = _drive(DrivePlan(name, side, 0.0, 0), again, chosen, answers, right_m)
     if folder is not None:
         write_drive(drive, folder)
     return drive
@@ -211,7 +211,7 @@ def _clean(simulator: SimulatorT, driver: Controller | Driver[SimulatorT], setti
 
 
 def _perturbed(
-    driver: Controller | Driver[SimulatorT], settings: Settings, clean: Drive, simulator: SimulatorT, plan: Plan
+    driver: Controller | Driver[SimulatorT], settings: Settings, clean: Drive, simulator: SimulatorT, plan: DrivePlan
 ) -> Drive:
     path, harm = CleanPath.of(clean.episode), ""
     for tried in range(TRIES):
@@ -235,7 +235,7 @@ def _astray(
     simulator: SimulatorT,
     driver: Controller | Driver[SimulatorT],
     settings: Settings,
-    plan: Plan,
+    plan: DrivePlan,
     clean: Drive,
     share: float,
     film: _Film,
@@ -314,7 +314,7 @@ def in_view(
 
 
 def _drive(
-    plan: Plan,
+    plan: DrivePlan,
     episode: Episode,
     chosen: Chosen,
     answered: Float[np.ndarray, " n"],

@@ -74,7 +74,7 @@ class SteeringNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DrivePlan:
     """The plan of one drive to be recorded.
 
     Args:
@@ -113,18 +113,18 @@ class Trajectories:
         if self.count not in COUNTS:
             raise RecordingError(f"T is {self.count} trajectories, expected one of {', '.join(map(str, COUNTS))}")
 
-    def plans(self) -> tuple[Plan, ...]:
+    def plans(self) -> tuple[DrivePlan, ...]:
         """The plans of all drives, the clean one first."""
         sides = (Side.RANDOM,) if self.scheme is Scheme.RANDOM else (Side.RIGHT, Side.LEFT)
         how, sizes = self.perturbation, [(0.0, False)]
         if isinstance(how, Swerve):
             sizes = [*((size, False) for size in how.swerves_m), *((size, True) for size in how.weaves_m)]
         perturbed = (
-            Plan(str(side) if k == 1 else f"{side}-{k}", side, size, k, weaves)
+            DrivePlan(str(side) if k == 1 else f"{side}-{k}", side, size, k, weaves)
             for k, (size, weaves) in enumerate(cycle(sizes), 1)
             for side in sides
         )
-        return (Plan(str(Side.CLEAN), Side.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
+        return (DrivePlan(str(Side.CLEAN), Side.CLEAN, 0.0, 0), *islice(perturbed, self.count - 1))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

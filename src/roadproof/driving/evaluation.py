@@ -46,7 +46,7 @@ _UNITS = {
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Row:
+class EvaluationRow:
     """Means over the trials of one pattern kind, weather and traffic.
 
     Args:
@@ -152,9 +152,9 @@ class Evaluation:
             and (weather is None or trial.weather == weather)
         )
 
-    def rows(self) -> tuple[Row, ...]:
+    def rows(self) -> tuple[EvaluationRow, ...]:
         """The table: pattern kinds, static before traffic, every weather and then all together."""
-        found: list[Row] = []
+        found: list[EvaluationRow] = []
         for pattern in (ATTACK, "random"):
             for traffic in (False, True):
                 for weather in (*self.weathers, None) if len(self.weathers) > 1 else self.weathers:
@@ -223,7 +223,7 @@ def kind_of(paint: PaintKind) -> str:
     return "predicted" if paint.predicted else "closed loop"
 
 
-def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> Row:
+def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Trial, ...]) -> EvaluationRow:
     # From one start alone, one pattern has one drive a weather, and the weathers are no sample of all there are.
     drawn = traffic or pattern != ATTACK or any(trial.start != NOMINAL for trial in trials)
     deviations = [trial.deviation_m for trial in trials]
@@ -239,7 +239,7 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
 
     points = known(lambda trial: trial.points)
     first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
-    return Row(
+    return EvaluationRow(
         pattern=pattern,
         weather=weather,
         traffic=traffic,
@@ -259,7 +259,7 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
     )
 
 
-def _shown(row: Row) -> tuple[object, ...]:
+def _shown(row: EvaluationRow) -> tuple[object, ...]:
     points = "not known" if row.points is None else f"{row.points.value:.1f}"
     traffic = "yes" if row.traffic else "no"
     return row.pattern, row.weather or "all", traffic, row.count, row.metres, f"{row.left_lane:.0%}", points

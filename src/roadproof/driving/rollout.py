@@ -102,8 +102,6 @@ def rollout(
             events += seen.events
     if on_step is not None:
         on_step(seen, None)
-    late = seen.time_s >= scenario.time_limit_s - 0.5 * simulator.dt_s
-    ending = Ending.STOPPED if stopped else seen.ending or (Ending.TIME_LIMIT if late else Ending.GOAL_REACHED)
     *observed, command = np.array(rows, np.float64).T
     given = [np.array([getattr(control, name) for control in controls], np.float64) for name in GIVEN]
     return Episode(
@@ -115,11 +113,17 @@ def rollout(
         pedestrians=pedestrians,
         seed=seed,
         dt_s=simulator.dt_s,
-        ending=ending,
+        ending=Ending.STOPPED if stopped else _ending(seen, scenario, simulator.dt_s),
         events=tuple(events),
         command=command.astype(np.int64),
         **dict(zip((*SEEN[:-1], *GIVEN), chain(observed, given), strict=True)),
     )
+
+
+def _ending(seen: Observation, scenario: Scenario, dt_s: float) -> Ending:
+    """Why a drive ended that nobody stopped, where a simulator does not say: too late, or at the goal."""
+    late = seen.time_s >= scenario.time_limit_s - 0.5 * dt_s
+    return seen.ending or (Ending.TIME_LIMIT if late else Ending.GOAL_REACHED)
 
 
 def replay(episode: Episode) -> Driver[Simulator]:

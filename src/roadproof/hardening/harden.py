@@ -35,6 +35,7 @@ from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.locks import working_in
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stress_test import OnProgress
+from roadproof.processes import require_opened
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
@@ -93,10 +94,7 @@ def harden(
     budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
     if judge_on:
         budget.require_libraries(space)
-    if processes < 1 or (processes > 1 and factory is None):
-        raise TrainingError(
-            f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
-        )
+    require_opened(processes, factory)
     load_trainable(controller)
     plan = HardeningPlan(
         spec=controller,

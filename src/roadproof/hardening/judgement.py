@@ -36,7 +36,7 @@ OLD = "found against the controller before"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Judged:
+class JudgedAttack:
     """One kind of attack on one street against one controller.
 
     Args:
@@ -62,7 +62,7 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class Clean:
+class BareDrives:
     """Drives over the bare road.
 
     Args:
@@ -77,7 +77,7 @@ class Clean:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Verdict:
+class HardeningVerdict:
     """Whether hardening helped.
 
     Args:
@@ -125,10 +125,10 @@ class Judgement:
         clean: drives over the bare road, before and after.
     """
 
-    judged: tuple[Judged, ...]
-    clean: tuple[Clean, Clean]
+    judged: tuple[JudgedAttack, ...]
+    clean: tuple[BareDrives, BareDrives]
 
-    def verdict(self) -> Verdict:
+    def verdict(self) -> HardeningVerdict:
         """The verdict on each street's strongest attack: attackers choose the kind; a mean over kinds would flatter."""
         names = list(dict.fromkeys(each.scenario for each in self.judged))
         before, after = ([self._strongest(name, after=after) for name in names] for after in (False, True))
@@ -144,7 +144,7 @@ class Judgement:
             outcome = "did not help"
         else:
             outcome = "helped" if high is not None and high < 0 else "not shown"
-        return Verdict(
+        return HardeningVerdict(
             outcome=outcome,
             change_m=change,
             over=over,
@@ -155,7 +155,7 @@ class Judgement:
             clean_worse=worse,
         )
 
-    def _strongest(self, scenario: str, *, after: bool) -> Judged:
+    def _strongest(self, scenario: str, *, after: bool) -> JudgedAttack:
         tried = [each for each in self.judged if (each.scenario, each.after) == (scenario, after)]
         return max(tried, key=lambda each: each.mean_m)
 
@@ -178,7 +178,7 @@ class StreetJudge:
     scenario: Scenario
     on_progress: OnProgress
 
-    def judge(self) -> list[Judged]:
+    def judge(self) -> list[JudgedAttack]:
         """Attack with every kind of search, and drive over what was found against the controller before.
 
         Raises:
@@ -211,7 +211,7 @@ class StreetJudge:
             judged.append(self._driven(controller, old, folder / "old", OLD))
         return judged
 
-    def _driven(self, controller: Controller, pattern: Pattern, place: Path, kind: str) -> Judged:
+    def _driven(self, controller: Controller, pattern: Pattern, place: Path, kind: str) -> JudgedAttack:
         asked = self.plan.budget.judge
         evaluation = evaluate(
             self.simulator,
@@ -229,9 +229,9 @@ class StreetJudge:
         )
         return self._judged(evaluation, kind, evaluation.simulator_calls)
 
-    def _judged(self, evaluation: Evaluation, kind: str, calls: int) -> Judged:
+    def _judged(self, evaluation: Evaluation, kind: str, calls: int) -> JudgedAttack:
         trials = evaluation.of(ATTACK, traffic=False)
-        return Judged(
+        return JudgedAttack(
             scenario=self.scenario.name,
             kind=kind,
             after=self.number > 0,
@@ -249,7 +249,7 @@ def clean_drives(
     folder: Path,
     *,
     on_drive: Callable[[int, int], object] = lambda _done, _total: None,
-) -> Clean:
+) -> BareDrives:
     """Drive scenarios over the bare road in several weathers, and count those in which nothing happened.
 
     Raises:
@@ -266,8 +266,8 @@ def clean_drives(
         if episode.ending is not Ending.GOAL_REACHED or counted(episode.events):
             failed.append(f"{scenario.name}, {weather}")
         on_drive(done, len(asked))
-    return Clean(len(asked), len(asked) - len(failed), tuple(failed))
+    return BareDrives(len(asked), len(asked) - len(failed), tuple(failed))
 
 
-def _share(judged: Sequence[Judged]) -> float:
+def _share(judged: Sequence[JudgedAttack]) -> float:
     return float(np.mean([left for each in judged for left in each.left_lane]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from roadproof.hardening.judgement import Judged
+from roadproof.hardening.judgement import JudgedAttack
 from roadproof.hardening.result import Hardened
 from roadproof.io.files import write_text
 from roadproof.io.html import encoded
@@ -50,7 +50,7 @@ def write_hardening(found: Hardened, folder: Path) -> Path:
     return page
 
 
-def _pairs(judged: tuple[Judged, ...]) -> list[tuple[str, str, Judged | None, Judged | None]]:
+def _pairs(judged: tuple[JudgedAttack, ...]) -> list[tuple[str, str, JudgedAttack | None, JudgedAttack | None]]:
     """Street by street, kind by kind: before and after, where there are both."""
     by = {(each.scenario, each.kind, each.after): each for each in judged}
     rows = dict.fromkeys((each.scenario, each.kind) for each in judged)

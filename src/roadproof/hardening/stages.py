@@ -16,7 +16,7 @@ from roadproof.controllers import CIL, ConditionalPilotNet, Controller, save_con
 from roadproof.controllers.loading import load_trainable, runs_code
 from roadproof.controllers.steering import NetworkController
 from roadproof.errors import TrainingError
-from roadproof.hardening.judgement import Clean, Judged, StreetJudge, clean_drives
+from roadproof.hardening.judgement import BareDrives, JudgedAttack, StreetJudge, clean_drives
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.result import Round
 from roadproof.hardening.town import Town
@@ -120,9 +120,9 @@ class HardeningStages:
         _save(network, plan, number)
         path.unlink(missing_ok=True)
 
-    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[Judged, ...]:
+    def judge(self, best: int, judge_on: Sequence[Scenario]) -> tuple[JudgedAttack, ...]:
         """Judge the controllers before and after on other streets."""
-        judged: list[Judged] = []
+        judged: list[JudgedAttack] = []
         with self.ledger.stage("judge"):
             # All before come first: the one after also drives over what was found against the one before.
             for number, when in ((0, "before"), (best, "after")):
@@ -134,7 +134,7 @@ class HardeningStages:
             self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
         return tuple(judged)
 
-    def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[Clean, Clean]:
+    def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[BareDrives, BareDrives]:
         """Drive over the bare road with the controllers before and after."""
         with self.ledger.stage("bare road"):
             before, after = (

@@ -1,4 +1,4 @@
-"""What the recorded world foretold of a pattern, beside what the car did: both paths, and how far they are apart."""
+"""What the recorded world predicted of a pattern, beside what the car did: both paths, and how far they are apart."""
 
 from __future__ import annotations
 
@@ -101,8 +101,8 @@ def predict(
     on_device = pattern[None].mapped(lambda part: part.to(device))
     with torch.no_grad():
         rolled = world.roll(controller, on_device)
-    foretold = world.foretold(controller, on_device, UNSURE)
-    deviations, changes = foretold.deviation_m, foretold.speed_change_mps
+    found = world.predict(controller, on_device, UNSURE)
+    deviations, changes = found.deviation_m, found.speed_change_mps
     predicted, canvas = world.whole_path(rolled, 0), world.course.canvas
     seen = passage(path_of(clean), canvas)
     driven = path_of(painted)[seen]

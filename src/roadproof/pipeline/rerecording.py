@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count, takewhile
 from pathlib import Path
 
@@ -137,11 +138,8 @@ def search_on(
     known, last, drives_of_last = _ranked(found, selection), selection, folder / "selection"
     done: list[ReRecordingRound] = []
     for number in range(1, rounds + 1):
-        place, before = folder / f"round-{number}", per_round * (number - 1)
-
-        def tell(now: int, word: str, before: int = before) -> None:
-            on_step(before + now, per_round * rounds, word)
-
+        place = folder / f"round-{number}"
+        tell = partial(_tell, on_step, per_round * (number - 1), per_round * rounds)
         tell(0, "recording")
         bare, driven = last.episodes(drives_of_last)
         try:
@@ -149,20 +147,16 @@ def search_on(
         except (CalibrationError, RecordingError) as error:
             return Rounds(first=selection, done=tuple(done), stopped=f"round {number}: {error}")
         recordings = replace(recordings, recordings=(*recordings.recordings, added))
-        if groups[0].direction is Direction.EITHER:
-            groups = parse_groups("all", recordings)
-        again = kept_attack(
+        again = _search_again(
             place / "attack",
             recordings,
             controller,
-            found.space,
-            objective=objective,
-            method=_gone_on(found.method),
-            groups=groups,
-            seed=found.seed,
-            starts=[candidate for _, candidate in known],
-            device=device,
-            on_step=lambda step, best, tell=tell: tell(step, f"{best:.2f}"),
+            objective,
+            groups,
+            found,
+            [candidate for _, candidate in known],
+            device,
+            lambda step, best, tell=tell: tell(step, f"{best:.2f}"),
         )
         chosen = select_by_driving(
             simulator,
@@ -180,6 +174,39 @@ def search_on(
         known = sorted([*_ranked(again, chosen), *known], key=lambda each: -each[0])
         last, drives_of_last = chosen, place / "selection"
     return Rounds(first=selection, done=tuple(done))
+
+
+def _tell(on_step: Callable[[int, int, str], object], before: int, whole: int, now: int, word: str) -> None:
+    on_step(before + now, whole, word)
+
+
+def _search_again(
+    place: Path,
+    recordings: RecordingSet,
+    controller: Controller,
+    objective: Objective,
+    groups: Sequence[Group],
+    found: AttackResult,
+    starts: Sequence[Candidate],
+    device: torch.device | str,
+    on_step: Callable[[int, float], object],
+) -> AttackResult:
+    """The search before, gone on with from what is known, on one more recorded drive."""
+    if groups[0].direction is Direction.EITHER:
+        groups = parse_groups("all", recordings)
+    return kept_attack(
+        place,
+        recordings,
+        controller,
+        found.space,
+        objective=objective,
+        method=_gone_on(found.method),
+        groups=groups,
+        seed=found.seed,
+        starts=starts,
+        device=device,
+        on_step=on_step,
+    )
 
 
 def _ranked(found: AttackResult, selection: Selection) -> list[tuple[float, Candidate]]:

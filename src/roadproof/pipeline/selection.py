@@ -187,14 +187,7 @@ def select_by_driving(
     episodes = Episodes.of(simulator, controller, scenario, paints, folder)
     bare = DriveConditions(paint=CLEAN, weather=weather)
     over = [replace(bare, paint=name) for name in paints]
-    made_of = {
-        **episodes.made_of,
-        "weather": weather,
-        "candidates": len(over),
-        "patterns": [episodes.digests[name][:16] for name in paints],
-        "drives": [episodes.file(drive) for drive in over],
-        "chosen_by": by,
-    }
+    made_of = _made_of(episodes, over, by)
     if (folder / "selection.json").exists():
         kept = Selection.load(folder)
         require_same(folder, "a choice", kept.made_of, made_of, RoadproofError)
@@ -224,10 +217,23 @@ def select_by_driving(
         simulator_calls=0 if simulator.paint.predicted else calls + len(driven),
         predicted=simulator.paint.predicted,
         chosen_by=by,
-        made_of=cast("dict[str, Any]", plain(made_of)),
+        made_of=made_of,
     )
     selection.save(folder)
     return selection
+
+
+def _made_of(episodes: Episodes, over: Sequence[DriveConditions], by: str) -> dict[str, Any]:
+    """What identifies a choice among drives over candidates, as JSON has it."""
+    made_of = {
+        **episodes.made_of,
+        "weather": over[0].weather,
+        "candidates": len(over),
+        "patterns": [episodes.digests[drive.paint][:16] for drive in over],
+        "drives": [episodes.file(drive) for drive in over],
+        "chosen_by": by,
+    }
+    return cast("dict[str, Any]", plain(made_of))
 
 
 def first_of_each_group(candidates: Sequence[Candidate], count: int) -> list[tuple[int, Candidate]]:

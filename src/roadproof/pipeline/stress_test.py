@@ -40,7 +40,7 @@ from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
 from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages
-from roadproof.processes import here_or_beside, require_picklable
+from roadproof.processes import here_or_beside, require_opened, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -158,10 +158,7 @@ def stress_test(
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     folder = as_path(folder)
-    if processes < 1 or (processes > 1 and factory is None):
-        raise RoadproofError(
-            f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
-        )
+    require_opened(processes, factory)
     stages = Stages(
         simulator=simulator,
         controller=controller,

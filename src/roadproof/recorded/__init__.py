@@ -3,5 +3,5 @@
 from roadproof.recorded.poses import placed as placed
 from roadproof.recorded.simulator import RecordedSimulator as RecordedSimulator
 from roadproof.recorded.vehicle import Vehicle as Vehicle
+from roadproof.recorded.world import BiasedStart as BiasedStart
 from roadproof.recorded.world import RecordedWorld as RecordedWorld
-from roadproof.recorded.world import Start as Start

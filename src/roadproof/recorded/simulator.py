@@ -26,7 +26,7 @@ from roadproof.io.files import is_plain_name
 from roadproof.io.identity import digest
 from roadproof.recorded.pictures import Apart, Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
-from roadproof.recorded.world import RecordedWorld, Start
+from roadproof.recorded.world import BiasedStart, RecordedWorld
 from roadproof.recordings import RecordingSet
 from roadproof.scenarios import Kind, Scenario
 from roadproof.simulators.protocol import PaintKind, PatternImage
@@ -174,7 +174,7 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     def _put(self, drive: _Drive, car: Motion) -> None:
         drive.car, drive.state = car, self._state(car)
 
-    def _start(self, asked: VehicleState) -> Start:
+    def _start(self, asked: VehicleState) -> BiasedStart:
         """The offset of an asked start from the recorded one; zero if it is at another place."""
         here = self.scenario.start
         dx, dy = asked.x_m - here.x_m, asked.y_m - here.y_m
@@ -182,8 +182,8 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         turned = math.remainder(asked.yaw_rad - here.yaw_rad, 2 * math.pi)
         right_m = s * dx - c * dy
         if abs(c * dx + s * dy) > SAME_PLACE_M or not _can_be_shown(right_m, turned):
-            return Start()
-        return Start(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
+            return BiasedStart()
+        return BiasedStart(right_m=right_m, turned_rad=turned, faster_mps=asked.speed_mps - here.speed_mps)
 
     def _state(self, car: Motion) -> VehicleState:
         canvas = self._world.bank.canvas

@@ -20,6 +20,7 @@ from roadproof.constants import constant
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of, steer_of
 from roadproof.driving.deviation import deviation_m
+from roadproof.driving.starts import StartOffset
 from roadproof.errors import RecordingError
 from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
@@ -41,26 +42,20 @@ _LOOK_AHEAD_M, _LOOK_AHEAD_S = 1.5, 0.5
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Start:
-    """How a drive differs from the clean one where it begins.
+class BiasedStart(StartOffset):
+    """How a drive's start differs from the clean drive's, and its steering from the controller's.
 
     Args:
-        right_m: offset to the right, metres.
-        turned_rad: turn of the heading, radians, left positive.
-        faster_mps: speed added to the clean drive's, m/s.
         steer: steer added to all of the controller's answers, which stands for the errors of pictures.
     """
 
-    right_m: float = 0.0
-    turned_rad: float = 0.0
-    faster_mps: float = 0.0
     steer: float = 0.0
 
 
 UNSURE = (
-    *(Start(steer=steer) for steer in (-0.02, -0.01, 0.0, 0.01, 0.02)),
-    *(Start(right_m=right_m) for right_m in (-0.1, 0.1)),
-    *(Start(faster_mps=faster_mps) for faster_mps in (-0.3, 0.3)),
+    *(BiasedStart(steer=steer) for steer in (-0.02, -0.01, 0.0, 0.01, 0.02)),
+    *(BiasedStart(right_m=right_m) for right_m in (-0.1, 0.1)),
+    *(BiasedStart(faster_mps=faster_mps) for faster_mps in (-0.3, 0.3)),
 )
 """Drives that show whether a prediction hangs by a thread: pictures are wrong by about so much steering (measured), and
 a car comes to the paint a little beside its clean path, or at another speed."""
@@ -120,7 +115,7 @@ class Approach:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Foretold:
+class Predicted:
     """What R patterns are predicted to do in each of S drives.
 
     Args:
@@ -199,7 +194,7 @@ class RecordedWorld:
         controller: Controller,
         pattern: Pattern | None = None,
         *,
-        starts: tuple[Start, ...] = (Start(),),
+        starts: tuple[BiasedStart, ...] = (BiasedStart(),),
         every: int = 1,
         looks: Looks | None = None,
         after: Approach | None = None,
@@ -231,7 +226,7 @@ class RecordedWorld:
         columns[0], columns[1] = columns[0] + self.course.canvas.x_m, columns[1] + self.course.canvas.y_m
         return Rolled(*columns)
 
-    def approach(self, controller: Controller, starts: tuple[Start, ...], every: int = 1) -> Approach | None:
+    def approach(self, controller: Controller, starts: tuple[BiasedStart, ...], every: int = 1) -> Approach | None:
         """The drives over the bare road from each start, up to where the canvas covers `SEEN` of a picture.
 
         Returns:
@@ -249,7 +244,7 @@ class RecordedWorld:
         shown = torch.zeros(len(poses.x_m)) if canvas is None else canvas.valid.sum(1).cpu()
         return shown / (view.height_px * view.width_px)
 
-    def _at_start(self, starts: tuple[Start, ...]) -> Approach:
+    def _at_start(self, starts: tuple[BiasedStart, ...]) -> Approach:
         car = self.begin(starts)
         return Approach(0, car, torch.zeros(len(starts), 3, dtype=torch.float64, device=self.device), None, ())
 
@@ -304,14 +299,14 @@ class RecordedWorld:
         clean = np.stack([x + course.canvas.x_m, y + course.canvas.y_m], 1)
         return np.concatenate([clean, rolled.path(index)])
 
-    def foretold(
+    def predict(
         self,
         controller: Controller,
         patterns: Pattern,
-        starts: tuple[Start, ...] = (Start(),),
+        starts: tuple[BiasedStart, ...] = (BiasedStart(),),
         looks: Looks | None = None,
         bare: Rolled | None = None,
-    ) -> Foretold:
+    ) -> Predicted:
         """What each pattern of a batch is predicted to do to the path and to the speed, from each start.
 
         Args:
@@ -335,9 +330,9 @@ class RecordedWorld:
                 deviations += [deviation_m(paths[k % len(starts)], self.whole_path(rolled, k)) for k in range(count)]
                 change = rolled.speed_mps - bare.speed_mps.repeat(count // len(starts), 1)
                 changes.append(share * change.mean(1).view(-1, len(starts)))
-        return Foretold(np.array(deviations).reshape(-1, len(starts)), torch.cat(changes).cpu().numpy())
+        return Predicted(np.array(deviations).reshape(-1, len(starts)), torch.cat(changes).cpu().numpy())
 
-    def begin(self, starts: tuple[Start, ...] = (Start(),), repeats: int = 1) -> Motion:
+    def begin(self, starts: tuple[BiasedStart, ...] = (BiasedStart(),), repeats: int = 1) -> Motion:
         """Cars at the first recorded frame of the clean drive, one for each start, repeated `repeats` times."""
         course, first = self.course, self.course.first
         right, turned, faster, _ = self._offsets_of(starts).repeat(repeats, 1).unbind(1)
@@ -352,7 +347,7 @@ class RecordedWorld:
             o + course.steer[max(first - 1, 0)],
         )
 
-    def _offsets_of(self, starts: tuple[Start, ...]) -> Float[Tensor, "s 4"]:
+    def _offsets_of(self, starts: tuple[BiasedStart, ...]) -> Float[Tensor, "s 4"]:
         """The numbers of some starts."""
         rows = tuple((start.right_m, start.turned_rad, start.faster_mps, start.steer) for start in starts)
         return constant(rows, self.course.arclength_m)

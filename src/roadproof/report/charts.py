@@ -186,7 +186,7 @@ def offsets(
     return _finished(figure, axes, "offsets", words, marks=marks)
 
 
-def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
+def predicted_path(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
     """The chosen pattern's predicted path beside the one that was driven."""
     figure, axes = _past_canvas("metres right of the clean path", canvas)
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
@@ -202,7 +202,7 @@ def foretold(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
         f"Where the recorded world said the pattern takes the car, and where it went: deviation "
         f"{prediction.predicted_m:.2f} m predicted, {prediction.driven_m:.2f} m driven"
     )
-    return _finished(figure, axes, "foretold", words, columns=1)
+    return _finished(figure, axes, "predicted-path", words, columns=1)
 
 
 def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], objective: str) -> Chart:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.datatypes import Weather
-from roadproof.driving.evaluation import ATTACK, Row
+from roadproof.driving.evaluation import ATTACK, EvaluationRow
 from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
@@ -19,7 +19,7 @@ from roadproof.io.html import encoded
 from roadproof.report import charts
 from roadproof.report.html import rendered
 from roadproof.report.road_view import on_asphalt
-from roadproof.report.run import Judged, read_run
+from roadproof.report.run import ShownEvaluation, read_run
 from roadproof.report.top_view import top_view
 from roadproof.report.verdict import Verdict, verdict
 
@@ -41,9 +41,9 @@ class Compared:
     """
 
     name: str
-    judged: Judged
+    judged: ShownEvaluation
     verdict: Verdict
-    alone: dict[Weather | None, Row]
+    alone: dict[Weather | None, EvaluationRow]
     change: Estimate | None
 
     @property
@@ -52,7 +52,7 @@ class Compared:
         return self.judged.evaluation.predicted
 
     @property
-    def whole(self) -> Row:
+    def whole(self) -> EvaluationRow:
         """The run's drives in all weathers together; in the one weather, where there is one alone."""
         return self.alone.get(None) or next(iter(self.alone.values()))
 

@@ -32,7 +32,7 @@ FORMAT = "roadproof-report"
 FORMAT_VERSION = 1
 SHOWN_COMPOSITES = 3
 PRINTED_MOMENTS = 6
-FORETOLD = (
+PREDICTION = (
     *("predicted_m", "least_m", "most_m", "driven_m", "error_m", "path_error_m", "gap_m", "gap_rad"),
     *("predicted_mps", "least_mps", "most_mps", "driven_mps"),
 )
@@ -101,14 +101,14 @@ def result_of(run: Run) -> Fields:
     surrogate: Fields = {}
     if run.judged is not None:
         evaluation = run.judged.evaluation
-        content["foreseen" if evaluation.predicted else "closed_loop"] = {
+        content["predicted" if evaluation.predicted else "closed_loop"] = {
             "controller": evaluation.controller,
             "paint": evaluation.paint,
             "trials": [asdict(trial) for trial in evaluation.trials],
             "rows": [asdict(row) for row in evaluation.rows()],
         }
     if run.prediction is not None:
-        content["predicted"] = {name: getattr(run.prediction, name) for name in FORETOLD}
+        content["prediction"] = {name: getattr(run.prediction, name) for name in PREDICTION}
     if run.attack is not None:
         surrogate |= {"shift": run.attack.surrogate_shift}
         content["search"] = {"objective": run.attack.objective, "by_group": run.attack.by_group}
@@ -138,7 +138,7 @@ def _charts(run: Run) -> dict[str, charts.Chart | None]:
         drawn["search"] = charts.search(run.attack.history, tuple(run.attack.by_group), run.attack.objective)
     if run.prediction is not None:
         canvas = run.recordings and run.recordings.canvas
-        drawn["foretold"] = None if canvas is None else charts.foretold(run.prediction, canvas)
+        drawn["predicted_path"] = None if canvas is None else charts.predicted_path(run.prediction, canvas)
     return drawn
 
 

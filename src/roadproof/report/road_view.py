@@ -25,7 +25,7 @@ from roadproof.simulators.protocol import PatternImage
 ASPHALT = (92, 94, 98)
 DPI = 100
 
-Plan = Float[np.ndarray, "n 2"]
+Points = Float[np.ndarray, "n 2"]
 Box = tuple[float, float, float, float]
 """Left, low, right and high edge of what is shown, in metres."""
 
@@ -70,18 +70,18 @@ def plan_of(box: Box, size_in: tuple[float, float], ground: str) -> tuple[Figure
     return figure, axes
 
 
-def around_canvas(canvas: CanvasPlacement) -> Callable[[Plan], Plan]:
+def around_canvas(canvas: CanvasPlacement) -> Callable[[Points], Points]:
     """The function from world x, y to metres right of and ahead of the canvas' middle."""
     c, s = math.cos(canvas.yaw_rad), math.sin(canvas.yaw_rad)
 
-    def around(points: Plan) -> Plan:
+    def around(points: Points) -> Points:
         dx, dy = points[:, 0] - canvas.x_m, points[:, 1] - canvas.y_m
         return np.column_stack([s * dx - c * dy, c * dx + s * dy])
 
     return around
 
 
-def in_world(points: Plan) -> Plan:
+def in_world(points: Points) -> Points:
     """World x, y as they are: a map with north up."""
     return points
 
@@ -94,7 +94,7 @@ def road_of(map_name: str) -> RoadMap | None:
         return None
 
 
-def draw_road(axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: Box, ground: Ground) -> None:
+def draw_road(axes: Axes, road: RoadMap, around: Callable[[Points], Points], box: Box, ground: Ground) -> None:
     """Draw what of a map lies in a box.
 
     Args:
@@ -107,7 +107,7 @@ def draw_road(axes: Axes, road: RoadMap, around: Callable[[Plan], Plan], box: Bo
     left, low, right, high = box
     colours = {"sidewalk": ground.sidewalk, "shoulder": ground.shoulder or ground.asphalt, "driving": ground.asphalt}
 
-    def inside(plan: Plan) -> bool:
+    def inside(plan: Points) -> bool:
         outside = (plan.max(0) < (left, low)) | (plan.min(0) > (right, high))
         return not bool(outside.any())
 

@@ -39,7 +39,7 @@ _STAGES = ("record", "calibration", "attack", "selection", "evaluation")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
-class Judged:
+class ShownEvaluation:
     """An evaluation with what is shown of it.
 
     Args:
@@ -99,7 +99,7 @@ class Run:
     calibration: CalibrationReport | None
     attack: AttackResult | None
     selections: tuple[Selection, ...]
-    judged: Judged | None
+    judged: ShownEvaluation | None
     prediction: Prediction | None
     pattern: Pattern | None
     cost: dict[str, StageCost]
@@ -200,13 +200,13 @@ def _commands(folder: Path) -> tuple[str, ...]:
     return (*stages, shlex.join(["roadproof", "report", str(folder)])) if stages else ()
 
 
-def _judged(folder: Path) -> Judged:
+def _judged(folder: Path) -> ShownEvaluation:
     evaluation = Evaluation.load(folder)
     shown = evaluation.shown()
     alone = evaluation.of(traffic=False)
     pairs = tuple(_driven(folder, trial) for trial in alone)
     fidelity = folder / "fidelity.npz"
-    return Judged(
+    return ShownEvaluation(
         evaluation=evaluation,
         paint=load_paint(folder),
         shown=shown,

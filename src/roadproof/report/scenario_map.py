@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from roadproof.errors import OutputError, ScenarioError
 from roadproof.io.files import write_atomically
 from roadproof.report.plots import show_as_it_is
-from roadproof.report.road_view import DAYLIGHT, Plan, draw_road, in_world, plan_of
+from roadproof.report.road_view import DAYLIGHT, Points, draw_road, in_world, plan_of
 from roadproof.roads.maps import scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
@@ -47,7 +47,7 @@ def draw_scenarios(scenarios: Sequence[Scenario], road_map: RoadMap, path: Path)
         raise OutputError(f"the map cannot be drawn to {path} ({error}); choose another place or a .png") from error
 
 
-def _draw_scenario(axes: Axes, scenario: Scenario, way: Plan, taken: list[tuple[float, float]]) -> None:
+def _draw_scenario(axes: Axes, scenario: Scenario, way: Points, taken: list[tuple[float, float]]) -> None:
     colour, canvas = COLOURS[scenario.kind], scenario.canvas
     axes.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.6, alpha=0.85, zorder=5)
     axes.plot(way[0, 0], way[0, 1], "o", color=colour, markersize=5.5, markeredgecolor="white", zorder=7)

@@ -14,7 +14,7 @@ from roadproof.driving.deviation import passage, path_of
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted
 from roadproof.report.charts import CLEAN, INK, NO_MOMENTS, PAINTED, VARIABLES, WIDTH_IN, Chart, Mark, svg_of
-from roadproof.report.road_view import Ground, Plan, around_canvas, draw_canvas, draw_road, plan_of, road_of
+from roadproof.report.road_view import Ground, Points, around_canvas, draw_canvas, draw_road, plan_of, road_of
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage
 
@@ -77,7 +77,7 @@ def top_view(
     return Chart(svg_of(figure, name, words, marks), words + ". Up is the direction of travel at the canvas.")
 
 
-def _draw_events(axes: Axes, painted: Episode, driven: Plan) -> int:
+def _draw_events(axes: Axes, painted: Episode, driven: Points) -> int:
     events = counted(painted.events)
     for number, event in enumerate(events, 1):
         x, y = driven[int(np.abs(painted.time_s - event.time_s).argmin())]

@@ -24,7 +24,7 @@ class Verdict:
     """What came out of a run.
 
     Args:
-        key: "fails", "deviates", "holds", "unfit", "foreseen", "predicted" or "recorded".
+        key: "fails", "deviates", "holds", "unfit", "predicted" or "recorded".
         title: the verdict in two or three words.
         sentence: the whole finding.
     """
@@ -46,7 +46,7 @@ def verdict(run: Run) -> Verdict:
     """What a run shows; without driving it shows a prediction at most."""
     if run.judged is not None:
         evaluation = run.judged.evaluation
-        return _foreseen(evaluation) if evaluation.predicted else _driven(evaluation)
+        return _predicted_drives(evaluation) if evaluation.predicted else _driven(evaluation)
     if run.attack is not None:
         driven = run.attack.predicted_m is not None or run.attack.predicted_mps is not None
         title = "Predicted, not driven" if driven else "Seen on composited frames, not driven"
@@ -72,14 +72,14 @@ def _predicted(attack: AttackResult) -> str:
     )
 
 
-def _foreseen(evaluation: Evaluation) -> Verdict:
+def _predicted_drives(evaluation: Evaluation) -> Verdict:
     trials = evaluation.of(traffic=False)
     furthest = max(abs(trial.lateral_m) for trial in trials)
     deviation = float(np.mean([trial.deviation_m for trial in trials]))
     left = [trial.ending for trial in trials if trial.ending == Ending.LEFT_RECORDED]
     more = " or more: it leaves what was recorded" if left else ""
     return Verdict(
-        "foreseen",
+        "predicted",
         "Predicted, not driven",
         f"Nothing was driven for real: in pictures made from recorded frames of {evaluation.scenario.name} the pattern "
         f"is predicted to move {evaluation.controller} by up to {furthest:.2f} m{more} (deviation {deviation:.2f} m). "

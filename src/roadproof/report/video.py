@@ -18,7 +18,7 @@ from roadproof.driving.rollout import OnStep
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.video import film_file
 from roadproof.recorded import RecordedSimulator
-from roadproof.report.road_view import DAYLIGHT, DPI, Plan, draw_canvas, draw_road, in_world, pixels_of, plan_of
+from roadproof.report.road_view import DAYLIGHT, DPI, Points, draw_canvas, draw_road, in_world, pixels_of, plan_of
 from roadproof.roads.maps import scenario_route
 from roadproof.roads.polylines import polyline_stations
 from roadproof.roads.roadmap import RoadMap
@@ -39,7 +39,7 @@ EVENT_SHOWN_S = 3.0
 
 INK, PAPER, FAINT = "#202226", "#f6f6f3", "#d0d0cb"
 WAY, CAR, OTHERS, PEOPLE, ALARM = "#286ebe", "#d23c28", "#46484e", "#288c5a", "#be281e"
-NOBODY: Plan = np.zeros((0, 2))
+NOBODY: Points = np.zeros((0, 2))
 
 
 @contextmanager
@@ -74,7 +74,7 @@ def length_m(world: MappedSimulator | RecordedSimulator, scenario: Scenario) -> 
     return float(polyline_stations(_map_of(world, scenario)[1])[-1])
 
 
-def _map_of(world: MappedSimulator | RecordedSimulator, scenario: Scenario) -> tuple[RoadMap | None, Plan]:
+def _map_of(world: MappedSimulator | RecordedSimulator, scenario: Scenario) -> tuple[RoadMap | None, Points]:
     """The roads, where they are known, and world x, y of the way from start to goal."""
     if isinstance(world, RecordedSimulator):
         return None, world.way
@@ -93,7 +93,7 @@ class DriveView:
     """
 
     def __init__(
-        self, *, roads: RoadMap | None, way: Plan, canvas: CanvasPlacement, pattern: PatternImage | None = None
+        self, *, roads: RoadMap | None, way: Points, canvas: CanvasPlacement, pattern: PatternImage | None = None
     ) -> None:
         ground = DAYLIGHT if roads is not None else replace(DAYLIGHT, grass=DAYLIGHT.asphalt)
         self._ground = ground.grass
@@ -111,7 +111,7 @@ class DriveView:
         self._font = ImageFont.load_default(18)
 
     def compose(
-        self, seen: Observation, control: Control, cars: Plan = NOBODY, people: Plan = NOBODY
+        self, seen: Observation, control: Control, cars: Points = NOBODY, people: Points = NOBODY
     ) -> UInt8[np.ndarray, "720 1280 3"]:
         """The image of one observation.
 
@@ -136,7 +136,7 @@ class DriveView:
             pen.text((VIEW[0] + 20, ABOVE_PX + 130 + 24 * i), text, ALARM if fresh else INK, self._font)
         return np.asarray(page)
 
-    def _above(self, seen: Observation, cars: Plan, people: Plan) -> Image.Image:
+    def _above(self, seen: Observation, cars: Points, people: Points) -> Image.Image:
         """The map around the car, north up."""
         state = seen.state
         ((x, y),) = self._pixels([(state.x_m, state.y_m)])

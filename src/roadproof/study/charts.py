@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from roadproof.report.formatting import in_words
-from roadproof.study.history import Course
+from roadproof.study.history import Progress
 from roadproof.study.kept_jobs import KeptJob
 from roadproof.study.results import Block, Results
 from roadproof.study.statistics import mean_over_scenarios
@@ -100,7 +100,7 @@ def _draw_means(axes: Axes, results: Results, block: Block, method: str, place: 
 
 def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
     """Deviation of the best pattern so far against simulator calls and against seconds, driven."""
-    courses: dict[str, dict[str, list[Course]]] = {}
+    courses: dict[str, dict[str, list[Progress]]] = {}
     for job in jobs:
         course = job.deviation() if job.id.method in results.compared else None
         if course is not None:

@@ -12,7 +12,7 @@ from roadproof.io.records import RecordFile
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Course:
+class Progress:
     """A value as a search went on: three lists of equal length.
 
     Args:
@@ -31,7 +31,7 @@ class Course:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class History(Course):
+class History(Progress):
     """The course of a search in its own measure, and what is known of it in metres.
 
     Args:
@@ -46,14 +46,14 @@ class History(Course):
     kind: Literal["closed loop", "predicted", "surrogate"]
     measure: str = ""
     deviation_m: tuple[float, ...] | None = None
-    driven: Course | None = None
+    driven: Progress | None = None
 
     @property
-    def deviation(self) -> Course | None:
+    def deviation(self) -> Progress | None:
         """The metres that the best patterns reached when driven, never a stand-in for them; None where unknown."""
         if self.kind != "closed loop":
             return self.driven if self.driven is not None and self.driven.best else None
-        return Course(calls=self.calls, seconds=self.seconds, best=self.deviation_m) if self.deviation_m else None
+        return Progress(calls=self.calls, seconds=self.seconds, best=self.deviation_m) if self.deviation_m else None
 
     def to_json(self) -> bytes:
         """The content of history.json."""

@@ -29,7 +29,7 @@ from roadproof.roads.marks import site_at
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.history import Course, History
+from roadproof.study.history import History, Progress
 from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
 from roadproof.study.passages import passages
 from roadproof.study.plan import BLACK, Job
@@ -115,9 +115,9 @@ def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: P
         seconds=tuple((sum(cost.seconds for cost in before) + steps).tolist()),
         best=tuple(np.maximum.accumulate(strongest).tolist()),
         measure=found.attack.objective,
-        driven=Course(calls=(), seconds=(), best=())
+        driven=Progress(calls=(), seconds=(), best=())
         if chosen is None
-        else Course(calls=(calls,), seconds=(seconds,), best=(chosen.deviation_m,)),
+        else Progress(calls=(calls,), seconds=(seconds,), best=(chosen.deviation_m,)),
     )
     site = site_of(load_recordings(folder / "recordings"))
     return _Found(found.pattern, calls, seconds, found.cost["evaluate"].seconds, history, _said(job, site))

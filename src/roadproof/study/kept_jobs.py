@@ -16,7 +16,7 @@ from roadproof.io.arrays import read_archive
 from roadproof.io.files import inside
 from roadproof.io.pictures import read_picture
 from roadproof.patterns import Pattern, load_pattern
-from roadproof.study.history import Course, read_history
+from roadproof.study.history import Progress, read_history
 from roadproof.study.passages import file_of
 from roadproof.study.rows import Frame, JobId
 
@@ -108,7 +108,7 @@ class KeptJob(_Stated):
             return None
         return read_picture(path, StudyError, _AGAIN)
 
-    def deviation(self) -> Course | None:
+    def deviation(self) -> Progress | None:
         """The metres that the search's best patterns reached when driven; None where the job kept none.
 
         Raises:
