@@ -14,7 +14,7 @@ from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario, load
 
 START = VehicleState(1.5, -2.0, 0.0, 0.25, 3.0)
 SCENARIO = Scenario(
-    name="odd (name), ü",
+    name="odd (name), ü 𠮷",
     kind="left",
     map_name="town",
     start=START,

@@ -156,12 +156,16 @@ def _block(scenario: Scenario, folder: Path) -> str:
             raise ScenarioError(f"scenario {scenario.name}: its map {map_name} is not in {folder}; copy it there first")
         map_name = Path(map_name).name
     lines = ["[[scenario]]"]
-    # JSON's strings, escaped to ASCII, are TOML's.
-    lines += [f"{key} = {json.dumps(value)}" for key, value in (("name", scenario.name), ("kind", scenario.kind))]
-    lines += [f"map_name = {json.dumps(map_name)}", f"start = {_table(asdict(scenario.start))}"]
+    lines += [f"{key} = {_string(value)}" for key, value in (("name", scenario.name), ("kind", scenario.kind))]
+    lines += [f"map_name = {_string(map_name)}", f"start = {_table(asdict(scenario.start))}"]
     lines += [f"goal_m = [{float(scenario.goal_m[0])!r}, {float(scenario.goal_m[1])!r}]"]
     lines += [f"canvas = {_table(asdict(scenario.canvas))}", f"time_limit_s = {float(scenario.time_limit_s)!r}"]
     return "\n".join(lines) + "\n"
+
+
+def _string(text: str) -> str:
+    """A string of TOML: as JSON has it, but for the control character that JSON leaves as it is."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _table(values: Mapping[str, float]) -> str:

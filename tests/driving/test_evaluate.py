@@ -114,10 +114,12 @@ def test_rows_average_the_trials_and_lose_none(done):
     ]
     for row in rows:
         trials = evaluation.of(row.pattern, traffic=row.traffic, weather=row.weather)
-        assert row.points.count == len(trials)
+        assert row.count == len(trials)
+        runs = {(trial.pattern, trial.seed, trial.start) for trial in trials}
+        assert row.points.count == len(runs), "the same run in two weathers is one run"
         assert row.deviation_m.value == pytest.approx(np.mean([trial.deviation_m for trial in trials]))
         assert row.failed == pytest.approx(np.mean([trial.first_event_s is not None for trial in trials]))
-        single = len(trials) == 1 or (row.pattern == "attack" and not row.traffic)
+        single = len(runs) == 1 or (row.pattern == "attack" and not row.traffic)
         assert (row.deviation_m.high is None) == single, "weathers are no sample"
 
 
@@ -211,6 +213,17 @@ def test_conditions_that_make_no_sense_are_refused(town, street, tmp_path, messa
     with pytest.raises(EpisodeError, match=message):
         evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, **MISTAKES[message])
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_drive_is_told_of_once_however_often_it_is_asked_for(town, street, tmp_path):
+    with pytest.raises(EpisodeError, match="weathers has clear-noon twice"):
+        evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, weathers=(WEATHERS[0], WEATHERS[0]))
+    with pytest.raises(EpisodeError, match="the seed is -1, expected 0 or more"):
+        evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, seed=-1)
+    nowhere = StartRange(right_m=0.0, turned_rad=0.0, faster_mps=0.0)
+    options = {"weathers": WEATHERS[:1], "starts": 3, "start_range": nowhere, "runs": 0}
+    told = evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, **options)
+    assert (len(told.trials), told.simulator_calls, told.rows()[0].deviation_m.low) == (1, 2, None)
 
 
 def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, street, tmp_path):

@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from roadproof.datatypes import Event, EventKind
+from roadproof.datatypes import Event, EventKind, Weather
 from roadproof.driving import deviation, infractions, intervals
+from roadproof.driving.starts import StartOffset
+from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline import fidelity
@@ -226,3 +228,45 @@ def test_composites_and_renders_are_compared_in_the_paint_and_outside_it():
             composited_steer=np.zeros(2),
             rendered_steer=np.zeros(2),
         )
+
+
+def test_beyond_the_end_of_a_drive_that_ended_early_nothing_is_beside_it():
+    # A right angle; the clean drive was blocked five metres before it.
+    corner = np.concatenate([line(), np.column_stack([np.full(60, 40.0), 0.5 * np.arange(1, 61)])])
+    blocked = corner[:70]
+    assert deviation.furthest_beside_m(blocked, corner, ended_early=True) == pytest.approx(0.0, abs=1e-9)
+    assert deviation.furthest_beside_m(blocked, corner, ended_early=False) == pytest.approx(30.0)
+    aside = corner + np.array([0.0, -1.5])
+    assert deviation.furthest_beside_m(blocked, aside, ended_early=True) == pytest.approx(-1.5)
+
+
+def test_a_drive_that_is_late_by_seconds_deviates_by_what_it_did_not_reach():
+    # At half a metre an instant it stands behind for 8 of the 81 instants.
+    late = np.concatenate([np.tile(line()[:1], (8, 1)), line()[:-8]])
+    assert deviation.deviation_m(line(), late) == pytest.approx(sum(0.5 * k for k in range(1, 9)) / (2 * 81))
+
+
+def trial(start, weather, deviation_m):
+    return Trial(
+        pattern="attack",
+        weather=weather,
+        traffic=False,
+        seed=0,
+        clean="",
+        painted="",
+        deviation_m=deviation_m,
+        lateral_m=0.0,
+        points=None,
+        clean_points=None,
+        leaderboard=None,
+        clean_leaderboard=None,
+        first_event_s=None,
+        clean_first_event_s=None,
+        ending="goal reached",
+        start=StartOffset(right_m=start),
+    )
+
+
+def test_the_same_starts_in_several_weathers_are_no_more_runs_than_in_one():
+    drives = [trial(start, weather, start) for weather in Weather for start in (0.1, 0.2, 0.3)]
+    assert runs_of(drives, lambda each: each.deviation_m) == pytest.approx([0.1, 0.2, 0.3])

@@ -174,9 +174,25 @@ def test_values_are_told_without_the_place_in_memory_or_on_disk() -> None:
 def test_ours_and_what_has_no_source_are_known_by_name() -> None:
     name = {"function": "roadproof.training.expert:expert"}
     assert known_by(expert) == name
-    typed: dict[str, Any] = {"__name__": "typed"}
-    exec("def drive(world): return 1.0", typed)
-    assert known_by(typed["drive"]) == {"function": "typed:drive"}
+
+
+def test_what_is_typed_at_a_prompt_is_known_by_its_code() -> None:
+    known: list[Any] = []
+    for gain in (1.0, 1.0, 2.0):
+        typed: dict[str, Any] = {"__name__": "typed"}
+        exec(f"def drive(world): return [{gain} for _ in 'a']", typed)
+        known.append(known_by(typed["drive"]))
+    assert known[0] == known[1] != known[2]
+
+
+def test_a_dict_or_list_around_a_function_counts_as_it_was_at_first(tmp_path: Path) -> None:
+    source = "SETTINGS = {'gain': 1.0}\nSEEN = []\ndef drive(x):\n    SEEN.append(x)\n    return SETTINGS['gain']"
+    module = loaded(tmp_path, source)
+    known = known_by(module.drive)
+    module.drive(1.0)
+    assert known_by(module.drive) == known, "a memory of its calls does not count"
+    assert known_by(loaded(tmp_path, source).drive) == known
+    assert known_by(loaded(tmp_path, source.replace("1.0}", "2.0}")).drive) != known
 
 
 def test_another_process_knows_the_same(own: Callable[..., Any], tmp_path: Path) -> None:

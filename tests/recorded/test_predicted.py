@@ -134,6 +134,16 @@ def test_a_selection_in_recordings_is_called_predicted(recordings, tmp_path):
     assert Selection.load(tmp_path).predicted
 
 
+def test_drawn_starts_are_beside_the_recorded_one_wherever_the_scenario_begins(recordings, tmp_path):
+    with RecordedSimulator(recordings) as world:
+        start = dataclasses.replace(world.scenario.start, x_m=world.scenario.start.x_m - 40.0)
+        before = dataclasses.replace(world.scenario, start=start)
+        options = {"weathers": (Weather.CLEAR_NOON,), "starts": 2, "runs": 0}
+        told = evaluate(world, PaintShy(), before, BAR, folder=tmp_path, **options)
+    assert len({trial.lateral_m for trial in told.trials}) == 2
+    assert told.scenario.start == world.scenario.start
+
+
 def test_the_speed_predicted_in_a_batch_is_that_of_a_drive_step_by_step(recordings):
     with RecordedSimulator(recordings) as simulator:
         scenario = briefly(simulator)

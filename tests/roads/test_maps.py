@@ -11,7 +11,7 @@ import pytest
 
 from roadproof.datatypes import Command
 from roadproof.errors import ScenarioError
-from roadproof.roads.maps import canvas_points, load_map, scenario_route
+from roadproof.roads.maps import builtin_map_file, canvas_points, load_map, scenario_route
 from roadproof.scenarios import BUILTIN_FILE, Scenario, builtin_scenarios, find_scenario, load_scenarios, save_scenarios
 
 SCENARIOS = builtin_scenarios()
@@ -88,6 +88,15 @@ def test_scenarios_that_do_not_fit_are_refused() -> None:
         with pytest.raises(ScenarioError, match=said) as error:
             scenario_route(dataclasses.replace(good, **changes), road_map)
         assert "\n" not in str(error.value)
+
+
+def test_a_map_that_is_edited_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "map.xodr"
+    path.write_text(builtin_map_file("town").read_text())
+    first = load_map(str(path))
+    assert load_map(str(path)) is first
+    path.write_text(builtin_map_file("second").read_text())
+    assert len(load_map(str(path)).lanes) != len(first.lanes)
 
 
 def test_unknown_maps_are_refused() -> None:

@@ -133,9 +133,14 @@ def test_files_that_are_not_maps_are_refused(tmp_path: Path) -> None:
         ("<OpenDRIVE>", "not well-formed"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><OpenDRIVE/>', "entities"),
         ("<OpenDRIVE/>", "no <road>"),
+        ('<?xml version="1.0" encoding="foo"?><OpenDRIVE/>', "unknown encoding: foo"),
+        ('<?xml version="1.0" encoding="big5"?><OpenDRIVE/>', "multi-byte"),
     ]:
         path.write_text(text)
         with pytest.raises(ScenarioError, match=said):
             read_opendrive(path)
+    path.write_bytes('<!DOCTYPE x [<!ENTITY a "b">]><OpenDRIVE/>'.encode("utf-16"))
+    with pytest.raises(ScenarioError, match="expected UTF-8"):
+        read_opendrive(path)
     with pytest.raises(ScenarioError, match="cannot be read"):
         read_opendrive(tmp_path / "missing.xodr")

@@ -261,6 +261,21 @@ def test_a_road_goes_on_into_the_next(tmp_path: Path) -> None:
     assert back_home.length_m == pytest.approx(70.0)
 
 
+def test_a_start_before_the_beginning_of_a_road_is_refused(tmp_path: Path) -> None:
+    road_map = loaded(tmp_path, street(1, 0.0))
+    with pytest.raises(ScenarioError, match=r"start .* is not along a driving lane \(the nearest is 20.0 m away"):
+        road_map.route(VehicleState(-20.0, -1.75, 0.0, 0.0, 0.0), (30.0, -1.75))
+
+
+def test_on_a_slope_arc_lengths_go_along_it(tmp_path: Path) -> None:
+    hill = '<elevationProfile><elevation s="0" a="0" b="0.2" c="0" d="0"/></elevationProfile>'
+    road_map = loaded(tmp_path, street(1, 0.0).replace("<planView>", f"{hill}<planView>"))
+    place = road_map.nearest_lane(30.0, -1.75, 0.0)
+    assert road_map.lanes[place.lane].at(place.arclength_m)[:3] == pytest.approx((30.0, -1.75, 6.0))
+    route = road_map.route(VehicleState(5.0, -1.75, 1.0, 0.0, 0.0), (30.0, -1.75))
+    assert route.points[-1, :2] == pytest.approx((30.0, -1.75))
+
+
 def test_a_goal_no_way_leads_to_is_refused(tmp_path: Path) -> None:
     road_map = loaded(tmp_path, street(1, 0.0), street(2, 60.0))
     with pytest.raises(ScenarioError, match=r"no way leads from lane -1 of road 1 .* to lane -1 of road 2"):

@@ -42,8 +42,9 @@ class World:
         Raises:
             RoadproofError: the simulator is not there, or the recordings say too little to drive in.
         """  # noqa: D205
-        from roadproof.drives.worlds import begun_in, open_world
+        from roadproof.drives.worlds import open_world
         from roadproof.recorded import RecordedSimulator
+        from roadproof.simulators.protocol import begun_in
 
         with open_world(self.spec, self.device) as world:
             if self.scenario is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.datatypes import Weather
@@ -13,7 +13,6 @@ from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.recordings import load_recordings
 from roadproof.scenarios import Scenario
 from roadproof.simulators.loading import RECORDED, MappedSimulator, open_simulator
-from roadproof.simulators.protocol import Simulator
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +67,3 @@ def open_world(spec: str, device: str = "cpu") -> AbstractContextManager[MappedS
     if inside is None:
         return open_simulator(spec)
     return RecordedSimulator(load_recordings(inside.folder), weather=inside.weather, device=device)
-
-
-def begun_in(world: Simulator, scenario: Scenario) -> Scenario:
-    """The scenario as it is driven in an open world: in recordings it begins where they do."""
-    return replace(scenario, start=world.scenario.start) if isinstance(world, RecordedSimulator) else scenario

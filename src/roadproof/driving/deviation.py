@@ -25,6 +25,10 @@ LEAVES_LANE_M = 0.8
 1.9 m."""
 
 
+PAST_END_M = 2.0
+"""So far beyond the end of a drive that ended early its path still says where it would have gone."""
+
+
 def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZON_M) -> slice:
     """The instants at which a clean drive has the canvas in view: from `horizon_m` before it to its end.
 
@@ -52,9 +56,10 @@ def deviation_m(clean: Path2D, painted: Float[np.ndarray, "m 2"]) -> float:
         Deviation = 1/(2T) ∑_{t=1}^{T} [ min_{t'} |W̃_t − W_{t'}| + min_{t'} |W_t − W̃_{t'}| ]
 
     with W the positions without and W̃ those with the pattern, at the instants when the canvas is in view (`passage`).
-    Each position is compared with the *nearest position* of the other drive, at whatever time, in both directions; so
-    the measure is symmetric, does not mind a delay along the same path, and is 0 for equal drives. Where one drive
-    ended before all instants had passed, each direction is the mean over the positions there are.
+    Each position is compared with the *nearest position* of the other drive, at whatever of these instants, in both
+    directions; so the measure is symmetric, is 0 for equal drives, and minds a small delay along the same path little.
+    A drive that is seconds late, or stands, deviates too: what it did not reach by then is as far away as it is. Where
+    one drive ended before all instants had passed, each direction is the mean over the positions there are.
 
     Args:
         clean: positions of the drive without the pattern: world x, y, metres, (n, 2).
@@ -84,6 +89,31 @@ def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[n
     Raises:
         EpisodeError: a path is empty or not finite, or the reference does not move.
     """
+    return _beside(reference, positions)[0]
+
+
+def furthest_beside_m(clean: Path2D, painted: Float[np.ndarray, "m 2"], *, ended_early: bool) -> float:
+    """The largest signed distance of a drive beside another's path, left positive, metres.
+
+    Args:
+        clean: path of the drive without paint, (n, 2).
+        painted: positions of the drive with paint, (m, 2).
+        ended_early: whether nobody knows where the clean drive would have gone on; positions from the first one that is
+            more than `PAST_END_M` beyond its end are then left out.
+
+    Raises:
+        EpisodeError: a path is empty or not finite, or the clean one does not move.
+    """
+    beside, past_end_m = _beside(clean, painted)
+    past = np.flatnonzero(past_end_m > PAST_END_M)
+    known = beside[: max(int(past[0]), 1)] if ended_early and len(past) else beside
+    return float(known[np.abs(known).argmax()])
+
+
+def _beside(
+    reference: Path2D, positions: Float[np.ndarray, "m 2"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """What `lateral_m` gives, and how far beyond the path's end each position is, metres; below 0 before it."""
     _check_path(reference, "reference")
     _check_path(positions, "compared")
     step = np.diff(reference, axis=0)
@@ -102,7 +132,8 @@ def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[n
     rows = np.arange(len(positions))
     x, y = away[rows, nearest].T
     left = ahead[nearest, 0] * y - ahead[nearest, 1] * x >= 0
-    return np.hypot(*gap[rows, nearest].T) * np.where(left, 1.0, -1.0)
+    past_end_m = np.where(nearest == len(length) - 1, along[:, -1] - length[-1], -np.inf)
+    return np.hypot(*gap[rows, nearest].T) * np.where(left, 1.0, -1.0), past_end_m
 
 
 def _check_path(path: np.ndarray, name: str) -> None:

@@ -17,11 +17,12 @@ from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
+from roadproof.io.tables import each_once
 from roadproof.patterns import Pattern, raster
 from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory
+from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory, begun_in
 
 PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 
@@ -83,7 +84,9 @@ def evaluate(
             f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "
             f"{processes} processes; expected at least one weather and process, and nothing below 0"
         )
-    begins = start_range.draw(starts, seed) if starts else (NOMINAL,)
+    each_once(weathers, "weathers", EpisodeError)
+    # A range of nothing draws one start again and again.
+    begins = tuple(dict.fromkeys(start_range.draw(starts, seed))) if starts else (NOMINAL,)
     if runs and not cars + pedestrians:
         raise EpisodeError(f"{runs} runs with traffic but no cars and no pedestrians; ask for some, or for 0 runs")
     if processes > 1 and not callable(simulator):
@@ -94,6 +97,7 @@ def evaluate(
     started = time.perf_counter()
     with ExitStack() as stack:
         world = stack.enter_context(simulator()) if callable(simulator) else simulator
+        scenario = begun_in(world, scenario)
         episodes = Episodes.of(world, driver, scenario, paints, folder)
         planned = _planned(list(paints), weathers, begins, runs, cars, pedestrians, seed)
         drives = list(dict.fromkeys(drive for pair in planned for drive in pair))

@@ -24,7 +24,7 @@ from PIL import Image
 from roadproof.datatypes import Weather
 from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
-from roadproof.driving.trial import Trial
+from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.html import table
@@ -47,7 +47,7 @@ _UNITS = {
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class EvaluationRow:
-    """Means over the trials of one pattern kind, weather and traffic.
+    """Means over the trials of one pattern kind, weather and traffic; their intervals are over starts and seeds.
 
     Args:
         pattern: "attack" or "random".
@@ -228,34 +228,32 @@ def _row(pattern: str, weather: Weather | None, traffic: bool, trials: tuple[Tri
     drawn = traffic or pattern != ATTACK or any(trial.start != NOMINAL for trial in trials)
     deviations = [trial.deviation_m for trial in trials]
 
-    def mean(values: Sequence[float]) -> Estimate:
-        found = mean_95(values)
+    def mean(value: Callable[[Trial], float], of: Sequence[Trial] = trials) -> Estimate:
+        found = mean_95(runs_of(of, value))
         return found if drawn else replace(found, low=None, high=None)
 
     def known(value: Callable[[Trial], float | None]) -> Estimate | None:
-        values = [value(trial) for trial in trials]
-        told = [each for each in values if each is not None]
-        return mean(told) if len(told) == len(values) else None
+        return None if any(value(trial) is None for trial in trials) else mean(lambda trial: value(trial) or 0.0)
 
     points = known(lambda trial: trial.points)
-    first = [trial.first_event_s for trial in trials if trial.first_event_s is not None]
+    failing = [trial for trial in trials if trial.first_event_s is not None]
     return EvaluationRow(
         pattern=pattern,
         weather=weather,
         traffic=traffic,
         count=len(trials),
-        deviation_m=mean(deviations),
+        deviation_m=mean(lambda trial: trial.deviation_m),
         median_m=float(np.median(deviations)),
         least_m=min(deviations),
         most_m=max(deviations),
         left_lane=sum(trial.leaves_lane for trial in trials) / len(trials),
-        lateral_m=mean([abs(trial.lateral_m) for trial in trials]),
+        lateral_m=mean(lambda trial: abs(trial.lateral_m)),
         speed_change_mps=known(lambda trial: trial.speed_change_mps),
         points=points,
         clean_points=known(lambda trial: trial.clean_points),
         leaderboard=known(lambda trial: trial.leaderboard),
-        failed=None if points is None else len(first) / len(trials),
-        first_event_s=mean_95(first) if first else None,
+        failed=None if points is None else len(failing) / len(trials),
+        first_event_s=mean(lambda trial: trial.first_event_s or 0.0, failing) if failing else None,
     )
 
 

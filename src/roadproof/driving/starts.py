@@ -68,7 +68,13 @@ class StartRange:
                 raise EpisodeError(f"{name} of the starts is {value}, expected 0 to {most:g}")
 
     def draw(self, count: int, seed: int) -> tuple[StartOffset, ...]:
-        """Draw `count` starts; the same for the same seed."""
+        """Draw `count` starts; the same for the same seed.
+
+        Raises:
+            EpisodeError: the seed is below 0.
+        """
+        if seed < 0:
+            raise EpisodeError(f"the seed is {seed}, expected 0 or more")
         low, high = np.array([-self.right_m, -self.turned_rad, 0.0]), np.array(list(asdict(self).values()))
         drawn = np.random.default_rng((seed, 0x57A27)).uniform(low, high, (count, 3)).round(4)
         return tuple(StartOffset(right_m=r, turned_rad=t, faster_mps=f) for r, t, f in drawn.tolist())

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from statistics import fmean
 
-import numpy as np
-
-from roadproof.datatypes import Event, Weather
-from roadproof.driving.deviation import LEAVES_LANE_M, lateral_m, passage_deviation_m, path_of
+from roadproof.datatypes import Ending, Event, Weather
+from roadproof.driving.deviation import LEAVES_LANE_M, furthest_beside_m, passage_deviation_m, path_of
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
 from roadproof.driving.speed import speed_difference
@@ -71,13 +71,17 @@ class Trial:
 
     @property
     def leaves_lane(self) -> bool:
-        """Whether part of the car gets over its lane's edge, or it commits more infractions than without paint."""
+        """Whether part of the car gets over its lane's edge, or its infractions cost more than those without paint."""
         return abs(self.lateral_m) >= LEAVES_LANE_M or (self.points or 0.0) > (self.clean_points or 0.0)
 
     def __post_init__(self) -> None:
         for name in filter(None, (self.clean, self.painted)):  # drives that were not kept have none
             if not check_name(name, "episode", EpisodeError).endswith(".npz"):
                 raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
+
+
+_EARLY = (Ending.TIME_LIMIT, Ending.OFF_ROUTE, Ending.STANDS, Ending.BLOCKED)
+"""Endings of a clean drive beyond whose last position nobody knows where it would have gone."""
 
 
 def judge(
@@ -93,9 +97,9 @@ def judge(
     """The trial of two drives that differ in the paint alone.
 
     Deviation and change of the speed are taken over the instants at which the clean drive has the canvas in view, the
-    largest offset over the whole painted drive.
+    largest offset over the whole painted drive; where the clean drive ended early, only as far as that got.
     """
-    beside = lateral_m(path_of(clean), path_of(painted))
+    furthest_m = furthest_beside_m(path_of(clean), path_of(painted), ended_early=clean.ending in _EARLY)
     faster = speed_difference(clean, painted, canvas)
     known = not painted.paint.predicted
     return Trial(
@@ -106,7 +110,7 @@ def judge(
         clean=clean_file,
         painted=painted_file,
         deviation_m=passage_deviation_m(clean, painted, canvas),
-        lateral_m=float(beside[np.abs(beside).argmax()]),
+        lateral_m=furthest_m,
         points=infraction_points(painted.events) if known else None,
         clean_points=infraction_points(clean.events) if known else None,
         leaderboard=leaderboard_factor(painted.events) if known else None,
@@ -120,3 +124,14 @@ def judge(
         speed_change_mps=faster.mean_mps,
         most_speed_change_mps=faster.most_mps,
     )
+
+
+def runs_of(trials: Iterable[Trial], value: Callable[[Trial], float]) -> list[float]:
+    """A number of independent runs: of each pattern, start and seed the mean over the weathers.
+
+    The same starts and seeds are driven in every weather, so that drives in several weathers are not independent.
+    """
+    runs: dict[tuple[object, ...], list[float]] = {}
+    for trial in trials:
+        runs.setdefault((trial.pattern, trial.traffic, trial.seed, trial.start), []).append(value(trial))
+    return list(map(fmean, runs.values()))

@@ -26,7 +26,6 @@ from roadproof.attacks.objective import varied
 from roadproof.controllers import Controller
 from roadproof.controllers.checks import require_usable
 from roadproof.controllers.identity import identity_of
-from roadproof.drives.worlds import begun_in
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.starts import NOMINAL
 from roadproof.errors import CheckError
@@ -48,7 +47,7 @@ from roadproof.recorded.simulator import RecordedSimulator
 from roadproof.roads.marks import site_at
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import Simulator
+from roadproof.simulators.protocol import Simulator, begun_in
 
 OUTPUTS = (FILE, "junit.xml", "summary.md", WORST)
 

@@ -19,8 +19,8 @@ import numpy as np
 from roadproof.io.identity import digest, stated
 
 _DEEPEST = 8
-_CHANGING = (list, dict, set, bytearray, ModuleType)
-"""What a function's surroundings may hold as a memory of its calls."""
+_CHANGING = (list, dict, set, bytearray)
+"""What a function's surroundings may hold as a memory of its calls: it is told as it was when first asked for."""
 _NOT_THE_USERS = sys.stdlib_module_names | {"torch", "numpy", __name__.partition(".")[0]}
 
 
@@ -40,7 +40,8 @@ def known_by(thing: object) -> Any:  # noqa: ANN401
     """What tells a value, an object or a function from others, in any process: as JSON has it.
 
     A function is known by its name and source, and by what it was given: defaults, the arguments of a partial one, and
-    what it uses of the user's modules and of its closure, but no lists or dicts, which may grow as it is called. An
+    what it uses of the user's modules and of its closure; lists, dicts and sets, which may grow as it is called, count
+    as they were when this process was first asked. An
     object is known by its class with its source, and by what its constructor takes, where it keeps that under the same
     name; a dataclass by its fields; a network by its weights too. Roadproof's own functions and classes have no source
     here: their version and their answers tell. A path tells nothing, as a folder may be moved.
@@ -117,11 +118,24 @@ def _uses(function: FunctionType, within: _Within, around: Mapping[str, object])
             continue
     told: dict[str, Any] = {}
     for name, value in sorted(found.items()):
-        if name in written or name.startswith("__") or isinstance(value, _CHANGING):
+        if name in written or name.startswith("__") or isinstance(value, ModuleType):
+            continue
+        if isinstance(value, _CHANGING):
+            told[name] = _as_first_seen(cast("object", value), within)
             continue
         foreign = isinstance(value, FunctionType | type) and not _is_the_users(value.__module__)
         told[name] = _name(cast("type", value)) if foreign else _known(value, within)
     return told
+
+
+_first_seen: dict[int, tuple[object, Any]] = {}
+
+
+def _as_first_seen(value: object, within: _Within) -> Any:  # noqa: ANN401
+    """What was known of a list or dict when it was first asked for; it is kept, so that its id stays its own."""
+    if id(value) not in _first_seen:
+        _first_seen[id(value)] = (value, _known(value, within))
+    return _first_seen[id(value)][1]
 
 
 def _names(code: CodeType) -> tuple[set[str], set[str]]:
@@ -233,8 +247,14 @@ def _is_ours(thing: FunctionType | type) -> bool:
 
 @cache
 def _source(thing: FunctionType | type) -> str:
-    """The digest of a source as it was when it was first asked for; empty where there is none, as at a prompt."""
+    """The digest of a source as it was when it was first asked for; where a function has none, that of its code."""
     try:
         return digest(inspect.getsource(thing))[:16]
     except (OSError, TypeError):
-        return ""
+        return digest(stated(_compiled(thing.__code__)))[:16] if isinstance(thing, FunctionType) else ""
+
+
+def _compiled(code: CodeType) -> list[Any]:
+    """What a function does, where only its code is there."""
+    held = [_compiled(each) if isinstance(each, CodeType) else known_by(each) for each in code.co_consts]
+    return [code.co_code.hex(), list(code.co_names), held]

@@ -12,7 +12,7 @@ from pathlib import Path
 from roadproof.datatypes import Weather
 from roadproof.driving.evaluation import ATTACK, EvaluationRow
 from roadproof.driving.intervals import Estimate, mean_95
-from roadproof.driving.trial import Trial
+from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path, write_text
 from roadproof.io.html import encoded
@@ -137,7 +137,7 @@ def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Estimate | None:
     """The mean change of the deviation over drives that have all but pattern and controller in common."""
     known = {_conditions(trial): trial.deviation_m for trial in before}
     shared = [trial for trial in after if _conditions(trial) in known]
-    return mean_95([trial.deviation_m - known[_conditions(trial)] for trial in shared]) if shared else None
+    return mean_95(runs_of(shared, lambda trial: trial.deviation_m - known[_conditions(trial)])) if shared else None
 
 
 def _conditions(trial: Trial) -> tuple[object, ...]:

@@ -12,6 +12,7 @@ from roadproof.datatypes import Ending
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.intervals import mean_95
 from roadproof.driving.speed import speed_in_words
+from roadproof.driving.trial import runs_of
 from roadproof.report.formatting import UNKNOWN, in_words, mean_in_words
 from roadproof.report.run import Run
 
@@ -93,8 +94,8 @@ def _driven(evaluation: Evaluation) -> Verdict:
     left = sum(trial.leaves_lane for trial in trials)
     furthest = max(abs(trial.lateral_m) for trial in trials)
     who, where, n = evaluation.controller, evaluation.scenario.name, len(trials)
-    points = mean_in_words(mean_95([trial.points or 0.0 for trial in trials]), 1)
-    before = mean_in_words(mean_95([trial.clean_points or 0.0 for trial in trials]), 1)
+    points = mean_in_words(mean_95(runs_of(trials, lambda trial: trial.points or 0.0)), 1)
+    before = mean_in_words(mean_95(runs_of(trials, lambda trial: trial.clean_points or 0.0)), 1)
     if all(trial.clean_points for trial in alone):
         return Verdict(
             "unfit",
@@ -115,15 +116,15 @@ def _driven(evaluation: Evaluation) -> Verdict:
         return Verdict(
             "deviates",
             "Deviates, no infraction",
-            f"The pattern moves {who} by up to {furthest:.1f} m on {where}, but no drive of {n} has more infractions "
-            "than on the bare road.",
+            f"The pattern moves {who} by up to {furthest:.1f} m on {where}, but no drive of {n} costs more penalty "
+            "points than on the bare road.",
         )
     deviation = float(np.mean([trial.deviation_m for trial in alone]))
     return Verdict(
         "holds",
         "Holds its lane",
         f"{who} keeps its path on {where}: at most {furthest:.2f} m aside (deviation {deviation:.2f} m), and in none "
-        f"of {n} drives more infractions than on the bare road.",
+        f"of {n} drives more penalty points than on the bare road.",
     )
 
 

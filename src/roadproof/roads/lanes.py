@@ -75,6 +75,11 @@ class Lane:
         """Its largest width."""
         return float(np.linalg.norm(self.left - self.right, axis=1).max())
 
+    def width_at(self, station_m: float) -> float:
+        """Width at a station, metres."""
+        across = interpolated(station_m, self.stations_m, self.left - self.right)
+        return float(np.linalg.norm(across[:2]))
+
     def at(self, station_m: float) -> tuple[float, float, float, float]:
         """(x, y, z, heading) of its centre at an arc length, held at both ends."""
         x, y, z = interpolated(station_m, self.stations_m, self.centre).tolist()

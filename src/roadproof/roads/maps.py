@@ -21,19 +21,26 @@ BUILTIN_MAPS = ("town", "second")
 CANVAS_NEAR_ROUTE_M = 4.0
 
 
-@lru_cache(maxsize=4)
 def load_map(name: str) -> RoadMap:
-    """A built-in map by name, or an OpenDRIVE file by path; kept, so that the next call is free.
+    """A built-in map by name, or an OpenDRIVE file by path; kept until the file changes, so that the next call is free.
 
     Raises:
         ScenarioError: there is no such map, or it cannot be read.
     """
-    if name in BUILTIN_MAPS:
-        return RoadMap.from_opendrive(builtin_map_file(name))
-    if not name.endswith(".xodr"):
+    if name not in BUILTIN_MAPS and not name.endswith(".xodr"):
         known = ", ".join(BUILTIN_MAPS)
         raise ScenarioError(f"the town simulator has no map {name!r}, expected {known} or the path of an .xodr file")
-    return RoadMap.from_opendrive(Path(name))
+    file = builtin_map_file(name) if name in BUILTIN_MAPS else Path(name)
+    try:
+        found = file.stat()
+    except (OSError, ValueError):  # what is wrong with it is told where it is read
+        return RoadMap.from_opendrive(file)
+    return _as_it_is(file.absolute(), found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=4)
+def _as_it_is(file: Path, _changed_ns: int, _size: int) -> RoadMap:
+    return RoadMap.from_opendrive(file)
 
 
 def builtin_map_file(name: str) -> Path:

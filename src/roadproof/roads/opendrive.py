@@ -49,10 +49,12 @@ def read_opendrive(path: Path) -> OpenDrive:
         text = path.read_bytes()
         if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
             raise ScenarioError(f"map {path} declares XML entities, expected plain OpenDRIVE")
+        if b"\0" in text:
+            raise ScenarioError(f"map {path} has two or more bytes a letter, expected UTF-8; save it so")
         root = ET.fromstring(text)  # noqa: S314  entities are refused above
     except OSError as error:
         raise ScenarioError(f"map {path} cannot be read ({error.strerror}); check the path") from error
-    except ET.ParseError as error:
+    except (ET.ParseError, LookupError, ValueError) as error:  # the last two for encodings that are not known here
         raise ScenarioError(f"map {path} is not well-formed XML ({error})") from error
     if root.tag != "OpenDRIVE":
         raise ScenarioError(f"map {path} starts with <{root.tag}>, expected <OpenDRIVE>")

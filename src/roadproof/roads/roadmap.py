@@ -84,7 +84,7 @@ class RoadMap:
             raise ScenarioError("the map has no lane of type driving, expected at least one")
         everything = np.concatenate([line[:, :2] for lane in lanes for line in (lane.left, lane.right)])
         (x0, y0), (x1, y1) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()
-        if max(x1 - x0, y1 - y0) > MAX_EXTENT_M:
+        if not max(x1 - x0, y1 - y0) <= MAX_EXTENT_M:
             raise ScenarioError(
                 f"the map spans {x1 - x0:.0f} × {y1 - y0:.0f} m, expected at most "
                 f"{MAX_EXTENT_M:.0f} m each way; cut out the part to be driven"
@@ -136,7 +136,7 @@ class RoadMap:
         segment = near[k]
         return LanePosition(
             lane=int(self._driving[segments.owner[segment]]),
-            arclength_m=float(segments.station_m[segment] + ahead[k] - over[k]),
+            arclength_m=float(segments.station_m[segment] + (ahead[k] - over[k]) * segments.stretch[segment]),
             lateral_m=float(beside[k]),
             heading_error_rad=float(error[k]),
         )
@@ -152,10 +152,11 @@ class RoadMap:
             ScenarioError: start or goal is off the road, or no way leads to the goal.
         """
         begin = self.nearest_lane(start.x_m, start.y_m, start.yaw_rad)
-        if abs(begin.lateral_m) > ON_ROUTE_M or abs(begin.heading_error_rad) > math.pi / 3:
+        away_m = math.dist((start.x_m, start.y_m), self.lanes[begin.lane].at(begin.arclength_m)[:2])
+        if away_m > ON_ROUTE_M or abs(begin.heading_error_rad) > math.pi / 3:
             raise ScenarioError(
                 f"start ({start.x_m:.1f}, {start.y_m:.1f}) with yaw {start.yaw_rad:.2f} rad is not along a driving "
-                f"lane (the nearest is {abs(begin.lateral_m):.1f} m away and {abs(begin.heading_error_rad):.2f} rad "
+                f"lane (the nearest is {away_m:.1f} m away and {abs(begin.heading_error_rad):.2f} rad "
                 "off); move or turn it"
             )
         ends = self._goal_places(goal_m)
@@ -190,7 +191,7 @@ class RoadMap:
         best: dict[int, tuple[float, float]] = {}
         for k in np.flatnonzero(distance < distance.min() + 0.5):
             index = int(self._driving[segments.owner[near[k]]])
-            place = (float(distance[k]), float(segments.station_m[near[k]] + ahead[k]))
+            place = (float(distance[k]), float(segments.station_m[near[k]] + ahead[k] * segments.stretch[near[k]]))
             best[index] = min(best.get(index, place), place)
         return [(index, place[1]) for index, place in best.items()]
 

@@ -62,9 +62,10 @@ class SegmentIndex:
     Attributes:
         start: x and y of each segment's first point.
         along: direction of each segment, of length 1.
-        length_m: length of each segment.
+        length_m: length of each segment seen from above.
         owner: index of the line that each segment belongs to.
-        station_m: arc length from the beginning of its line up to each segment.
+        stretch: how much longer each segment is than seen from above; 1 on a flat road.
+        station_m: arc length from the beginning of its line up to each segment, along slopes.
     """
 
     def __init__(self, lines: list[Float[np.ndarray, "_ 3"]]) -> None:
@@ -72,12 +73,14 @@ class SegmentIndex:
         step = np.concatenate([np.diff(line[:, :2], axis=0) for line in lines])
         length = np.linalg.norm(step, axis=1)
         owner = np.repeat(np.arange(len(lines)), [len(line) - 1 for line in lines])
-        total = np.cumsum(length) - length
+        sloped = np.linalg.norm(np.concatenate([np.diff(line, axis=0) for line in lines]), axis=1)
+        total = np.cumsum(sloped) - sloped
         station = total - total[np.searchsorted(owner, np.arange(len(lines)))][owner]
         keep = length > 1e-6
         self.start: Float[np.ndarray, "s 2"] = start[keep]
         self.along: Float[np.ndarray, "s 2"] = step[keep] / length[keep, None]
         self.length_m: Float[np.ndarray, " s"] = length[keep]
+        self.stretch: Float[np.ndarray, " s"] = sloped[keep] / length[keep]
         self.owner: Int[np.ndarray, " s"] = owner[keep]
         self.station_m: Float[np.ndarray, " s"] = station[keep]
         self._tree: Any = KDTree(self.start + 0.5 * step[keep])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from enum import StrEnum
 from types import TracebackType
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
@@ -175,6 +176,23 @@ def obstacles_of(simulator: object, scenario: Scenario) -> tuple[Obstacle, ...] 
         ScenarioError: the simulator has no such map.
     """
     return simulator.obstacles(scenario) if isinstance(simulator, Furnished) else None
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """A world that begins where its recordings do."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The recorded stretch as a scenario."""
+        ...
+
+
+def begun_in(simulator: Simulator, scenario: Scenario) -> Scenario:
+    """The scenario as it is driven in an open simulator: in recordings it begins where they do."""
+    if simulator.paint.predicted and isinstance(simulator, Recorded):
+        return replace(scenario, start=simulator.scenario.start)
+    return scenario
 
 
 @runtime_checkable

@@ -133,6 +133,20 @@ def test_the_opposite_lane_is_the_wrong_lane_and_so_is_driving_backwards(roads):
     assert EventKind.WRONG_LANE not in kinds(roads, on_lane(roads, -3.5, backwards=True))
 
 
+def test_a_lane_is_as_wide_as_it_is_there(tmp_path):
+    width = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
+    lane = '<{0}><lane id="{1}" type="driving">{2}</lane></{0}>'
+    widening = lane.format("right", -1, width.replace('b="0"', 'b="0.0175"'))
+    (tmp_path / "map.xodr").write_text(
+        '<OpenDRIVE><road id="1" length="200" junction="-1"><planView><geometry s="0" x="0" y="0" hdg="0" length="200">'
+        f'<line/></geometry></planView><lanes><laneSection s="0">{lane.format("left", 1, width)}'
+        f'<center><lane id="0"/></center>{widening}</laneSection></lanes></road></OpenDRIVE>'
+    )
+    roads = load_map(str(tmp_path / "map.xodr"))
+    assert kinds(roads, VehicleState(6.0, 0.5, 0.0, 0.0, 8.0)) == {EventKind.WRONG_LANE}
+    assert EventKind.WRONG_LANE not in kinds(roads, VehicleState(190.0, 0.0, 0.0, 0.0, 8.0))
+
+
 def test_further_right_comes_the_sidewalk_and_then_the_land(roads):
     found = [kinds(roads, on_lane(roads, offset)) for offset in np.arange(0.0, 12.0, 0.25)]
     first = {kind: next(i for i, those in enumerate(found) if kind in those) for kind in set().union(*found)}

@@ -2,19 +2,20 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 import needs
-from roadproof.datatypes import Control, Ending, Event, EventKind, VehicleState
+from roadproof.datatypes import Control, Ending, EventKind, VehicleState
 from roadproof.driving.infractions import counted, infraction_points
 from roadproof.driving.rollout import rollout
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import find_scenario
-from roadproof.simulators.tracker.judge import BLOCKED_S, STANDS_S, Endings
+from roadproof.simulators.tracker.judge import BLOCKED_S, STANDS_S, Contact, Endings, Judge
 
 SCENARIO = find_scenario("left-03")
 ROUTE = scenario_route(SCENARIO, load_map(SCENARIO.map_name))
-HIT = (Event(EventKind.COLLISION_STATIC, 1.0, "guard rail 0"),)
+RAIL = (Contact("static", "guard rail 0"),)
 
 
 def place(along_m, left_m=0.0, speed_mps=5.0):
@@ -38,10 +39,25 @@ def test_fifteen_metres_beside_the_route_it_is_over():
 
 def test_who_stands_after_a_collision_is_not_waited_for():
     watch = Endings(ROUTE, 400.0).watch
-    assert watch(*place(10.0), 1.0, HIT) is None
-    assert watch(*place(10.0, speed_mps=0.0), 1.0 + STANDS_S - 0.1, ()) is None
+    assert watch(*place(10.0), 1.0, RAIL) is None
+    assert watch(*place(10.0, speed_mps=0.0), 1.0 + STANDS_S - 0.1, RAIL) is None
     assert watch(*place(10.0, speed_mps=0.5), 1.0 + STANDS_S, ()) is None, "moves on"
     assert watch(*place(10.0, speed_mps=0.0), 1.0 + 2 * STANDS_S, ()) is Ending.STANDS
+
+
+def test_a_touch_long_before_is_no_reason_to_stand():
+    watch = Endings(ROUTE, 400.0).watch
+    assert watch(*place(10.0), 1.0, RAIL) is None
+    assert watch(*place(30.0), 5.0, ()) is None
+    assert watch(*place(30.0, speed_mps=0.0), 5.0 + 2 * STANDS_S, ()) is None
+
+
+def test_leaving_the_road_slowly_over_the_sidewalk_is_one_event():
+    judge, found = Judge(load_map(SCENARIO.map_name)), []
+    for step in range(200):
+        state, _ = place(10.0, left_m=-0.05 * step)
+        found += judge.watch(state, 0.05 * step, (), np.zeros((0, 2)))
+    assert [event.kind for event in found] == [EventKind.SIDEWALK]
 
 
 def test_who_stands_for_no_reason_is_waited_for_half_a_minute():

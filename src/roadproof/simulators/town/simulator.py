@@ -28,7 +28,6 @@ from roadproof.simulators.tracker.simulator import Request, RouteSimulator
 class _Town:
     """What is kept from drive to drive: one map with all that stands on it."""
 
-    name: str
     roads: RoadMap
     scenery: Scenery
     renderer: Renderer
@@ -160,12 +159,10 @@ class TownSimulator(RouteSimulator[_Drive]):
 
     def _town_of(self, map_name: str) -> _Town:
         """A map with everything on it; built when the map changes."""
-        if self._town is None or self._town.name != map_name:
-            roads = load_map(map_name)
+        roads = load_map(map_name)
+        if self._town is None or self._town.roads is not roads:
             self._end_drive()
             self._close()
             scenery = build_scenery(roads)
-            self._town = _Town(
-                map_name, roads, scenery, Renderer(roads, scenery, self.camera, self.input, self._graphics)
-            )
+            self._town = _Town(roads, scenery, Renderer(roads, scenery, self.camera, self.input, self._graphics))
         return self._town

@@ -152,5 +152,5 @@ class RouteTracker(DriveTracker):
         self.place = self.route.locate(self.state.x_m, self.state.y_m, near_m)
         people = np.column_stack([self.pedestrians.x_m, self.pedestrians.y_m])
         events = self._judge.watch(self.state, self.time_s, contacts, people) + signals
-        ending = self._endings.watch(self.state, self.place, self.time_s, events)
+        ending = self._endings.watch(self.state, self.place, self.time_s, contacts)
         return self.observation(frame, picture, self.place.command, ending, events)

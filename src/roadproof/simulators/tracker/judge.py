@@ -21,11 +21,14 @@ HEIGHT_M, TRACK_M = 1.45, 1.6
 """Measures of the driven car."""
 
 PERSON_RADIUS_M = 0.3
-REARM_S = 1.0
+REARM_S = 2.0
+"""So long a departure must be over before another counts, as `driving.infractions` counts stored events."""
+
 GOAL_M = 2.0
 OFF_ROUTE_M = 15.0
 STANDS_MPS = 0.1
 STANDS_S = 3.0
+TOUCHED_S = 2.0
 BLOCKED_S = 30.0
 
 _COLLISIONS = {
@@ -33,6 +36,7 @@ _COLLISIONS = {
     "vehicle": EventKind.COLLISION_VEHICLE,
     "pedestrian": EventKind.COLLISION_PEDESTRIAN,
 }
+_LEFT_THE_ROAD = (EventKind.SIDEWALK, EventKind.OFF_ROAD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +50,14 @@ class Contact:
 class Judge:
     """Watches one drive for events.
 
-    A collision counts once per object and drive. Wrong lane, sidewalk and off road count when they begin, and again
-    only after a second without.
+    A collision counts once per object and drive. Being in the wrong lane and having left the road, over the sidewalk or
+    not, count when they begin, and again only after two seconds without.
     """
 
     def __init__(self, roads: RoadMap) -> None:
         self._roads = roads
         self._hit: set[str] = set()
-        self._last: dict[EventKind, float] = {}
+        self._last: dict[str, float] = {}
 
     def watch(
         self, state: VehicleState, time_s: float, contacts: Sequence[Contact], people: Float[np.ndarray, "m 2"]
@@ -73,8 +77,9 @@ class Judge:
                 self._hit.add(contact.name)
                 events.append(Event(_COLLISIONS[contact.kind], time_s, contact.name))
         for kind, detail in self._departures(state):
-            last = self._last.get(kind, -math.inf)
-            self._last[kind] = time_s
+            departure = "off" if kind in _LEFT_THE_ROAD else kind
+            last = self._last.get(departure, -math.inf)
+            self._last[departure] = time_s
             if time_s - last > REARM_S:
                 events.append(Event(kind, time_s, detail))
         return tuple(events)
@@ -91,7 +96,7 @@ class Judge:
         lane = self._roads.lanes[place.lane]
         if middle == Surface.DRIVING and lane.junction is None:
             backwards = abs(place.heading_error_rad) > math.pi / 2
-            if backwards or abs(place.lateral_m) > lane.width_m / 2 + 0.05:
+            if backwards or abs(place.lateral_m) > lane.width_at(place.arclength_m) / 2 + 0.05:
                 found.append(
                     (EventKind.WRONG_LANE, f"{abs(place.lateral_m):.1f} m beside its lane on road {lane.road}")
                 )
@@ -102,7 +107,8 @@ class Endings:
     """Watches one drive for the reason why it is over.
 
     It is over at the goal, when its time is up, 15 m beside the route, three seconds after the car has come to stand
-    where it had hit something static, and when it has not moved for half a minute, whatever the reason.
+    where it touched something static, within two seconds of touching it, and when it has not moved for half a minute,
+    whatever the reason.
 
     Args:
         route: the way to the goal.
@@ -111,18 +117,21 @@ class Endings:
 
     def __init__(self, route: Route, limit_s: float) -> None:
         self._route, self._limit_s = route, limit_s
-        self._hit, self._moved_s = False, 0.0
+        self._touched_s, self._moved_s = -math.inf, 0.0
 
-    def watch(self, state: VehicleState, place: RoutePosition, time_s: float, events: Sequence[Event]) -> Ending | None:
+    def watch(
+        self, state: VehicleState, place: RoutePosition, time_s: float, contacts: Sequence[Contact]
+    ) -> Ending | None:
         """Why the drive is over now; None where it goes on.
 
         Args:
             state: where the car is now.
             place: where the car is along the route.
             time_s: seconds since the start.
-            events: the events that begin now.
+            contacts: what the car touches.
         """
-        self._hit |= any(event.kind is EventKind.COLLISION_STATIC for event in events)
+        if any(contact.kind == "static" for contact in contacts):
+            self._touched_s = time_s
         if abs(state.speed_mps) > STANDS_MPS:
             self._moved_s = time_s
         stood_s = time_s - self._moved_s
@@ -130,7 +139,7 @@ class Endings:
             return Ending.GOAL_REACHED
         if math.dist((state.x_m, state.y_m), self._route.at(place.arclength_m)[:2]) > OFF_ROUTE_M:
             return Ending.OFF_ROUTE
-        if self._hit and stood_s >= STANDS_S:
+        if stood_s >= STANDS_S and self._touched_s >= self._moved_s - TOUCHED_S:
             return Ending.STANDS
         if stood_s >= BLOCKED_S:
             return Ending.BLOCKED
