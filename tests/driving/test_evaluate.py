@@ -12,7 +12,7 @@ import torch
 import bad_drivers
 import needs
 from paint_shy import PaintShy, along_a_street, magenta
-from roadproof.datatypes import Weather
+from roadproof.datatypes import Control, Weather
 from roadproof.driving.deviation import deviation_m, lateral_m, passage, path_of
 from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, driver_in_words, load_episodes
 from roadproof.driving.episode import Episode
@@ -23,7 +23,7 @@ from roadproof.driving.rollout import rollout
 from roadproof.driving.starts import StartRange
 from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
-from roadproof.scenarios import identity
+from roadproof.scenarios import find_scenario, identity
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
@@ -251,6 +251,26 @@ def test_a_pattern_is_judged_from_starts_that_did_not_choose_it(town, street, tm
     assert row.deviation_m.low is not None, "drawn starts are a sample"
     assert Evaluation.load(tmp_path).trials == told.trials
     assert Evaluation.load(tmp_path).start_range == narrow
+
+
+def waits_among_others(simulator):
+    """Drives on, but for who sees another car on the road, which stands."""
+    waits = len(simulator.cars) > 0
+    return lambda _seen: Control(0.0, throttle=0.0 if waits else 0.5, brake=1.0 if waits else 0.0)
+
+
+def test_what_never_came_to_the_canvas_without_paint_is_no_comparison(town, tmp_path):
+    far = dataclasses.replace(find_scenario("straight-08"), time_limit_s=8.0)
+    options = {"weathers": WEATHERS[:1], "starts": 0, "runs": 1, "pedestrians": 0}
+    told = evaluate(town, waits_among_others, far, MAGENTA, folder=tmp_path / "one", cars=1, **options)
+    assert ([trial.traffic for trial in told.trials], told.left_out) == ([False], 1)
+    assert Evaluation.load(tmp_path / "one").left_out == 1
+    with pytest.raises(EpisodeError, match="without paint the car never comes near the canvas of straight-08"):
+        evaluate(town, stands, far, MAGENTA, folder=tmp_path / "none", cars=1, **options)
+
+
+def stands(_simulator):
+    return lambda _seen: Control(0.0, brake=1.0)
 
 
 @pytest.mark.parametrize("wrong", [{"right_m": 1.5}, {"turned_rad": -0.1}, {"faster_mps": math.nan}], ids=str)

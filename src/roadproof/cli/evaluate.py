@@ -177,6 +177,8 @@ def _summarise(evaluation: Evaluation, fidelity: Fidelity | None, out: Path, *, 
     if faster:
         speed = "predicted m/s" if evaluation.predicted else "speed m/s"
         columns, note = (*columns[:3], speed, *columns[3:]), f"{note}; m/s: mean change of speed, negative = slower"
+    if evaluation.left_out:
+        note = f"{note}; {evaluation.left_out} left out: without paint the car did not come to the canvas"
     shown = table((*(["pattern"] if several else []), "weather", "with"), columns, title=title, note=note)
     for row in rows:
         points = [

@@ -50,6 +50,13 @@ def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZO
     return slice(int(seen[0]), int(seen[-1]) + 1)
 
 
+def sees_canvas(clean: Path2D, canvas: CanvasPlacement) -> bool:
+    """Whether a drive came so near to the canvas that a driver begins to see what is painted on it."""
+    _check_path(clean, "clean")
+    nearest_m = np.hypot(clean[:, 0] - canvas.x_m, clean[:, 1] - canvas.y_m).min()
+    return bool(nearest_m <= HORIZON_M + canvas.length_m / 2)
+
+
 def deviation_m(clean: Path2D, painted: Float[np.ndarray, "m 2"]) -> float:
     """The paper's deviation between two drives, in metres.
 

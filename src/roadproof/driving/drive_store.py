@@ -18,6 +18,7 @@ import roadproof
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import told_of
 from roadproof.datatypes import Weather
+from roadproof.driving.deviation import path_of, sees_canvas
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.driving.starts import NOMINAL, StartOffset
@@ -153,6 +154,14 @@ class Episodes:
             painted_file=self.file(painted),
             start=painted.start,
         )
+
+    def sees_canvas(self, drive: DriveConditions) -> bool:
+        """Whether a drive that was made came to where the canvas is in view.
+
+        Raises:
+            EpisodeError: the drive is missing or damaged.
+        """
+        return sees_canvas(path_of(Episode.load(self._path(drive))), self.scenario.canvas)
 
     def _path(self, drive: DriveConditions) -> Path:
         return self.folder / "episodes" / self.file(drive)

@@ -15,6 +15,7 @@ from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import CLEAN, AnyDriver, DriveConditions, Episodes, driver_in_words, make_missing
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
+from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import each_once
@@ -72,23 +73,16 @@ def evaluate(
         on_drive: called after each drive with the number of drives done and of all drives.
 
     Raises:
-        EpisodeError: there is nothing to drive, several processes are asked for with an open simulator, or a drive in
-            the folder is damaged.
+        EpisodeError: there is nothing to drive, several processes are asked for with an open simulator, a drive in the
+            folder is damaged, or no drive alone without paint comes to the canvas.
         ControllerError: the driver raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator refuses the conditions, or a process died.
         OutputError: the folder cannot be written.
     """
     folder = as_path(folder)
-    if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
-        raise EpisodeError(
-            f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "
-            f"{processes} processes; expected at least one weather and process, and nothing below 0"
-        )
-    each_once(weathers, "weathers", EpisodeError)
+    _check_numbers(weathers, starts, runs, cars, pedestrians, processes)
     # A range of nothing draws one start again and again.
     begins = tuple(dict.fromkeys(start_range.draw(starts, seed))) if starts else (NOMINAL,)
-    if runs and not cars + pedestrians:
-        raise EpisodeError(f"{runs} runs with traffic but no cars and no pedestrians; ask for some, or for 0 runs")
     if processes > 1 and not callable(simulator):
         raise EpisodeError(f"{processes} processes need a simulator each; give a function that makes one")
     if processes > 1:
@@ -104,6 +98,7 @@ def evaluate(
         if pool is None:
             pool = stack.enter_context(here_or_beside(world, simulator if callable(simulator) else None, processes))
         make_missing(pool, episodes, drives, lambda done: on_drive(done, len(drives)))
+    trials = _compared(episodes, planned)
     evaluation = Evaluation(
         scenario=scenario,
         controller=driver_name or driver_in_words(driver),
@@ -112,7 +107,8 @@ def evaluate(
         cars=cars,
         pedestrians=pedestrians,
         seed=seed,
-        trials=tuple(episodes.trial(clean, painted) for clean, painted in planned),
+        trials=trials,
+        left_out=len(planned) - len(trials),
         simulator_calls=0 if world.paint.predicted else len(drives),
         seconds=time.perf_counter() - started,
         paint=world.paint,
@@ -121,6 +117,31 @@ def evaluate(
     )
     evaluation.save(folder, paints[ATTACK])
     return evaluation
+
+
+def _check_numbers(
+    weathers: Sequence[Weather], starts: int, runs: int, cars: int, pedestrians: int, processes: int
+) -> None:
+    if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
+        raise EpisodeError(
+            f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "
+            f"{processes} processes; expected at least one weather and process, and nothing below 0"
+        )
+    each_once(weathers, "weathers", EpisodeError)
+    if runs and not cars + pedestrians:
+        raise EpisodeError(f"{runs} runs with traffic but no cars and no pedestrians; ask for some, or for 0 runs")
+
+
+def _compared(episodes: Episodes, planned: Sequence[tuple[DriveConditions, DriveConditions]]) -> tuple[Trial, ...]:
+    """The trials of all pairs of drives of which the one without paint came to the canvas."""
+    seen = {clean for clean in dict.fromkeys(clean for clean, _ in planned) if episodes.sees_canvas(clean)}
+    trials = tuple(episodes.trial(clean, painted) for clean, painted in planned if clean in seen)
+    if all(trial.traffic for trial in trials):
+        raise EpisodeError(
+            f"without paint the car never comes near the canvas of {episodes.scenario.name}: nothing can be compared "
+            "with it; choose a scenario that the controller masters"
+        )
+    return trials
 
 
 def random_patterns(pattern: Pattern, count: int, *, seed: int = 0) -> tuple[Pattern, ...]:

@@ -105,6 +105,8 @@ class Evaluation:
         seed: seed of the first run with traffic; the others count on from it.
         starts: number of drives alone per weather, each from a drawn start; 0 for one from the scenario's own start.
         start_range: range that the starts were drawn from.
+        left_out: number of drives over paint that are compared with nothing, since the one without paint never came to
+            where the canvas is in view, as behind a queue.
         trials: comparison of every drive over paint with its clean drive.
         simulator_calls: number of drives that the evaluation takes, clean ones included; 0 if they are predicted.
         seconds: wall time in seconds of the drives made in this call; those found in the folder cost nothing.
@@ -127,6 +129,7 @@ class Evaluation:
     paint: PaintKind = PaintKind.RENDERED
     starts: int = 0
     start_range: StartRange = USUAL_STARTS
+    left_out: int = 0
 
     def __post_init__(self) -> None:
         if not self.of(traffic=False):

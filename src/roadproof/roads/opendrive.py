@@ -175,7 +175,8 @@ def _mark(element: ET.Element, where: str) -> MarkRecord:
     colour = element.get("color", "standard")
     return MarkRecord(
         offset_m=_number(element, "sOffset", where),
-        kind=element.get("type", "none"),
+        # Two words, but one line.
+        kind=element.get("type", "none").replace("botts dots", "botts-dots"),
         colour="white" if colour == "standard" else colour,
         width_m=_number(element, "width", where) if "width" in element.attrib else 0.12,
     )
