@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from roadproof.controllers import shipped
@@ -155,6 +156,40 @@ def test_other_weights_in_the_same_file_are_other_jobs(tmp_path):
     assert first == [job.key for job in study.jobs]
     weights.write_bytes(b"another")
     assert not {*nothing, *first} & {job.key for job in study.jobs}
+
+
+@pytest.mark.parametrize("name", ["own.safetensors", "own.pt2"])
+def test_another_card_beside_the_same_weights_is_another_job(tmp_path, name):
+    weights, card = tmp_path / name, tmp_path / "own.json"
+    study = dataclasses.replace(load_study(written(tmp_path, TEXT)), controller=str(weights))
+    weights.write_bytes(b"one")
+    keys = [study.jobs[0].key]
+    for speed in (6.0, 7.0):
+        card.write_text(f'{{"target_speed_mps": {speed}}}')
+        keys.append(study.jobs[0].key)
+    assert len(set(keys)) == 3
+    named = dataclasses.replace(study, controller=f"pilotnet:{weights}").jobs[0].key
+    card.unlink()
+    assert study.jobs[0].key == keys[0]
+    assert dataclasses.replace(study, controller=f"pilotnet:{weights}").jobs[0].key == named
+
+
+def test_other_external_data_of_an_onnx_file_are_other_jobs(tmp_path):
+    onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
+    network = tmp_path / "own.onnx"
+    study = dataclasses.replace(load_study(written(tmp_path, TEXT)), controller=str(network))
+    output = onnx.helper.make_tensor_value_info("w", onnx.TensorProto.FLOAT, [3])
+    keys = []
+    for weight in (1.0, -1.0):
+        held = onnx.numpy_helper.from_array(np.full(3, weight, np.float32), "w")
+        made = onnx.helper.make_model(onnx.helper.make_graph([], "graph", [], [output], [held]))
+        (tmp_path / "weights.bin").unlink(missing_ok=True)
+        onnx.save(made, network, save_as_external_data=True, location="weights.bin", size_threshold=0)
+        keys += [(network.read_bytes(), study.jobs[0].key)]
+    assert keys[0][0] == keys[1][0]
+    assert keys[0][1] != keys[1][1]
+    network.write_bytes(b"damaged")
+    assert study.jobs[0].key not in dict(keys).values()
 
 
 def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, monkeypatch):

@@ -129,7 +129,7 @@ def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | 
 
 
 def files_of(spec: str) -> tuple[Path, ...]:
-    """The files that are there of a user's controller: its weights or network, and its function's module.
+    """The files that are there of a user's controller: its weights or network, its card, and its function's module.
 
     Nothing is imported, but for the packages that a module lies in. A controller that comes with roadproof has none.
     """
@@ -141,7 +141,14 @@ def files_of(spec: str) -> tuple[Path, ...]:
             found = importlib.util.find_spec(head)
             named = [*([Path(found.origin)] if found and found.origin else []), *named]
     elif head not in ARCHITECTURES or tail:
-        named = [Path(tail if head in ARCHITECTURES else spec)]
+        named = [path := Path(tail if head in ARCHITECTURES else spec)]
+        if path.suffix and head not in ARCHITECTURES:
+            named.append(path.with_suffix(".json"))
+        if path.suffix == ".onnx":
+            from roadproof.controllers.onnx_graph import external_data_of
+
+            with suppress(ControllerError):
+                named += external_data_of(path)
     return tuple(path for path in named if path.suffix and path.is_file())
 
 

@@ -132,14 +132,27 @@ def _with_spent_values(nodes: list[_Node], keep: str) -> tuple[_Node, ...]:
     return tuple(reversed(result))
 
 
-def _read(path: Path) -> Any:  # noqa: ANN401
+def external_data_of(path: Path) -> tuple[Path, ...]:
+    """The files beside an ONNX file that hold its tensors, where it does not hold them itself.
+
+    Raises:
+        ControllerError: the extra is not installed, or the file is not ONNX.
+    """
+    graph = _read(path, whole=False).graph
+    tensors = [*graph.initializer, *(each.t for node in graph.node for each in node.attribute)]
+    told = [entry for tensor in tensors for entry in tensor.external_data if entry.key == "location"]
+    return tuple(path.parent / name for name in sorted({entry.value for entry in told}))
+
+
+def _read(path: Path, *, whole: bool = True) -> Any:  # noqa: ANN401
     try:
         onnx: Any = importlib.import_module("onnx")
     except ImportError as error:
         raise ControllerError(f"{path} needs the ONNX reader: pip install 'roadproof[onnx]'") from error
     try:
-        model = onnx.load(path)
-        onnx.checker.check_model(model)
+        model = onnx.load(path, load_external_data=whole)
+        if whole:
+            onnx.checker.check_model(model)
     except Exception as error:  # the reader raises its own, protobuf's and the system's
         raise ControllerError(f"{path} is not a valid ONNX file: {in_one_line(error)}") from error
     return model
