@@ -61,6 +61,19 @@ def test_a_recording_of_a_driver_that_answered_otherwise_is_not_taken(drives, fo
     write_settings(drives.settings, folder)
 
 
+def test_a_recording_knows_a_map_by_what_is_in_it_wherever_it_lies(drives, tmp_path):
+    own = tmp_path / "own.xodr"
+    own.write_text("<OpenDRIVE/>")
+    settings = dataclasses.replace(drives.settings, scenario=dataclasses.replace(LEFT, map_name=str(own)))
+    assert write_settings(settings, tmp_path / "record")
+    moved = own.rename(tmp_path / "record" / "own.xodr")
+    settings = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name=str(moved)))
+    assert not write_settings(settings, tmp_path / "record")
+    moved.write_text("<OpenDRIVE />")
+    with pytest.raises(RecordingError, match=r"holds a recording with scenario\.map "):
+        write_settings(settings, tmp_path / "record")
+
+
 def test_the_kept_frames_show_the_canvas(drives):
     for drive in drives.drives:
         assert drive.frames.shape == (5, 88, 200, 3)

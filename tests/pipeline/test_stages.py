@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -43,6 +43,19 @@ def stages_in(folder, **options):
         on_progress=lambda *_: None,
         **options,
     )
+
+
+def test_a_run_knows_a_map_by_what_is_in_it_wherever_it_lies(tmp_path):
+    parts = []
+    for folder, content in (("one", "<OpenDRIVE/>"), ("two", "<OpenDRIVE/>"), ("two", "<OpenDRIVE />")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        own = tmp_path / folder / "own.xodr"
+        own.write_text(content)
+        run = stages_in(tmp_path)
+        parts.append(replace(run, scenario=replace(run.scenario, map_name=str(own))).made_of["scenario"])
+    assert parts[0] == parts[1] != parts[2]
+    in_town = stages_in(tmp_path)
+    assert in_town.made_of["scenario"] == asdict(in_town.scenario), "as before maps were known by their content"
 
 
 def in_black(found):

@@ -26,7 +26,7 @@ from roadproof.io.html import table
 from roadproof.io.identity import require_same
 from roadproof.io.records import Form, RecordFile
 from roadproof.recordings import Side, Track
-from roadproof.scenarios import Scenario
+from roadproof.scenarios import Scenario, identity
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -197,14 +197,18 @@ def write_settings(settings: Settings, folder: Path) -> bool:
         RecordingError: the folder holds a recording with other settings; the message names the first difference.
         OutputError: the folder cannot be written.
     """
-    path = folder / "record.json"
+    path, scenario = folder / "record.json", identity(settings.scenario)
     if path.exists():
-        before = _SETTINGS.content(path)
-        _SETTINGS.made(path, before)  # damage is named as such
+        content = _SETTINGS.content(path)
+        _SETTINGS.made(path, content)  # damage is named as such
+        known = content["scenario"]
+        known |= {"map_name": Path(known["map_name"]).name, "map": content.get("map", "")}
         # Recordings of the town as software draws it are older than this word.
-        require_same(folder, "a recording", {"world": ""} | before, _SETTINGS.stated(settings), RecordingError)
+        before = {"world": ""} | content
+        now = _SETTINGS.stated(settings) | {"scenario": scenario}
+        require_same(folder, "a recording", before, now, RecordingError)
         return False
-    _SETTINGS.write(path, settings)
+    _SETTINGS.write(path, settings, **({"map": scenario["map"]} if scenario["map"] else {}))
     return True
 
 

@@ -32,7 +32,7 @@ from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_
 from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import marks_of, site_at
-from roadproof.scenarios import Scenario
+from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, world_of
 
@@ -65,8 +65,10 @@ class Stages:
     def made_of(self) -> dict[str, object]:
         """What identifies this run, by name."""
         size = self.simulator.input.height_px, self.simulator.input.width_px
+        # Runs in the town are older than the content of maps.
+        scenario = {name: value for name, value in identity(self.scenario).items() if name != "map" or value}
         return {
-            "scenario": self.scenario,
+            "scenario": scenario,
             "budget": without_addresses(repr(self.budget)),
             "objective": own_objective(self.budget.objective),
             "space": self.space.stated,
