@@ -71,6 +71,10 @@ MISTAKES = {
     ),
     "no number": ((LIMITS, "stored = { deviation_m = nan }"), "limits.stored.deviation_m is nan, expected"),
     "no limit": ((LIMITS, ""), "limits has nothing for stored patterns"),
+    "a change of the bare road alone": (
+        (LIMITS, CHANGE + "failed = { absolute = 0.0, relative = 0.0 }"),
+        "limits has nothing for stored patterns",
+    ),
     "too few for a median": (("count = 3", "count = 2"), "too few drives: 4 a case (starts × seeds) can never show"),
     "too few for a share": ((LIMITS, "stored = { left_lane = 0.05 }"), "left_lane at most 0.05 for stored"),
     "equal starts": (

@@ -242,7 +242,7 @@ def _check_drives(plan: CheckPlan) -> None:
         raise CheckError(f"random is 0 and {bare[0]} has no stored patterns, so nothing would be painted there")
     for kind, count in drives.items():
         limits = plan.limits[kind]
-        if kind is not Kind.BARE and not limits and not plan.change:
+        if not limits and not plan.change.keys() & set(MEASURES[kind]):
             raise CheckError(f"limits has nothing for {kind} patterns, which are driven over; add {kind} = {{ ... }}")
         asked = dict(limits) | ({"deviation_m": 0.0} if "deviation_m" in plan.change and kind is not Kind.BARE else {})
         for name, limit in asked.items():
