@@ -12,13 +12,15 @@ from PIL import Image
 import roadproof
 from command import answered, stored
 from roadproof.controllers import load_controller
-from roadproof.datatypes import Control
+from roadproof.datatypes import Control, Weather
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import CheckError
 from roadproof.gate.check import architecture_of, run_check
+from roadproof.gate.places import places_of
 from roadproof.gate.plan import load_check
 from roadproof.gate.result import CHECK_FILE
+from roadproof.gate.stretch import Stretch
 from roadproof.gate.verdict import Kind, Status
 from team_folder import PLAN, MagentaShy, magenta_shy
 
@@ -216,6 +218,23 @@ def test_a_reference_of_other_conditions_is_refused(accepted, tmp_path):
     accepted.reference.with_name("bad.json").write_text('{"format": "roadproof-check-result", "version": 1}')
     with pytest.raises(CheckError, match="incomplete or damaged"):
         run_check(replace(accepted, reference=accepted.reference.with_name("bad.json")), magenta_shy(), tmp_path)
+
+
+def test_a_fresh_attack_in_another_weather_is_another_condition(team, tmp_path):
+    plan = load_check(team / "check.toml", trust=True)
+    with places_of(plan, "cpu")[0].factory() as world:
+        drives = Episodes.of(world, magenta_shy(), plan.scenarios[0], {}, tmp_path)
+    noon, rain = Weather.CLEAR_NOON, Weather.RAINY_NOON
+
+    def known(*weathers, kind=Kind.FRESH):
+        asked = replace(plan, weathers=weathers)
+        stretch = Stretch(plan=asked, world=world, weathers=weathers, paints=(), episodes=drives)
+        return [stretch.conditions(("test-road", weather, kind, ""), ()) for weather in (noon, rain)]
+
+    noon_first, rain_first = known(noon, rain), known(rain, noon)
+    assert not set(noon_first) & set(rain_first)
+    assert known(noon) == noon_first
+    assert known(noon, rain, kind=Kind.RANDOM) == known(rain, noon, kind=Kind.RANDOM)
 
 
 def test_an_architecture_is_known_by_its_shapes_not_its_weights():

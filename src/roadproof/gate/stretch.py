@@ -152,7 +152,7 @@ class Stretch:
     def conditions(self, key: Key, paints: Sequence[Paint]) -> str:
         """A hash of all that the drives of a case depend on, apart from the controller.
 
-        A fresh attack finds another pattern for every controller, so only how it searches counts.
+        A fresh attack finds another pattern for every controller, so only how it searches counts, and in which weather.
         """
         plan, (_, weather, kind, _) = self.plan, key
         images = [] if kind is Kind.FRESH else [self.episodes.digests[paint.name] for paint in paints]
@@ -168,6 +168,8 @@ class Stretch:
             plan.seeds,
             asdict(plan.starts),
             world,
+            # References are older than this word.
+            *([plan.weathers[0]] if kind is Kind.FRESH and weather != plan.weathers[0] else []),
         ]
         return digest(json.dumps(told, default=str))[:16]
 
