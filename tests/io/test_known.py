@@ -153,6 +153,13 @@ def test_a_network_is_its_weights_and_its_settings() -> None:
     assert known != known_by(network().to(torch.bfloat16))
 
 
+@pytest.mark.parametrize("kind", ["", "@staticmethod", "@classmethod", "@property", "@cached_property"])
+def test_what_any_member_of_a_class_uses_counts(tmp_path: Path, kind: str) -> None:
+    source = f"from functools import cached_property\nGAIN = 1\nclass Own:\n  {kind}\n  def gain(own=0): return GAIN"
+    one, same, other = (loaded(tmp_path, text) for text in (source, source, source.replace("GAIN = 1", "GAIN = 2")))
+    assert known_by(one.Own()) == known_by(same.Own()) != known_by(other.Own())
+
+
 @dataclass
 class Own:
     gain: float

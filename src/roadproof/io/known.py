@@ -157,12 +157,19 @@ def _class(kind: type, within: _Within) -> dict[str, Any]:
         return {"class": _name(kind)}
     for each in kind.__mro__:
         if str(each.__module__).partition(".")[0] == package or _is_the_users(each.__module__):
-            methods = [value for value in vars(each).values() if isinstance(value, FunctionType)]
+            methods = [method for value in vars(each).values() for method in _methods(value)]
             uses = {
                 name: value for method in methods for name, value in _uses(method, within, method.__globals__).items()
             }
             told[_label(each)] = [_source(each), uses]
     return {"class": _label(kind), "source": told}
+
+
+def _methods(member: Any) -> list[FunctionType]:  # noqa: ANN401
+    """The functions of a class's member: of a method itself, of a property up to three."""
+    names = ("__func__", "fget", "fset", "fdel", "func")
+    found = [member, *(getattr(member, name, None) for name in names)]
+    return [each for each in found if isinstance(each, FunctionType)]
 
 
 def _object(thing: Any, within: _Within, *, weights: bool = True) -> dict[str, Any]:  # noqa: ANN401
