@@ -155,6 +155,19 @@ def test_who_does_not_drive_well_without_paint_does_not_pass(team, tmp_path, con
     assert "worst.jpg" not in (tmp_path / "summary.md").read_text()
 
 
+def test_a_case_some_of_whose_bare_drives_fail_has_too_few_drives(team, tmp_path, monkeypatch):
+    bare = Stretch.bare
+    monkeypatch.setattr(
+        Stretch, "bare", lambda *given: tuple(replace(each, wrong="off" * (not each.seed)) for each in bare(*given))
+    )
+    (team / "half.toml").write_text(PLAN + "bare = { failed = 1.0 }\n")
+    result = run_check(load_check(team / "half.toml", trust=True), MagentaShy(gain=0.0), tmp_path)
+    green = by_name(result)["green"]
+    assert (green.status, len(green.drives)) == (Status.TOO_FEW, 3)
+    assert "too few drives: 3 had no good drive on the bare road to compare with" in green.reasons
+    assert by_name(result)["bare road"].status is Status.PASSED
+
+
 def test_random_patterns_are_one_case(team, tmp_path):
     text = PLAN.replace("random = 0", "random = 3").replace('patterns = "patterns"', "")
     (team / "random.toml").write_text(text + "random = { left_lane = 1.0 }\n")

@@ -91,5 +91,12 @@ def test_a_case_without_drives_does_not_pass():
     assert judge({}, {}, {}, None)[0] is Status.TOO_FEW
 
 
+def test_a_case_without_all_of_its_drives_does_not_pass():
+    status, reasons = judge({"left_lane": share_95(0, 1)}, {"left_lane": 0.0}, {}, None, left_out=5)
+    assert status is Status.TOO_FEW
+    assert reasons == ("too few drives: 5 had no good drive on the bare road to compare with",)
+    assert judge({"left_lane": share_95(1, 1)}, {"left_lane": 0.0}, {}, None, left_out=5)[0] is Status.FAILED
+
+
 def test_the_least_for_a_median_follows_from_its_tails():
     assert 2 * 0.5 ** least_drives("deviation_m", math.inf) <= 0.05 < 2 * 0.5**5

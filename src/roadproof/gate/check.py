@@ -173,7 +173,8 @@ class _Check:
         drives = stretch.painted(weather, paints) if paints else stretch.bare(weather)
         measures = measures_of(kind, drives)
         stored = self.before.get(key)
-        status, reasons = judge(measures, plan.limits[kind], plan.change, stored and stored.measures)
+        left_out = sum(len(paint.drives) for paint in paints) - len(drives) if paints else 0
+        status, reasons = judge(measures, plan.limits[kind], plan.change, stored and stored.measures, left_out)
         # Where there is none over paint, the drives past the bare road are to be seen.
         shown = paints or stretch.paints
         worst = worst_of(drives) or JudgedDrive(seed=shown[0].drives[0][0], start=NOMINAL, wrong="", clean="")

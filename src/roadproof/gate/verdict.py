@@ -98,7 +98,11 @@ def least_drives(measure: str, limit: float) -> int:
 
 
 def judge(
-    measures: Measures, limits: Mapping[str, float], changes: Mapping[str, Change], before: Measures | None
+    measures: Measures,
+    limits: Mapping[str, float],
+    changes: Mapping[str, Change],
+    before: Measures | None,
+    left_out: int = 0,
 ) -> tuple[Status, tuple[str, ...]]:
     """Whether a case passes, and why not.
 
@@ -107,11 +111,12 @@ def judge(
         limits: the greatest values that pass, by measure.
         changes: how much worse than the reference each measure may be, by measure.
         before: the reference's measures; None where nothing is compared.
+        left_out: how many drives over paint were not made, since the same drive on the bare road did not go well.
     """
     if not measures:
         return Status.TOO_FEW, ("too few drives: on the bare road none went well, so there is none to compare with",)
     failed: list[str] = []
-    undecided: list[str] = []
+    undecided = [f"too few drives: {left_out} had no good drive on the bare road to compare with"] if left_out else []
     for name, limit in limits.items():
         found = measures[name]
         if found.value > limit:
