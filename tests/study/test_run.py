@@ -24,6 +24,15 @@ def two_jobs(small_study):
     return dataclasses.replace(small_study, methods=small_study.methods[:1])
 
 
+def test_a_table_without_pandas_is_not_called_damaged(tmp_path, monkeypatch):
+    (tmp_path / "rows.parquet").touch()
+    with pytest.raises(StudyError, match="is damaged"):
+        read_table(tmp_path)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(StudyError, match=r"^studies need pandas; install roadproof\[study\]$"):
+        read_table(tmp_path)
+
+
 def test_every_job_gives_its_rows_and_what_is_done_is_not_done_again(small_study, tmp_path):
     told = []
     frame = run_study(small_study, tmp_path, counts, workers=2, on_job=lambda done, job, _: told.append((done, job)))

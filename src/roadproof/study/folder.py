@@ -121,8 +121,9 @@ def read_table(folder: Path, name: str = "rows.parquet") -> Frame:
     if not path.is_file():
         raise StudyError(f"{folder} has no {name}; run the study first")
     check_closed(folder, StudyError)
+    library = pandas()
     try:
-        return pandas().read_parquet(path)
+        return library.read_parquet(path)
     except (OSError, ValueError) as error:
         raise StudyError(f"{path} is damaged ({error}); run the study again, finished jobs are kept") from None
 
