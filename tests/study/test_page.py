@@ -246,6 +246,21 @@ def test_transfer_has_its_matrix_in_the_page(finished, tmp_path):
     assert (tmp_path / "out" / "transfer-deviation.tex").exists()
 
 
+def test_a_transfer_of_another_state_of_the_study_is_left_out(finished, tmp_path):
+    _, rows, page = finished
+    driven = rows[rows["error"].isna()].assign(found_on="cil")
+    again = "The study has changed since; run the transfer again."
+    for of_now, shown in ((driven["method"] != "BO", True), (driven["method"] == "none", False)):
+        out = tmp_path / str(shown)
+        text = write_tables(rows, out, out, driven.assign(job=driven["job"].where(of_now, "0" * 16))).read_text()
+        assert ("driven by" in text, again in text) == (shown, shown)
+        assert (out / "figures" / "transfer-deviation.png").exists() is shown
+    whole = write_tables(rows, tmp_path, tmp_path / "whole", driven).read_text()
+    assert "driven by" in whole
+    assert again not in whole
+    assert "driven by" not in page.read_text()
+
+
 @pytest.mark.parametrize("width", [6.0, 10.0])
 def test_a_legend_of_long_names_stays_inside_its_figure(width):
     figure = Figure(figsize=(width, 5.0), layout="constrained")

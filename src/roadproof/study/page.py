@@ -9,6 +9,7 @@ OUT/figures/*.png
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from roadproof.io.files import write_text
@@ -36,7 +37,8 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
         rows: the rows of the study (`folder.read_table`).
         folder: the folder of the study, for what its jobs left there.
         out: the folder for the files; older ones of the same names are replaced.
-        transfer: rows of the same patterns driven by other controllers; None where nobody drove them.
+        transfer: rows of the same patterns driven by other controllers, those of other patterns are left out; None
+            where nobody drove them.
 
     Returns:
         The path of the page, tables.html.
@@ -48,13 +50,15 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     check_jobs(rows)
     jobs = read_jobs(folder, rows)
     results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder))
-    driven = [] if transfer is None else [(transfer, metric) for metric in (DEVIATION, PENALTY)]
+    kept, again = (None, "") if transfer is None else _of_these_jobs(transfer, results)
+    driven = [] if kept is None or kept.empty else [(kept, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))
     shown = (*drawn, gallery(results, jobs), *passages(results, jobs), *(transfer_map(*each) for each in driven))
     pictures = [picture for picture in shown if picture is not None]
     for picture in pictures:
         save(picture.figure, out / "figures" / f"{picture.name}.png")
-    tables = [*paper_tables(results), *(transfer_table(*each) for each in driven)]
+    matrices = [transfer_table(*each) for each in driven]
+    tables = [*paper_tables(results), *(replace(each, note=each.note + again) for each in matrices)]
     # A list of what was missing does not outlive the gaps.
     (out / f"{GAPS}.tex").unlink(missing_ok=True)
     for table in tables:
@@ -63,6 +67,15 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     write_text(out / "tables.md", _markdown(name, sentence, results, tables, pictures))
     write_text(out / "tables.html", _page(name, sentence, results, tables, pictures, out))
     return out / "tables.html"
+
+
+def _of_these_jobs(transfer: Frame, results: Results) -> tuple[Frame, str]:
+    """The rows of a transfer that are of a study's patterns, and what a note says where these are not all of both."""
+    if "job" not in transfer or "job" not in results.drives:
+        return transfer, ""
+    known, driven = transfer["job"].isin(results.drives["job"]), results.drives["job"].isin(transfer["job"])
+    whole = bool(known.all()) and bool(driven.all())
+    return transfer[known], "" if whole else " The study has changed since; run the transfer again."
 
 
 def _page(
