@@ -288,3 +288,15 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path)
     assert code == 0
     assert "compared with the reference" in said.out
+    # Nor where an option is wrong; and no reference is taken away, whatever else is wrong.
+    code, said = invoke("check", "loose.toml", "--budget", "smok", "--out", tmp_path)
+    assert (code, "did you mean smoke?" in said.err) == (2, True)
+    assert not any(path.exists() for path in left)
+    (team / "wrong.toml").write_text(loose.replace("version = 1", "version = 3"))
+    for plan in ("loose.toml", "wrong.toml"):
+        code, said = invoke("check", plan, "--trust", "--out", "kept/smoke")
+        assert code == 2
+        assert "kept/smoke/check.json is a reference of the plan; choose another folder for the results" in said.err
+        assert (team / "kept/smoke/check.json").exists()
+    with pytest.raises(CheckError, match="is a reference of the plan"):
+        run_check(load_check("loose.toml", trust=True), magenta_shy(), "kept/smoke")

@@ -41,15 +41,15 @@ def check(
     from roadproof.controllers import load_controller
     from roadproof.errors import CheckError
     from roadproof.gate.check import clear, run_check
-    from roadproof.gate.plan import BUDGETS, load_check
+    from roadproof.gate.plan import BUDGETS, load_check, references_of
     from roadproof.gate.result import FILE
     from roadproof.gate.verdict import Status
     from roadproof.io.locks import hold
 
-    asked = None if budget is None else choice(budget, "budget", BUDGETS)
     if not is_dry_run():
         hold(out)
-        clear(out)
+        clear(out, references_of(plan))
+    asked = None if budget is None else choice(budget, "budget", BUDGETS)
     chosen = load_check(plan, budget=asked, trust=trust)
     if accept and chosen.reference is None:
         raise CheckError(f"--accept makes a reference, but {plan} names none; add [change] with reference")

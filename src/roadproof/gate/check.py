@@ -74,7 +74,7 @@ def run_check(
         on_progress: called in every stage with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
-        CheckError: the reference is missing, damaged, or was made under other conditions.
+        CheckError: the reference is missing, damaged, or was made under other conditions, or the folder is its own.
         ControllerError: the controller raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator is not there or stopped answering.
         OutputError: the folder cannot be written, or another process works in it.
@@ -85,7 +85,7 @@ def run_check(
     if processes > 1:
         require_picklable(controller)
     with working_in(folder):
-        clear(folder)
+        clear(folder, None if plan.reference is None else plan.reference.parents[1])
         if compare and plan.reference is not None:
             before = load_reference(plan.reference, architecture, plan)
         run = _Check(plan, controller, folder, before, device, processes, on_progress)
@@ -106,8 +106,18 @@ def run_check(
     return result
 
 
-def clear(folder: Path) -> None:
-    """Take away what an earlier check left for others, so that nobody takes it for this one's."""
+def clear(folder: Path, references: Path | None) -> None:
+    """Take away what an earlier check left for others, so that nobody takes it for this one's.
+
+    Args:
+        folder: the folder for the results of a check.
+        references: the folder in which the plan keeps its references; None where it names none.
+
+    Raises:
+        CheckError: the results would take the place of a reference.
+    """
+    if references is not None and folder.resolve().parent == references.resolve() and (folder / FILE).is_file():
+        raise CheckError(f"{folder / FILE} is a reference of the plan; choose another folder for the results")
     for name in OUTPUTS:
         (folder / name).unlink(missing_ok=True)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 from roadproof.compositing import Variation
 from roadproof.datatypes import Weather
@@ -145,6 +145,17 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
     except RoadproofError as error:
         raise CheckError(f"{path}: {error}") from None
     return plan
+
+
+def references_of(path: AnyPath) -> Path | None:
+    """The folder in which a plan keeps its references, whatever else is wrong with it; None where it names none."""
+    path = as_path(path)
+    try:
+        change = read_toml(path, CheckError).get("change")
+    except CheckError:
+        return None
+    named = cast("dict[str, object]", change).get("reference") if isinstance(change, dict) else None
+    return path.parent / named if isinstance(named, str) else None
 
 
 def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
