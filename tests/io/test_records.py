@@ -185,3 +185,15 @@ def test_numbers_that_are_none_are_refused_wherever_they_stand(tmp_path: Path, n
     path.write_text(f'{{"format": "f", "version": 1, "deep": [{{"a": {number}}}]}}')
     with pytest.raises(RoadproofError, match="is not valid JSON"):
         read_json(path, "f", 1, RoadproofError)
+
+
+def test_half_a_character_is_refused_and_a_whole_one_is_not(tmp_path: Path) -> None:
+    """No file could be written with it."""
+    path = tmp_path / "a.json"
+    for text, whole in ((r"\ud83d\ude97", True), (r"\uD83D", False), (r"\ude97 \ud83d", False)):
+        path.write_text(f'{{"format": "f", "version": 1, "deep": [{{"{text}": 1}}]}}')
+        if whole:
+            assert list(read_json(path, "f", 1, RoadproofError)["deep"][0]) == ["🚗"]
+            continue
+        with pytest.raises(RoadproofError, match="is not valid JSON .*surrogates not allowed"):
+            read_json(path, "f", 1, RoadproofError)

@@ -46,9 +46,11 @@ def parse_json(text: str) -> dict[str, Any]:
     Raises:
         TypeError: the text is something else than an object.
         ValueError, RecursionError: the text is not JSON, is too deep, or has a number that is none (NaN, infinity,
-            hundreds of digits).
+            hundreds of digits) or half a character.
     """
     content: object = json.loads(text, parse_int=_whole, parse_float=_finite, parse_constant=_finite)
+    if "\\ud" in text.lower():  # of such a half nothing could be written or printed
+        json.dumps(content, ensure_ascii=False).encode()
     if not isinstance(content, dict):
         raise TypeError("it holds no JSON object")
     return cast("dict[str, Any]", content)
