@@ -195,5 +195,5 @@ def test_half_a_character_is_refused_and_a_whole_one_is_not(tmp_path: Path) -> N
         if whole:
             assert list(read_json(path, "f", 1, RoadproofError)["deep"][0]) == ["🚗"]
             continue
-        with pytest.raises(RoadproofError, match="is not valid JSON .*surrogates not allowed"):
+        with pytest.raises(RoadproofError, match=r"is not valid JSON .*surrogates not allowed"):
             read_json(path, "f", 1, RoadproofError)

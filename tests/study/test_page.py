@@ -177,7 +177,21 @@ def test_pictures_need_no_files_of_jobs(finished, tmp_path):
     [
         ("paths.npz", b"no zip", StudyError, "paths.npz is damaged"),
         ("history.json", b"{}", StudyError, "history.json has format None"),
+        (
+            "history.json",
+            b"""{"format": "roadproof-study-history", "version": 1, "kind": "closed loop", "calls": [1, 2],
+            "seconds": [1, 2], "best": [1, 2], "deviation_m": [1]}""",
+            StudyError,
+            r"history.json is incomplete or damaged \(its deviation_m is not as long as its calls\)",
+        ),
         ("job.json", b"[]", StudyError, "job.json is damaged"),
+        (
+            "job.json",
+            b"""{"controller": "cil", "scenario": {"map_name": "town", "canvas": {"x_m": 0, "y_m": 0}},
+            "method": {"name": "BO", "search": "gradopt", "scheme": "odd"}}""",
+            StudyError,
+            "job.json is damaged .*odd",
+        ),
         ("pattern.json", b"{}", PatternError, "pattern.json has format None"),
     ],
 )

@@ -107,6 +107,12 @@ def test_variants_that_differ_otherwise_go_by_their_names():
     assert [heading.text for heading in table.header[1]] == ["K", "short", "long"]
 
 
+def test_variants_of_unknown_schemes_are_not_compared():
+    variants = [StatedMethod(name=name, search="gradopt") for name in ("GradOpt", "BO")]
+    rows = [row(method=method.name) for method in variants]
+    assert not any(table.name.startswith("ablation") for table in paper_tables(results(rows, variants)))
+
+
 def test_what_failed_is_noted_and_left_out_on_both_sides(records):
     broken = [each for each in records if (each["scenario"], each["method"]) != ("right-01", "BO")]
     broken += [bad("out of memory", scenario="right-01", method="BO", figures=k) for k in ("1", "5")]

@@ -48,6 +48,11 @@ class History(Progress):
     deviation_m: tuple[float, ...] | None = None
     driven: Progress | None = None
 
+    def __post_init__(self) -> None:
+        Progress.__post_init__(self)
+        if self.deviation_m and len(self.deviation_m) != len(self.calls):
+            raise ValueError("its deviation_m is not as long as its calls")
+
     @property
     def deviation(self) -> Progress | None:
         """The metres that the best patterns reached when driven, never a stand-in for them; None where unknown."""

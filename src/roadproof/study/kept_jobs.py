@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -37,7 +38,7 @@ class StatedMethod:
     name: str
     search: str = ""
     trajectories: int = 0
-    scheme: str = ""
+    scheme: Literal["", "group", "group-all", "random"] = ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -27,7 +27,7 @@ GAPS = "missing"
 def paper_tables(results: Results) -> tuple[Table, ...]:
     """Every table that makes sense for a study, in the paper's order; what failed comes last."""
     tables = [methods_table(results)]
-    gradopt = [method for method in results.methods if method.search == "gradopt"]
+    gradopt = [method for method in results.methods if method.search == "gradopt" and method.scheme]
     if len(gradopt) > 1:
         tables += [ablation_table(results, gradopt, metric) for metric in (DEVIATION, PENALTY)]
     taken: set[str] = set()
