@@ -55,6 +55,10 @@ def test_what_failed_or_is_missing_is_said():
         ([bad("no luck")], r"first of 1 that failed \(left-01, K = 1, GradOpt, seed 0\): no luck"),
         ([row(deviation_m=float("nan"))], "deviation_m is nan, expected a finite number"),
         ([row(points=None)], "points is None"),
+        ([row(figures=5)], "figures of the rows is .*5.*, expected text; run the study again"),
+        ([row(), row(method=None)], "method of the rows is .*, expected text"),
+        ([row(seed=float("nan"))], "seed of the rows is .*nan.*, expected a whole number"),
+        ([row(), row(weather=None)], "weather of the rows is .*, expected text"),
     ],
 )
 def test_rows_that_cannot_be_compared_are_named(rows, message):

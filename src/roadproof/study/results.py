@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
+from numbers import Integral
 
 import numpy as np
 
@@ -190,6 +191,7 @@ def results_of(rows: Frame, methods: Iterable[StatedMethod] = (), named: str | N
         job, reason = next(iter(failures.items()))
         raise StudyError(f"no job came to its end; the first of {len(failures)} that failed ({job}): {reason}")
     _check_columns(drives, [*CONDITION, *NUMBERS])
+    _check_kind(drives, "weather", str, "text")
     for name in NUMBERS:
         check_finite(drives, name)
     known = {method.name: method for method in methods}
@@ -209,11 +211,14 @@ def check_jobs(rows: Frame) -> None:
     """See that rows say which job each belongs to, and whether it failed.
 
     Raises:
-        StudyError: there is no row, or a column is missing.
+        StudyError: there is no row, a column is missing, or a job's column holds something else than it should.
     """
     if rows.empty:
         raise StudyError("the study has no rows yet; run it first")
     _check_columns(rows, [name for name in (*JobColumns.__annotations__, "error") if name != "job"])
+    for name in ("scenario", "kind", "figures", "method"):
+        _check_kind(rows, name, str, "text")
+    _check_kind(rows, "seed", Integral, "a whole number")
 
 
 def check_finite(rows: Frame, column: str) -> None:
@@ -238,3 +243,10 @@ def _check_columns(rows: Frame, columns: Iterable[str]) -> None:
     for column in columns:
         if column not in rows:
             raise StudyError(f"the study's rows have no column {column!r}; run the study again, finished jobs are kept")
+
+
+def _check_kind(rows: Frame, column: str, kind: type, expected: str) -> None:
+    for value in rows[column].unique():
+        if not isinstance(value, kind):
+            found = f"{column} of the rows is {value!r:.40}, expected {expected}"
+            raise StudyError(f"{found}; run the study again, finished jobs are kept")
