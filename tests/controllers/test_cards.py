@@ -31,6 +31,8 @@ def test_a_card_is_read_as_it_was_written(written):
     ("text", "message"),
     [
         ("{", "card net.json is not JSON"),
+        (100_000 * "[", "card net.json is not JSON"),
+        (card(width=0).replace("0", "9" * 5000), "card net.json is not JSON: an integer has 5000 digits"),
         ("[1]", r"holds \[1\] where a JSON object is expected"),
         ("{}", "not a controller card"),
         (card(version=2), "has version 2, this roadproof reads version 1"),

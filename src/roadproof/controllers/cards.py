@@ -22,7 +22,9 @@ from typing import Any, cast
 from roadproof.controllers.frames import FramePreparation
 from roadproof.controllers.tracking import LAWS, LinearMPC, PurePursuit, law_name
 from roadproof.errors import ControllerError
+from roadproof.io.files import one_line
 from roadproof.io.tables import build
+from roadproof.io.text import parse_json
 
 CARD_FORMAT = "roadproof-controller"
 CARD_VERSION = 1
@@ -105,10 +107,12 @@ def read_card(text: str, source: str) -> ControllerCard:
         ControllerError: the text is not a card, is of another version, or has an unknown key or a wrong kind of value.
     """
     try:
-        card: object = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ControllerError(f"card {source} is not JSON: {error}") from error
-    stated = _object(card, source)
+        stated = parse_json(text)
+    except TypeError:
+        shown = " ".join(text.split())
+        raise ControllerError(f"card {source} holds {shown:.60} where a JSON object is expected") from None
+    except (ValueError, RecursionError) as error:
+        raise ControllerError(f"card {source} is not JSON: {one_line(error)}") from None
     if stated.pop("format", None) != CARD_FORMAT:
         raise ControllerError(f'card {source} is not a controller card, expected "format": "{CARD_FORMAT}"')
     if (version := stated.pop("version", None)) != CARD_VERSION:
