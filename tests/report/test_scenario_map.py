@@ -1,5 +1,7 @@
 """The map with the scenarios: a picture that shows what it should."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +9,11 @@ import pytest
 from PIL import Image
 
 from roadproof.errors import OutputError, ScenarioError
+from roadproof.geometry import CanvasPlacement
+from roadproof.report.road_view import on_asphalt
 from roadproof.report.scenario_map import COLOURS, draw_scenarios
 from roadproof.roads.maps import load_map
-from roadproof.scenarios import builtin_scenarios
+from roadproof.scenarios import builtin_scenarios, find_scenario
 
 
 def count_of(path: Path, colour: str) -> int:
@@ -31,6 +35,22 @@ def test_kinds_that_are_not_asked_for_are_not_drawn(tmp_path: Path) -> None:
     draw_scenarios(lefts, load_map("town"), tmp_path / "map.png")
     assert count_of(tmp_path / "map.png", COLOURS["left"]) > 1000
     assert count_of(tmp_path / "map.png", COLOURS["right"]) == 0
+
+
+def test_a_way_of_four_points_is_drawn(tmp_path: Path) -> None:
+    scenario = find_scenario("straight-02")
+    start, canvas = scenario.start, scenario.canvas
+    goal = (start.x_m + 1.2 * math.cos(start.yaw_rad), start.y_m + 1.2 * math.sin(start.yaw_rad))
+    middle = {"x_m": (start.x_m + goal[0]) / 2, "y_m": (start.y_m + goal[1]) / 2, "width_m": 2.0, "length_m": 0.5}
+    short = replace(scenario, goal_m=goal, canvas=replace(canvas, **middle))
+    draw_scenarios([short], load_map("town"), tmp_path / "map.png")
+    assert (tmp_path / "map.png").exists()
+
+
+def test_a_ribbon_of_paint_fills_no_memory() -> None:
+    paint = np.zeros((8, 8, 4), np.uint8)
+    for width_m, size in ((1e-5, (4, 400)), (2.0, (4, 8)), (1e9, (4, 1))):
+        assert on_asphalt(paint, 4, CanvasPlacement(x_m=0.0, y_m=0.0, width_m=width_m, length_m=4.0)).size == size
 
 
 def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:

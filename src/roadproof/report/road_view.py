@@ -24,6 +24,8 @@ from roadproof.simulators.protocol import PatternImage
 
 ASPHALT = (92, 94, 98)
 DPI = 100
+MOST_TIMES_AS_LONG = 100
+"""The picture of a canvas is no longer than so many of its widths, or it might fill all memory."""
 
 Points = Float[np.ndarray, "n 2"]
 Box = tuple[float, float, float, float]
@@ -162,7 +164,7 @@ def pixels_of(figure: Figure) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def on_asphalt(paint: UInt8[np.ndarray, "s s 4"], width_px: int, canvas: CanvasPlacement | None) -> Image.Image:
-    """A pattern on asphalt in its true proportions, direction of travel upwards.
+    """A pattern on asphalt in its true proportions, within reason, direction of travel upwards.
 
     Args:
         paint: the pattern on the canvas, RGBA.
@@ -172,4 +174,5 @@ def on_asphalt(paint: UInt8[np.ndarray, "s s 4"], width_px: int, canvas: CanvasP
     road = Image.new("RGB", (paint.shape[1], paint.shape[0]), ASPHALT)
     road.paste(Image.fromarray(paint[..., :3]), (0, 0), Image.fromarray(paint[..., 3]))
     width, length = (1.0, 1.0) if canvas is None else (canvas.width_m, canvas.length_m)
-    return road.resize((width_px, max(round(width_px * length / width), 1)), Image.Resampling.LANCZOS)
+    height_px = round(width_px * min(length / width, MOST_TIMES_AS_LONG))
+    return road.resize((width_px, max(height_px, 1)), Image.Resampling.LANCZOS)

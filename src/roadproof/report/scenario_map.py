@@ -52,7 +52,7 @@ def _draw_scenario(axes: Axes, scenario: Scenario, way: Points, taken: list[tupl
     axes.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.6, alpha=0.85, zorder=5)
     axes.plot(way[0, 0], way[0, 1], "o", color=colour, markersize=5.5, markeredgecolor="white", zorder=7)
     arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.6}
-    axes.annotate("", xy=tuple(way[-1]), xytext=tuple(way[-5]), arrowprops=arrow, zorder=7)
+    axes.annotate("", xy=tuple(way[-1]), xytext=tuple(way[-5:][0]), arrowprops=arrow, zorder=7)
     corners = [(-0.5, -0.5, 1.0), (399.5, -0.5, 1.0), (399.5, 399.5, 1.0), (-0.5, 399.5, 1.0)]
     outline = (corners @ canvas.world_from_canvas.T)[:, :2]
     axes.fill(*outline.T, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=1.0, zorder=4)
