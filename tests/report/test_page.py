@@ -95,6 +95,16 @@ def test_the_figures_listed_are_those_of_the_pattern_that_was_chosen(tmp_path):
     assert "#e5cc1a" in report_of(tmp_path).text
 
 
+def test_how_conspicuous_is_told_of_the_pattern_that_is_shown(tmp_path):
+    write_run(tmp_path)
+    told = []
+    for pattern in (PATTERN, dataclasses.replace(PATTERN, colours=PATTERN.colours.flip(0))):
+        save_pattern(pattern, tmp_path / "pattern.json")
+        write_report(tmp_path)
+        told.append(read_result(tmp_path)["conspicuousness"])
+    assert told[0].keys() - told[1].keys() == {"the pattern"}
+
+
 def test_every_candidate_that_was_driven_is_shown_and_the_one_that_was_kept(tmp_path):
     write_run(tmp_path)
     assert "Chosen by driving" not in report_of(tmp_path).text

@@ -168,13 +168,11 @@ def _passage(run: Run) -> list[Fields]:
 
 def _pattern(run: Run) -> Fields | None:
     """What is painted, as it lies on the road."""
-    pattern, judged = run.pattern, run.judged
+    pattern, judged = _painted(run), run.judged
     canvas = None if judged is None else judged.evaluation.scenario.canvas
     size = canvas and (canvas.width_m, canvas.length_m)
     if judged is not None:
         paint = judged.paint
-        # Its figures are listed only if they are what was painted.
-        pattern = pattern if pattern is not None and np.array_equal(raster(pattern), paint) else None
     elif pattern is not None:
         paint = raster(pattern)
     else:
@@ -192,14 +190,22 @@ def _pattern(run: Run) -> Fields | None:
     }
 
 
+def _painted(run: Run) -> Pattern | None:
+    """The pattern of the run; None where the drives that are shown are over another one."""
+    pattern, judged = run.pattern, run.judged
+    is_shown = judged is None or (pattern is not None and np.array_equal(raster(pattern), judged.paint))
+    return pattern if is_shown else None
+
+
 def _conspicuous(run: Run) -> list[tuple[str, Conspicuousness]]:
     """How conspicuous the pattern of the run is, and the cheapest one."""
     known: list[tuple[str, Conspicuousness]] = []
-    if run.pattern is not None and run.recordings is not None:
+    pattern = _painted(run)
+    if pattern is not None and run.recordings is not None:
         limits = None if run.attack is None else run.attack.space.limits
         site = site_of(run.recordings)
-        known.append(("the pattern", conspicuousness(run.pattern, site if limits is None else limits.site(site))))
-    elif run.attack is not None and run.attack.conspicuousness is not None:
+        known.append(("the pattern", conspicuousness(pattern, site if limits is None else limits.site(site))))
+    elif pattern is not None and run.attack is not None and run.attack.conspicuousness is not None:
         known.append(("the pattern", run.attack.conspicuousness))
     if run.cheapest is not None:
         known.append((f"the least paint for {run.cheapest.wanted_m:g} m", run.cheapest.conspicuousness))
