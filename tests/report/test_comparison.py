@@ -65,6 +65,17 @@ def test_what_is_not_alike_is_said(runs, tmp_path):
     assert "offsets" not in [each["id"] for _, each in page.tags if "id" in each]
 
 
+def test_others_in_other_numbers_are_said(runs, tmp_path):
+    said = "with the same others on the road"
+    for name, cars in (("few", 20), ("again", 20), ("many", 200)):
+        made = dataclasses.replace(write_run(tmp_path / name), cars=cars)
+        assert made.of(traffic=True)
+        made.save(tmp_path / name / "evaluation", raster(PATTERN))
+    for other, differ in (("again", False), ("many", True)):
+        write_comparison([tmp_path / "few", tmp_path / other], tmp_path / "compare.html")
+        assert (said in (tmp_path / "compare.html").read_text()) is differ
+
+
 def write_predicted(folder):
     evaluation = dataclasses.replace(write_run(folder), paint=PaintKind.COMPOSITED)
     evaluation.save(folder / "evaluation", raster(PATTERN))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.datatypes import Weather
-from roadproof.driving.evaluation import ATTACK, EvaluationRow
+from roadproof.driving.evaluation import ATTACK, Evaluation, EvaluationRow
 from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import RoadproofError
@@ -144,6 +144,11 @@ def _conditions(trial: Trial) -> tuple[object, ...]:
     return trial.weather, trial.traffic, trial.seed if trial.traffic else 0, trial.start
 
 
+def _all_conditions(evaluation: Evaluation) -> tuple[object, ...]:
+    others = (evaluation.cars, evaluation.pedestrians) if evaluation.of(traffic=True) else ()
+    return frozenset(map(_conditions, evaluation.trials)), others
+
+
 def _cautions(runs: Sequence[Compared], *, same_place: bool) -> list[str]:
     """Why numbers beside each other may not be alike."""
     said: list[str] = []
@@ -151,7 +156,7 @@ def _cautions(runs: Sequence[Compared], *, same_place: bool) -> list[str]:
         said.append("They are of different stretches of road: how far a car deviates depends on the road too.")
     if len({each.predicted for each in runs}) > 1:
         said.append("Some were driven and some only predicted in recordings: their metres are not of one kind.")
-    if len({frozenset(map(_conditions, each.judged.evaluation.trials)) for each in runs}) > 1:
+    if len({_all_conditions(each.judged.evaluation) for each in runs}) > 1:
         said.append(
             "They were not judged in the same weathers, from the same starts, with the same others on the road."
         )
