@@ -92,13 +92,18 @@ MISTAKES = {
     ),
     "scenario": (('scenarios = ["test-road"]', 'scenarios = ["test-raod"]'), "did you mean 'test-road'"),
     "outside": (('scenario_file = "', 'scenario_file = "../'), "leaves the plan's folder"),
+    "patterns outside": (
+        ('patterns = "patterns"', 'patterns = "../out"'),
+        "patterns '../out' leaves the plan's folder",
+    ),
+    "recordings outside": (('["recordings"]', '["recordings", "/"]'), "recordings '/' leaves the plan's folder"),
     "patterns": (('patterns = "patterns"', 'patterns = "nowhere"'), "patterns 'nowhere' is no folder"),
     "nothing painted": (('patterns = "patterns"', ""), "nothing would be painted there"),
     "no smoke": (('[smoke]\nrecordings = ["recordings"]', ""), "add [smoke] with recordings"),
     "no recordings": (('recordings = ["recordings"]', 'recordings = ["nowhere"]'), "roadproof record test-road"),
     "weather": (
         ('recordings = ["recordings"]', 'recordings = ["recordings"]\nweathers = ["rainy-noon"]'),
-        "no recording of test-road at rainy-noon; make one with: roadproof record test-road --weather rainy-noon",
+        "add 'recordings-rainy-noon' to recordings and make one with: roadproof record test-road --weather rainy-noon",
     ),
     "change without a measure": ((LIMITS, LIMITS + CHANGE), "change needs reference"),
     "a change's key": (

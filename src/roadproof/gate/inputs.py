@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from roadproof.errors import CheckError
 from roadproof.io.files import check_name
 from roadproof.io.tables import each_once
 from roadproof.patterns import Pattern, load_pattern
+from roadproof.plans import beside
 from roadproof.scenarios import Scenario, find_scenario
 
 LONGEST_STEM = 40
@@ -44,13 +46,14 @@ def stored_patterns(
         known: all scenarios that a folder of patterns may be named after.
 
     Raises:
-        CheckError: the folder is missing or holds no pattern, a name is too long, or a scenario has two of one name.
+        CheckError: the folder is missing, does not lie beside the plan or holds no pattern, a name is too long, or a
+            scenario has two of one name.
         ScenarioError: a folder among the patterns is named after no scenario.
         PatternError: a file among the patterns is no pattern.
     """
     if listed is None:
         return {}
-    place = folder / listed
+    place = beside(folder, listed, "patterns", "plan", CheckError)
     if not place.is_dir():
         raise CheckError(f"patterns {listed!r} is no folder; expected one with pattern files (*.json)")
     for each in sorted(place.iterdir()):
@@ -91,11 +94,11 @@ def recordings_of(
         controller: the controller's spec, for the advice where a recording is missing.
 
     Raises:
-        CheckError: a recording is missing, or of another stretch of road.
+        CheckError: a recording is missing, or of another stretch of road, or a folder does not lie beside the plan.
         RecordingError: a recording is damaged.
     """
     found: dict[tuple[str, Weather], Path] = {}
-    for place in (folder / listed for listed in listed):
+    for place in (beside(folder, each, "recordings", "plan", CheckError) for each in listed):
         for scenario in scenarios:
             if not (run := place / scenario.name).is_dir():
                 continue
@@ -105,10 +108,18 @@ def recordings_of(
             found.setdefault((scenario.name, made.weather), run)
     for scenario in scenarios:
         for weather in weathers:
-            run = Path(folder / listed[0] if listed else "recordings", scenario.name)
             if (scenario.name, weather) not in found:
-                raise CheckError(
-                    f"no recording of {scenario.name} at {weather}; make one with: roadproof record {scenario.name} "
-                    f"--weather {weather} --driver {controller} --out {run.parent}; roadproof calibrate {run}"
-                )
+                raise CheckError(_missing(folder, listed, scenario, weather, controller))
     return found
+
+
+def _missing(folder: Path, listed: tuple[str, ...], scenario: Scenario, weather: Weather, controller: str) -> str:
+    name, added = Path(listed[0] if listed else "recordings").as_posix(), ""
+    if (folder / name / scenario.name).exists():
+        # A run is of one weather, so that another has a folder of its own.
+        name = f"{name}-{weather}"
+        added = f"add {name!r} to recordings and "
+    place = folder / name
+    words = ["record", scenario.name, "--weather", weather, "--driver", controller, "--out", str(place)]
+    made = [shlex.join(["roadproof", *each]) for each in (words, ["calibrate", str(place / scenario.name)])]
+    return f"no recording of {scenario.name} at {weather}; {added}make one with: {'; '.join(made)}"
