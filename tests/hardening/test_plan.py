@@ -1,15 +1,22 @@
 """What tells one hardening from another."""
 
+from dataclasses import replace
+
 import pytest
 
 import needs
 from hardening_road import SPACE
 from painted_ground import RampFollower
+from roadproof.attacks import TPE
+from roadproof.datatypes import Weather
 from roadproof.errors import RoadproofError
 from roadproof.hardening.budget import HardeningBudget
+from roadproof.hardening.judgement import clean_drives
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.tuning import training_step
 from roadproof.io.identity import require_same
+from roadproof.patterns import Shape
+from roadproof.scenarios import find_scenario
 
 needs.town()
 from roadproof.simulators.town.simulator import TownSimulator
@@ -28,3 +35,28 @@ def test_an_edited_training_step_is_another_hardening(tmp_path):
     for other in (parts[0], parts[2]):
         with pytest.raises(RoadproofError, match="holds a hardening with training step"):
             require_same(tmp_path, "a hardening", parts[1], other, RoadproofError)
+
+
+def test_a_street_that_is_named_twice_is_driven_over_once(tmp_path):
+    street = replace(find_scenario("left-03"), time_limit_s=0.2)
+    with TownSimulator() as town:
+        drives = clean_drives(town, RampFollower(), [street, street], [Weather.CLEAR_NOON], tmp_path)
+    assert (drives.drives, drives.failed) == (1, ("left-03, clear-noon",))
+
+
+def test_judging_otherwise_is_the_same_hardening(tmp_path):
+    usual = HardeningBudget()
+    parts = [
+        HardeningPlan(
+            spec="pilotnet", scenarios=(), folder=tmp_path, budget=budget, space=SPACE, seed=0, device="cpu"
+        ).made_of(TownSimulator(), RampFollower(), training_step)
+        for budget in (
+            usual,
+            replace(usual, clean_weathers=(Weather.RAINY_NOON,), unseen=TPE(calls=7), unseen_shape=Shape.TRIANGLE),
+            replace(usual, town_drives=7),
+        )
+    ]
+    require_same(tmp_path, "a hardening", parts[0], parts[1], RoadproofError)
+    assert parts[0]["budget"] == repr(replace(usual, judge=usual.attack)), "as before judging was left out"
+    with pytest.raises(RoadproofError, match="holds a hardening with budget"):
+        require_same(tmp_path, "a hardening", parts[0], parts[2], RoadproofError)

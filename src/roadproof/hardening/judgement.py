@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -257,7 +258,7 @@ def clean_drives(
         OutputError: the folder cannot be written.
     """
     failed: list[str] = []
-    asked = [(scenario, weather) for scenario in scenarios for weather in weathers]
+    asked = list(dict.fromkeys(product(scenarios, weathers)))
     for done, (scenario, weather) in enumerate(asked, 1):
         episodes = Episodes.of(simulator, controller, scenario, {}, folder / scenario.name)
         drive = DriveConditions(paint=CLEAN, weather=weather)

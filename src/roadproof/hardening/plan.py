@@ -87,16 +87,17 @@ class HardeningPlan:
 
     def made_of(self, simulator: Simulator, teacher: Controller, step: TrainingStep) -> dict[str, object]:
         """What identifies the hardening; judging may be asked for later."""
-        view = simulator.input
+        view, usual, attack = simulator.input, HardeningBudget(), self.budget.attack
+        judging = {name: getattr(usual, name) for name in ("unseen", "unseen_shape", "clean_weathers")}
         return {
             "controller": self.spec,
             "world": world_of(simulator),
             **parts_of(teacher, (view.height_px, view.width_px)),
             "scenarios": [identity(each) for each in self.scenarios],
-            "budget": without_addresses(repr(replace(self.budget, judge=self.budget.attack))),
-            "objective": own_objective(self.budget.attack.objective),
+            "budget": without_addresses(repr(replace(self.budget, judge=attack, **judging))),
+            "objective": own_objective(attack.objective),
             "space": repr(self.space),
-            "variation": repr(variation_of(self.budget.attack.objective)),
+            "variation": repr(variation_of(attack.objective)),
             "seed": self.seed,
             "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",
             "training step's source": known_by(step),
