@@ -155,6 +155,13 @@ def test_methods_whose_names_look_alike_keep_their_files_apart():
     assert {"overall-a-b", "overall-a-b-2"} <= set(tables)
 
 
+def test_methods_with_long_names_have_files_of_names_that_are_not_too_long():
+    names = ("GradOpt", "long " * 50 + "one", "long " * 50 + "other")
+    tables = tables_of([row(method=name) for name in names])
+    assert len([name for name in tables if name.startswith("overall-long-long")]) == 2
+    assert max(map(len, tables)) < 100
+
+
 def test_an_unknown_search_is_compared_too():
     assert methods_table(results([row(method="own")])).rows[0][1] == "own"
 

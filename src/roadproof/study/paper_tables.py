@@ -20,6 +20,8 @@ from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
 from roadproof.study.table_notes import table_note
 
 SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}
+LONGEST_NAME = 60
+"""Of a method in the name of a table's file, which must not be longer than file names may be."""
 GAPS = "missing"
 """The table of what failed or is missing; there is none where nothing is."""
 
@@ -32,7 +34,7 @@ def paper_tables(results: Results) -> tuple[Table, ...]:
         tables += [ablation_table(results, gradopt, metric) for metric in (DEVIATION, PENALTY)]
     taken: set[str] = set()
     for theirs in results.rivals:
-        name = slug(theirs.name)
+        name = slug(theirs.name)[:LONGEST_NAME].strip("-")
         while name in taken:
             name += "-2"
         taken.add(name)
