@@ -64,6 +64,19 @@ def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_pa
     assert len(list((tmp_path / "out" / "transfer").rglob("episodes/*.npz"))) == 4
 
 
+def test_a_dry_run_counts_traffic_in_the_weathers_that_have_some(study, tmp_path, monkeypatch):
+    monkeypatch.setattr("roadproof.pipeline.workload.frame_seconds", lambda *_, **__: 0.002)
+    text = PLAN.replace("starts =", 'weathers = ["clear-noon", "rainy-noon"]\nstarts =')
+    drives = []
+    for more in ("", '[traffic]\nruns = 3\nweathers = "first"', "[traffic]\nruns = 3"):
+        plan = write_plan(tmp_path, text + more)
+        code, printed = study("run", plan, "--dry-run", "--json", "--out", tmp_path / "out")
+        assert code == 0, printed.err
+        drives.append(answered(printed.out)["drives"])
+    alone = 2 + 2 * 2  # one pattern tried, beside the bare road; then each way of driving in two weathers
+    assert drives == [alone, alone + 2 * 3, alone + 2 * 3 * 2]
+
+
 BLIND = """
 class Blind:
     input_size = None

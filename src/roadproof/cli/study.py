@@ -69,11 +69,12 @@ def run(
 
 def _workload(study: Study, who: Controller, workers: int) -> Workload:
     """All jobs, also of those that are done already."""
-    from roadproof.pipeline.workload import Workload, of_drives, of_evaluation, of_run
+    from roadproof.pipeline.workload import Workload, of_drives, of_run
     from roadproof.study.methods import BlackBoxPlan, budget_of
 
-    traffic, whole = study.traffic, Workload()
-    judged = of_evaluation(len(study.weathers), study.starts.count, traffic.runs if traffic else 0, film=False)
+    traffic, weathers, whole = study.traffic, len(study.weathers), Workload()
+    crowded = 0 if traffic is None else traffic.runs * (1 if traffic.weathers == "first" else weathers)
+    judged = of_drives(2 * weathers * study.starts.count, 2 * crowded)
     for method in study.methods:
         budget = replace(budget_of(method, study.weathers[0]), starts=0, runs=0)
         if isinstance(method, BlackBoxPlan) and method.where == "simulator":
