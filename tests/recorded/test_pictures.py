@@ -170,6 +170,15 @@ def test_what_a_turned_car_sees_comes_from_a_frame_that_looked_that_way(bank):
     assert helped[:40].mean() < 0.3 * alone[:40].mean()
 
 
+def test_no_sky_is_painted_on_ground_that_lies_behind_the_frame_that_looked_the_same_way():
+    road = recorded_road()
+    ahead = recorded(Side.LEFT, 0.6, yaw_rad=0.3, name="left-2", from_m=-9.0, every=100)
+    bank = FrameBank(dataclasses.replace(road, recordings=(*road.recordings, ahead)))
+    shown = levels(seen_from(bank, [pose(-14.0, 0.1, 0.3)]).frames)[0]
+    # The sky is at least 170 blue, the ground at most 142.
+    assert shown[bank.horizon_row :, :, 2].max() < 147
+
+
 def test_a_set_that_cannot_be_driven_in_says_what_it_lacks():
     road = recorded_road(every=8)
     with pytest.raises(RecordingError, match="where its canvas lies"):

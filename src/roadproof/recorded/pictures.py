@@ -98,6 +98,7 @@ MISSED = 0.04
 
 
 _FURTHEST_M = 1e4
+_IN_FRONT = 1e-6
 
 
 class FrameBank:
@@ -268,7 +269,8 @@ class FrameBank:
         if lens is None:
             above, below = ((self._halves_from_px @ part).float() for part in (above, below))
             mapped = torch.cat([above @ self._sky, below @ self._ground], 2)
-            return mapped[:, :2] / mapped[:, 2:]
+            # What is behind the camera would come out mirrored, in the sky; it is far outside the frame.
+            return mapped[:, :2] / mapped[:, 2:].clamp_min_(_IN_FRONT)
         above, below = ((self._rays_from_input @ part).float() for part in (above, below))
         rays = torch.where(self._is_sky, above @ self._pixels, below @ self._pixels)
         scale, middle = self._halves_from_rays.diagonal()[:2].float(), self._halves_from_rays[:2, 2].float()
