@@ -17,6 +17,7 @@ from roadproof.drives.own.plan import GroundPoint
 from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, homography_from_pose
 from roadproof.io.pictures import read_picture
+from roadproof.recorded import RecordedWorld
 from roadproof.recordings import Side
 from roadproof.search_space import SearchSpace
 
@@ -74,6 +75,10 @@ def test_corners_of_the_canvas_give_poses_and_its_size(tmp_path):
     assert recordings.is_placed
     assert recordings.canvas.width_m == pytest.approx(CANVAS.width_m, rel=0.01)
     assert recordings.canvas.length_m == pytest.approx(CANVAS.length_m, rel=0.01)
+    clean = recordings.recordings[0]
+    assert len(clean.frames) == 40
+    assert np.diff(clean.track.step).tolist() == [1] * 71  # of all rows, though not all frames are kept
+    assert RecordedWorld(recordings).course.count > 60
 
 
 def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():

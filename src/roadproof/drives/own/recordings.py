@@ -32,6 +32,7 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded import placed
 from roadproof.recordings import Recording, RecordingSet, Track, evenly
+from roadproof.recordings.recording import PER_FRAME
 
 WINDOW = Window(frames=40, least_px=8)
 """Frames that are kept of a drive, as a recording for the recorded world has them."""
@@ -69,9 +70,10 @@ def import_drives(folder: AnyPath) -> RecordingSet:
     if len(tables) == 1 and tables[0].tells_no_place:
         tables, agreed = _with_motion(folder, own, tables[0])
         given["origin"] += f"; speed and yaw rate seen in {agreed}"
-    if all(name in table.numbers for table in tables for name in CORNERS):
-        return _from_corners(folder, own, tables, given)
-    return _from_poses(folder, own, tables, given)
+    cornered = all(name in table.numbers for table in tables for name in CORNERS)
+    whole = (_from_corners if cornered else _from_poses)(own, tables, given)
+    drives = zip(tables, whole.recordings, strict=True)
+    return replace(whole, recordings=tuple(_with_pictures(folder, own, *each) for each in drives))
 
 
 def _with_camera(folder: Path, own: OwnDrives) -> tuple[OwnDrives, str]:
@@ -105,7 +107,7 @@ def _with_motion(folder: Path, own: OwnDrives, table: Table) -> tuple[list[Table
     return [replace(table, numbers={**found, **table.numbers})], agreed
 
 
-def _from_poses(folder: Path, own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
+def _from_poses(own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
     tracks = [track_of(own, table, alone=len(tables) == 1) for table in tables]
     canvas = canvas_on(own, tracks[0])
     drives: list[Recording] = []
@@ -118,53 +120,60 @@ def _from_poses(folder: Path, own: OwnDrives, tables: Sequence[Table], given: Ma
                 f"drive {table.drive.name} never sees {WINDOW.least_px} pixels of the canvas at x_m {canvas.x_m:.1f}, "
                 f"y_m {canvas.y_m:.1f}; check the camera, or where the canvas lies"
             )
-        kept = shown[evenly(len(shown), WINDOW.frames)]
-        seen = np.stack([homography_from_pose(own.camera, track.state(int(step)), canvas) for step in kept])
-        drives.append(_recording(folder, own, table, kept, seen, track.speed_mps[kept], track))
+        seen = np.stack([homography_from_pose(own.camera, track.state(int(step)), canvas) for step in shown])
+        drives.append(_unpictured(own, table, shown, seen, track.speed_mps[shown], track))
     return RecordingSet(**given, recordings=tuple(drives), canvas=canvas)
 
 
-def _from_corners(folder: Path, own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
+def _from_corners(own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any]) -> RecordingSet:
     drives: list[Recording] = []
     controls: dict[str, Float[np.ndarray, "f 3"]] = {}
     for table in tables:
-        kept = table.pictured[evenly(len(table.pictured), WINDOW.frames)]
-        corners = np.stack([table.numbers[name][kept] for name in CORNERS], 1).reshape(-1, 4, 2)
+        rows = table.pictured
+        corners = np.stack([table.numbers[name][rows] for name in CORNERS], 1).reshape(-1, 4, 2)
         try:
             seen = np.stack([homography_from_points(_CORNERS_PX, own.camera.straightened(four)) for four in corners])
         except GeometryError as error:
             raise RecordingError(f"{table.drive.table}, corners of the canvas: {error}") from None
-        drives.append(_recording(folder, own, table, kept, seen, table.needed("speed_mps")[kept]))
-        columns = [table.column(name)[kept] for name in ("steer", "throttle", "brake")]
+        drives.append(_unpictured(own, table, rows, seen, table.needed("speed_mps")[rows]))
+        columns = [table.column(name)[rows] for name in ("steer", "throttle", "brake")]
         controls[table.drive.name] = np.stack(columns, 1)
     return placed(RecordingSet(**given, recordings=tuple(drives)), dt_s=own.dt_s, controls=controls)
 
 
-def _recording(
-    folder: Path,
+def _unpictured(
     own: OwnDrives,
     table: Table,
-    kept: Int[np.ndarray, " f"],
+    rows: Int[np.ndarray, " f"],
     seen: Float[np.ndarray, "f 3 3"],
     speed_mps: Float[np.ndarray, " f"],
     track: Track | None = None,
 ) -> Recording:
-    command = table.column("command", 2.0)[kept]
+    """The recording of some rows, all of which tell where the car was; its frames are not read yet, and black."""
+    command = table.column("command", 2.0)[rows]
     odd = command[(command != command.round()) | (np.abs(command) > 100)]
     if odd.size:
         raise RecordingError(f"{table.drive.table}: command {odd[0]:g} is no command, expected 2, 3, 4 or 5")
     return Recording(
         name=table.drive.name,
         side=table.drive.side,
-        frames=np.stack([_frame(folder, own, table.pictures[int(step)]) for step in kept]),
-        frame_number=kept.astype(np.int64),
+        frames=np.broadcast_to(np.uint8(0), (len(rows), own.input.height_px, own.input.width_px, 3)),
+        frame_number=rows.astype(np.int64),
         image_from_canvas=seen,
         speed_mps=speed_mps,
         command=command.astype(np.int64),
-        steer=table.needed("steer")[kept],
+        steer=table.needed("steer")[rows],
         track=track,
         weather=table.drive.weather,
     )
+
+
+def _with_pictures(folder: Path, own: OwnDrives, table: Table, drive: Recording) -> Recording:
+    """The frames of a drive that are kept; its track stays whole."""
+    kept = evenly(len(drive.frames), WINDOW.frames)
+    rows = {name: getattr(drive, name)[kept] for name in PER_FRAME}
+    frames = np.stack([_frame(folder, own, table.pictures[int(step)]) for step in rows["frame_number"]])
+    return replace(drive, frames=frames, **rows)
 
 
 def _picture(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
