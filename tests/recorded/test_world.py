@@ -13,6 +13,7 @@ from roadproof.patterns import Pattern
 from roadproof.recorded.vehicle import Vehicle
 from roadproof.recorded.world import UNSURE, BiasedStart, RecordedWorld
 from roadproof.recordings import Side
+from roadproof.recordings.recording import PER_FRAME
 
 VEHICLE = dataclasses.replace(
     Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.1), pulling=(4.0, -8.0, -0.4, 0.0, 0.0)
@@ -179,6 +180,30 @@ def test_sets_too_thin_to_drive_in_are_one_clear_line():
     )
     with pytest.raises(RecordingError, match="no pose for frame"):
         dataclasses.replace(clean, track=few)
+
+
+def without(drive, steps):
+    """A drive whose log lost some steps."""
+    kept, shown = ~np.isin(drive.track.step, steps), ~np.isin(drive.frame_number, steps)
+    known = {field.name: getattr(drive.track, field.name)[kept] for field in dataclasses.fields(drive.track)[1:]}
+    frames = {name: getattr(drive, name)[shown] for name in ("frames", *PER_FRAME)}
+    return dataclasses.replace(drive, track=dataclasses.replace(drive.track, **known), **frames)
+
+
+def test_steps_that_the_clean_log_lost_end_no_drive(world):
+    road = recorded_road()
+    clean, *others = road.recordings
+
+    def course(lost):
+        known = dataclasses.replace(road, recordings=(without(clean, lost), *others))
+        return RecordedWorld(known, vehicle=VEHICLE).course
+
+    # A long gap before the first frame, which is step 6, is not on the way.
+    for lost in ([30], [30, 31, 40], range(1, 6)):
+        whole, found = (each.poses.x_m[each.first :][: each.count] for each in (world.course, course(lost)))
+        assert found.tolist() == pytest.approx(whole.tolist())
+    with pytest.raises(RecordingError, match="lacks steps 30 to 35, between its first frame and the canvas' end"):
+        course(range(30, 36))
 
 
 class Smoothed(RampFollower):

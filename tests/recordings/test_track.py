@@ -37,6 +37,16 @@ def test_stretches_end_where_a_step_is_left_out():
     assert list(track((7,)).stretches()) == [slice(0, 1)]
 
 
+def test_steps_that_a_log_lost_lie_evenly_between_others():
+    turned = replace(track(), yaw_rad=np.array([3.0, 3.1, -3.1, -3.1, -3.1, -3.1]))
+    filled = turned.filled(0.35)
+    assert filled.step.tolist() == list(range(3, 13))
+    np.testing.assert_allclose(filled.x_m, 0.5 * filled.step)
+    assert np.abs(np.diff(filled.yaw_rad)).max() < 0.11  # over half a turn, not all the way back
+    assert track().filled(0.25).step.tolist() == [3, 4, 5, 8, 9, 12]
+    assert np.array_equal(track((7, 8, 9)).filled(0.5).steer, track((7, 8, 9)).steer)
+
+
 def test_a_state_holds_the_pose_of_its_row():
     state = track().state(3)
     assert (state.x_m, state.y_m, state.z_m, state.speed_mps) == (4.0, 0.0, 0.0, 5.0)

@@ -31,6 +31,7 @@ from roadproof.recorded.vehicle import curvatures
 from roadproof.recordings import Track
 
 _FAR_M = 4.0
+_LONGEST_GAP_S = 0.5
 
 
 class Place(NamedTuple):
@@ -57,23 +58,33 @@ class Course:
         device: torch device on which cars are compared with the path.
 
     Raises:
-        RecordingError: the drive is too short, or does not move.
+        RecordingError: the drive is too short, does not move, or is not known all the way to the canvas' end.
     """
 
     def __init__(
         self, track: Track, canvas: CanvasPlacement, shown: int, *, device: torch.device | str = "cpu"
     ) -> None:
-        rows = max(track.stretches(), key=lambda part: part.stop - part.start)
+        # A log may lose a step; in longer gaps the way may bend.
+        track = track.filled(_LONGEST_GAP_S)
+        begin = int(track.rows(np.array([shown]))[0])
+        rows = next(part for part in track.stretches() if begin < part.stop)
+        seen = passage(np.stack([track.x_m, track.y_m], 1), canvas)
+        if seen.stop > rows.stop:
+            last, on = track.step[rows.stop - 1 : rows.stop + 1]
+            raise RecordingError(
+                f"the clean drive's track lacks steps {last + 1} to {on - 1}, between its first frame and the canvas' "
+                f"end; expected gaps of at most {_LONGEST_GAP_S:g} s there; add them, or record it again"
+            )
         if rows.stop - rows.start < 3:
             raise RecordingError("the clean drive has fewer than three steps that follow each other; record more of it")
         x, y = track.x_m[rows] - canvas.x_m, track.y_m[rows] - canvas.y_m
         moved = np.hypot(np.diff(x), np.diff(y))
         if moved.sum() < 1.0:
             raise RecordingError("the clean drive moves less than a metre past the canvas; check its track")
-        seen = passage(np.stack([track.x_m[rows], track.y_m[rows]], 1), canvas)
+        seen = slice(max(seen.start - rows.start, 0), seen.stop - rows.start)
         kappa = curvatures(track, rows)
         self.seen, self.dt_s = seen, track.dt_s
-        self.first = max(seen.start, shown - int(track.step[rows][0]))
+        self.first = max(seen.start, begin - rows.start)
         self.count = seen.stop - self.first
         self.canvas = canvas
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -103,6 +103,17 @@ class Track:
         return VehicleState(
             float(self.x_m[row]), float(self.y_m[row]), 0.0, float(self.yaw_rad[row]), float(self.speed_mps[row])
         )
+
+    def filled(self, longest_s: float) -> Track:
+        """The same drive with the steps that are left out in gaps of at most so many seconds, evenly between others."""
+        ends = self.step.tolist()
+        parts = [
+            range(one, other) if (other - one) * self.dt_s <= longest_s else [one] for one, other in pairwise(ends)
+        ]
+        step = np.concatenate([*parts, ends[-1:]]).astype(np.int64)
+        known = {field.name: getattr(self, field.name) for field in fields(self)[2:]}
+        known["yaw_rad"] = np.unwrap(self.yaw_rad)
+        return replace(self, step=step, **{name: np.interp(step, ends, values) for name, values in known.items()})
 
     def stretches(self) -> Iterator[slice]:
         """Slices of the rows whose steps follow each other without a gap."""
