@@ -81,6 +81,18 @@ def test_corners_of_the_canvas_give_poses_and_its_size(tmp_path):
     assert RecordedWorld(recordings).course.count > 60
 
 
+def test_a_log_that_ends_before_the_canvas_is_refused(tmp_path):
+    folder = write_own(tmp_path / "own", ["clean", "right"])
+    rows = {name: (folder / f"{name}.csv").read_text().splitlines()[:61] for name in ("clean", "right")}
+    (folder / "right.csv").write_text("\n".join(rows["right"]))
+    assert len(import_drives(folder).recordings) == 2  # what is perturbed may end where it likes
+    (folder / "clean.csv").write_text("\n".join(rows["clean"]))
+    with pytest.raises(
+        RecordingError, match=r"drive clean ends 13\.\d m before the canvas; give the rows of clean.csv"
+    ):
+        import_drives(folder)
+
+
 def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():
     true = replace(CIL_CAMERA, up_m=1.62, pitch_deg=-11.0, fov_deg=88.0)
     places = np.array([[6.0, -1.5], [6.0, 1.5], [14.0, -3.0], [25.0, 2.0]])

@@ -96,6 +96,21 @@ def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
     return CanvasPlacement(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, **size)
 
 
+def check_passes(table: Table, track: Track, canvas: CanvasPlacement) -> None:
+    """See that a drive does not end before the canvas, where the recorded world would end with it.
+
+    Raises:
+        RecordingError: it does; the message says by how much.
+    """
+    x_m, y_m = track.x_m - canvas.x_m, track.y_m - canvas.y_m
+    short_m = -float(x_m[-1] * math.cos(canvas.yaw_rad) + y_m[-1] * math.sin(canvas.yaw_rad)) - canvas.length_m / 2
+    if short_m > 0 and np.hypot(x_m, y_m).argmin() == len(track) - 1:
+        raise RecordingError(
+            f"drive {table.drive.name} ends {short_m:.1f} m before the canvas; give the rows of {table.drive.table} up "
+            "to the canvas' end, or place it nearer"
+        )
+
+
 def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint], *, fov_known: bool = False) -> CameraModel:
     """The camera with height, pitch and field of view fitted so that known ground points are where they are seen.
 

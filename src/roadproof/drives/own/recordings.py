@@ -20,7 +20,7 @@ from roadproof.drives.own.boards import boards_in
 from roadproof.drives.own.chessboard import calibrated
 from roadproof.drives.own.motion import motion_of
 from roadproof.drives.own.pictures import camera_picture
-from roadproof.drives.own.place import canvas_on, fitted_camera, track_of
+from roadproof.drives.own.place import canvas_on, check_passes, fitted_camera, track_of
 from roadproof.drives.own.plan import PLAN, OwnColour, OwnDrives, read_plan
 from roadproof.drives.own.table import CORNERS, Table, read_table
 from roadproof.drives.record import in_view
@@ -31,7 +31,7 @@ from roadproof.homographies import apply_homography, homogeneous, homography_fro
 from roadproof.io.files import AnyPath, as_path
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded import placed
-from roadproof.recordings import Recording, RecordingSet, Track, evenly
+from roadproof.recordings import Recording, RecordingSet, Side, Track, evenly
 from roadproof.recordings.recording import PER_FRAME
 
 WINDOW = Window(frames=40, least_px=8)
@@ -55,7 +55,8 @@ def import_drives(folder: AnyPath) -> RecordingSet:
 
     Raises:
         RecordingError: a file is missing or damaged, a column is missing or has no number, poses jump, the canvas is
-            not in view, or known points or chessboards do not agree with the camera; the message names it.
+            not in view or not reached, or known points or chessboards do not agree with the camera; the message names
+            it.
     """
     folder = as_path(folder)
     own = read_plan(folder)
@@ -120,6 +121,8 @@ def _from_poses(own: OwnDrives, tables: Sequence[Table], given: Mapping[str, Any
                 f"drive {table.drive.name} never sees {WINDOW.least_px} pixels of the canvas at x_m {canvas.x_m:.1f}, "
                 f"y_m {canvas.y_m:.1f}; check the camera, or where the canvas lies"
             )
+        if table.drive.side is Side.CLEAN:
+            check_passes(table, track, canvas)
         seen = np.stack([homography_from_pose(own.camera, track.state(int(step)), canvas) for step in shown])
         drives.append(_unpictured(own, table, shown, seen, track.speed_mps[shown], track))
     return RecordingSet(**given, recordings=tuple(drives), canvas=canvas)
