@@ -120,6 +120,17 @@ def test_pixel_maps_travel_with_their_drive(tmp_path):
     assert torch.equal(loaded.visible, maps.visible)
 
 
+@pytest.mark.parametrize("shape", [(3, 88, 200, 3), (1, 88, 200, 3), (2, 87, 200, 3)])
+def test_pixel_maps_of_other_frames_are_refused(tmp_path, shape):
+    save_recordings(recording_set(frames=2), tmp_path / "set")
+    maps = {"gain": np.ones(shape), "offset": np.zeros(shape), "visible": np.ones(shape[:3])}
+    np.savez(tmp_path / "set" / "clean" / "shading.npz", **maps)
+    with pytest.raises(
+        RecordingError, match=r"drive clean: its pixel maps .* expected that of its frames, \(2, 88, 200"
+    ):
+        load_recordings(tmp_path / "set")
+
+
 def test_a_thinned_drive_ends_with_the_same_frame_and_keeps_what_belongs_to_each():
     maps = PixelMaps(torch.rand(8, 88, 200, 3), torch.zeros(8, 88, 200, 3), torch.ones(8, 88, 200))
     drive = replace(recording(Side.CLEAN, frames=8), maps=maps)

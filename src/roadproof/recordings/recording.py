@@ -53,8 +53,8 @@ class Recording:
         weather: name of the weather that the drive was recorded in; empty if it is not known.
 
     Raises:
-        RecordingError: a frame has no pose in the track, lengths differ, a value is not finite or outside its range,
-            or a homography is not a view of the canvas.
+        RecordingError: a frame has no pose in the track, lengths or shapes differ, a value is not finite or outside its
+            range, or a homography is not a view of the canvas.
     """
 
     name: str
@@ -86,6 +86,11 @@ class Recording:
                 number = self.frame_number[bad[0]]
                 raise RecordingError(f"drive {self.name}: {field} of frame {number} is NaN or infinite; drop the frame")
         self._check_ranges()
+        if self.maps is not None and self.maps.gain.shape != self.frames.shape:
+            raise RecordingError(
+                f"drive {self.name}: its pixel maps (shading.npz) have shape {tuple(self.maps.gain.shape)}, expected "
+                f"that of its frames, {self.frames.shape}; drop the same frames from both, or calibrate it again"
+            )
         for number, homography in zip(self.frame_number, self.image_from_canvas, strict=True):
             try:
                 check_image_from_canvas(homography)
