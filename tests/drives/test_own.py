@@ -234,3 +234,14 @@ def test_columns_are_known_or_named(tmp_path):
     table.unlink()
     with pytest.raises(RecordingError, match="cannot read"):
         import_drives(folder)
+
+
+def test_a_table_needs_a_picture_and_corners_that_are_the_canvas(tmp_path):
+    folder = write_own(tmp_path / "own", ["clean"], CORNER_NAMES, PLAN[: PLAN.index("[canvas]")])
+    changed_table(folder / "clean.csv", 2, **dict.fromkeys(CORNER_NAMES, "100.0"))
+    with pytest.raises(RecordingError, match=r"clean.csv, row 3, corners of the canvas: "):
+        import_drives(folder)
+    for row in range(len((folder / "clean.csv").read_text().splitlines()) - 1):
+        changed_table(folder / "clean.csv", row, picture="")
+    with pytest.raises(RecordingError, match=r"clean.csv names no picture in \d+ rows"):
+        import_drives(folder)

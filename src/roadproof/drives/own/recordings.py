@@ -27,7 +27,7 @@ from roadproof.drives.record import in_view
 from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, homography_from_pose
-from roadproof.homographies import apply_homography, homogeneous, homography_from_points
+from roadproof.homographies import Homography, apply_homography, homogeneous, homography_from_points
 from roadproof.io.files import AnyPath, as_path
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded import placed
@@ -134,11 +134,14 @@ def _from_corners(own: OwnDrives, tables: Sequence[Table], given: Mapping[str, A
     for table in tables:
         rows = table.pictured
         corners = np.stack([table.numbers[name][rows] for name in CORNERS], 1).reshape(-1, 4, 2)
-        try:
-            seen = np.stack([homography_from_points(_CORNERS_PX, own.camera.straightened(four)) for four in corners])
-        except GeometryError as error:
-            raise RecordingError(f"{table.drive.table}, corners of the canvas: {error}") from None
-        drives.append(_unpictured(own, table, rows, seen, table.needed("speed_mps")[rows]))
+        seen: list[Homography] = []
+        for row, four in zip(rows, corners, strict=True):
+            try:
+                seen.append(homography_from_points(_CORNERS_PX, own.camera.straightened(four)))
+            except GeometryError as error:
+                told = f"{table.drive.table}, row {row + 1}, corners of the canvas: {error}"
+                raise RecordingError(told) from None
+        drives.append(_unpictured(own, table, rows, np.stack(seen), table.needed("speed_mps")[rows]))
         columns = [table.column(name)[rows] for name in ("steer", "throttle", "brake")]
         controls[table.drive.name] = np.stack(columns, 1)
     return placed(RecordingSet(**given, recordings=tuple(drives)), dt_s=own.dt_s, controls=controls)

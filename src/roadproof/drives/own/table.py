@@ -74,7 +74,8 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
     """Read the table of a drive.
 
     Raises:
-        RecordingError: the file is missing, too long, no table, or has an unknown column or a wrong number.
+        RecordingError: the file is missing, too long, no table or names no picture, or has an unknown column or a wrong
+            number.
     """
     path = inside(folder, drive.table, f"{folder / PLAN}: table", RecordingError)
     try:
@@ -94,11 +95,14 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
         raise RecordingError(f"{path}, row {long}: it has more cells than the {len(names)} columns; check its commas")
     if "picture" not in names or not rows:
         raise RecordingError(f"{path} has {len(rows)} rows and columns {', '.join(names)!r:.200}; expected one picture")
+    pictures = tuple((row["picture"] or "").strip() for row in rows)
+    if not any(pictures):
+        raise RecordingError(f"{path} names no picture in {len(rows)} rows, expected one at least")
     numbers = {name: _numbers(path, name, rows) for name in names if name in _COLUMNS}
     unknown = [name for name in names if name not in _COLUMNS and name != "picture"]
     if unknown:
         raise RecordingError(f"{path} has a column {unknown[0]!r:.60}, expected {', '.join(('picture', *_COLUMNS))}")
-    return Table(drive, tuple((row["picture"] or "").strip() for row in rows), numbers)
+    return Table(drive, pictures, numbers)
 
 
 def _numbers(path: Path, name: str, rows: Sequence[dict[str, str]]) -> Float[np.ndarray, " n"]:
