@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from roadproof.attacks import GradOpt, PathDeviation, attack
 from roadproof.drives.own import import_drives, preview
 from roadproof.drives.own.place import fitted_camera
 from roadproof.drives.own.plan import GroundPoint
+from roadproof.drives.record import in_view
 from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, homography_from_pose
 from roadproof.io.pictures import read_picture
@@ -146,6 +148,19 @@ def test_known_points_seen_through_a_lens_give_height_pitch_and_field_of_view(le
     found = fitted_camera(behind(lens), ground)
     assert (found.up_m, found.pitch_deg, found.fov_deg) == pytest.approx((1.62, -11.0, 88.0), abs=1e-3)
     assert found.lens == lens
+
+
+def test_long_logs_take_no_more_memory_to_see_where_the_canvas_is():
+    driven = track()
+    states = [driven.state(row) for row in range(len(driven))]
+    tracemalloc.start()
+    shows = in_view(states, CANVAS, CIL_CAMERA, CIL_INPUT, 8)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20 * 3 * 8 * 200 * 88  # some ten copies of one input's pixels, not one of all
+    assert not shows[-1]
+    assert shows[:100].all()
+    assert not in_view([], CANVAS, CIL_CAMERA, CIL_INPUT, 8).size
 
 
 def test_black_and_white_are_seen_as_stated(tmp_path):

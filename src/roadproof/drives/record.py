@@ -24,6 +24,7 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, Policy, SimulatorT, policy_of, replay, rollout
 from roadproof.errors import GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
+from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
 from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Side, evenly
@@ -301,16 +302,17 @@ def in_view(
     states: list[VehicleState], canvas: CanvasPlacement, camera: CameraModel, view: CropResize, least_px: int
 ) -> Bool[np.ndarray, " n"]:
     """Whether the canvas fills `least_px` pixels of the controller's input, by the pose; occlusion does not count."""
-    if not states:
-        return np.zeros(0, bool)
-    image_from_canvas = np.stack([homography_from_pose(camera, state, canvas) for state in states])
+    shown_px = (_shown_px(homography_from_pose(camera, state, canvas), view, camera) for state in states)
+    return np.fromiter((shown >= least_px for shown in shown_px), bool, len(states))
+
+
+def _shown_px(image_from_canvas: Homography, view: CropResize, camera: CameraModel) -> int:
+    """How many pixels of the controller's input have their middle on the canvas."""
     try:
-        index, centre, _ = canvas_pixels(image_from_canvas, view, camera)
+        _, centre, _ = canvas_pixels(image_from_canvas[None], view, camera)
     except GeometryError:
-        return np.zeros(len(states), bool)
-    inside = ((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(1)
-    frame = index[inside] // (view.width_px * view.height_px)
-    return np.bincount(frame, minlength=len(states)) >= least_px
+        return 0
+    return int(((centre > -0.5) & (centre < CANVAS_SIZE_PX - 0.5)).all(1).sum())
 
 
 def _drive(
