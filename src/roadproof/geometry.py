@@ -278,7 +278,7 @@ class CanvasPlacement:
         length_m: extent along the road, metres.
 
     Raises:
-        GeometryError: an extent is not positive.
+        GeometryError: a number is not finite, or no metres on earth, or an extent is not positive.
     """
 
     x_m: float
@@ -289,6 +289,9 @@ class CanvasPlacement:
     length_m: float = 9.5
 
     def __post_init__(self) -> None:
+        for name in self.__slots__:
+            if not abs(getattr(self, name)) < 1e9:
+                raise GeometryError(f"canvas {name} is {getattr(self, name)}, expected a finite number below 1e9")
         if not (self.width_m > 0 and self.length_m > 0):
             raise GeometryError(f"canvas is {self.width_m} m × {self.length_m} m, expected both extents above 0")
 

@@ -57,8 +57,7 @@ class Scenario:
     def __post_init__(self) -> None:
         check_name(self.name, "scenario", ScenarioError)
         numbers = {"goal x": self.goal_m[0], "goal y": self.goal_m[1], "time_limit_s": self.time_limit_s}
-        for what, place in (("start", self.start), ("canvas", self.canvas)):
-            numbers |= {f"{what} {key}": value for key, value in asdict(place).items()}
+        numbers |= {f"start {key}": value for key, value in asdict(self.start).items()}
         for what, value in numbers.items():
             if not abs(value) < 1e9:
                 raise ScenarioError(f"scenario {self.name}: {what} is {value}, expected a finite number below 1e9")

@@ -182,6 +182,16 @@ def test_black_and_white_are_seen_as_stated(tmp_path):
         (PLAN.replace("x_m = 130.0\n", ""), "neither ahead_m nor"),
         (PLAN + "ahead_m = 3\n", "both ahead_m and a place"),
         (PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 1e4"), "expected 0 to 4"),
+        (
+            PLAN.replace("yaw_rad = 0.6", "yaw_rad = inf"),
+            r"\[canvas\] of drives.toml: canvas yaw_rad is inf, expected",
+        ),
+        (PLAN.replace("x_m = 130.0", "x_m = 1e300"), r"canvas x_m is 1e\+300, expected a finite number below 1e9"),
+        (PLAN + "width_m = nan\n", "canvas width_m is nan, expected a finite number"),
+        (
+            f"ground = [{{ x_px = nan, y_px = 1, ahead_m = 6, left_m = 1 }}]\n{PLAN}",
+            "x_px of a known point of the ground is nan",
+        ),
         (PLAN[: PLAN.index("[canvas]")], r"no table \[canvas\]"),
         (PLAN + "\n[colour]\nblack = [0.9, 0, 0]\nwhite = [0.8, 1, 1]\n", "0 ≤ black < white ≤ 1"),
         (PLAN.replace("[camera]", "[camera]\nzoom = 3"), "camera has an unknown key 'zoom'; did you mean"),

@@ -14,7 +14,7 @@ from scipy import optimize
 from roadproof.datatypes import VehicleState
 from roadproof.drives.own.plan import PLAN, GroundPoint, OwnDrives
 from roadproof.drives.own.table import POSE, Table
-from roadproof.errors import RecordingError
+from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement
 from roadproof.recordings import Track
 
@@ -74,26 +74,30 @@ def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
     """The canvas as drives.toml places it: by its pose, or by a distance along the first drive.
 
     Raises:
-        RecordingError: the canvas is placed twice or not at all, or lies beyond the driven path.
+        RecordingError: the canvas is placed twice or not at all, lies beyond the driven path, or has no size or
+            numbers that are none.
     """
     stated = own.canvas
     if stated is None:
         raise RecordingError(f"{PLAN} has no table [canvas]; say where may be painted, for instance ahead_m = 30")
-    size = {"width_m": stated.width_m, "length_m": stated.length_m}
     place = [stated.x_m, stated.y_m, stated.yaw_rad]
-    if stated.ahead_m is None:
-        if None in place:
-            raise RecordingError(f"[canvas] of {PLAN} has neither ahead_m nor x_m, y_m and yaw_rad; give one of them")
-        return CanvasPlacement(**dict(zip(POSE, cast("list[float]", place), strict=True)), **size)
-    if place != [None] * 3:
-        raise RecordingError(f"[canvas] of {PLAN} has both ahead_m and a place; leave one out")
-    way_m = np.concatenate([[0.0], np.hypot(np.diff(track.x_m), np.diff(track.y_m)).cumsum()])
-    if not 0.0 <= stated.ahead_m <= way_m[-1]:
-        raise RecordingError(f"[canvas] has ahead_m {stated.ahead_m:g}, expected 0 to {way_m[-1]:.1f}, the way driven")
-    x_m, y_m, yaw_rad = (
-        float(np.interp(stated.ahead_m, way_m, values)) for values in (track.x_m, track.y_m, np.unwrap(track.yaw_rad))
-    )
-    return CanvasPlacement(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, **size)
+    if stated.ahead_m is None and None in place:
+        raise RecordingError(f"[canvas] of {PLAN} has neither ahead_m nor x_m, y_m and yaw_rad; give one of them")
+    if stated.ahead_m is not None:
+        if place != [None] * 3:
+            raise RecordingError(f"[canvas] of {PLAN} has both ahead_m and a place; leave one out")
+        way_m = np.concatenate([[0.0], np.hypot(np.diff(track.x_m), np.diff(track.y_m)).cumsum()])
+        if not 0.0 <= stated.ahead_m <= way_m[-1]:
+            raise RecordingError(
+                f"[canvas] has ahead_m {stated.ahead_m:g}, expected 0 to {way_m[-1]:.1f}, the way driven"
+            )
+        poses = (track.x_m, track.y_m, np.unwrap(track.yaw_rad))
+        place = [float(np.interp(stated.ahead_m, way_m, values)) for values in poses]
+    x_m, y_m, yaw_rad = cast("list[float]", place)
+    try:
+        return CanvasPlacement(x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, width_m=stated.width_m, length_m=stated.length_m)
+    except GeometryError as error:
+        raise RecordingError(f"[canvas] of {PLAN}: {error}") from None
 
 
 def check_passes(table: Table, track: Track, canvas: CanvasPlacement) -> None:

@@ -31,6 +31,12 @@ class GroundPoint:
     ahead_m: float
     left_m: float
 
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            if not abs(getattr(self, name)) < 1e6:
+                told = f"{name} of a known point of the ground is {getattr(self, name)}"
+                raise RecordingError(f"{told}, expected a finite number below 1e6")
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Chessboard:
