@@ -313,6 +313,8 @@ def test_a_search_that_was_kept_is_read_and_one_of_other_parts_is_refused(tmp_pa
     controller, asked = pull_to_the_right(), {"objective": SteeringShift(), "method": QUICK}
     trained_again = pull_to_the_right()
     trained_again.act = lambda *_: Control(steer=0.1)
+    cannot_drive = pull_to_the_right()
+    cannot_drive.act = lambda *_: None
 
     def kept(recordings=recording_set(), space=SearchSpace(figures=1), driver=controller, **changed):  # noqa: B008
         return kept_attack(tmp_path, recordings, driver, space, **asked | changed)
@@ -335,6 +337,7 @@ def test_a_search_that_was_kept_is_read_and_one_of_other_parts_is_refused(tmp_pa
             "objective": SteeringShift(variation=Variation())
         },
         "holds a search of another controller, which answers otherwise": {"driver": trained_again},
+        "holds a search, perhaps of another controller: this one cannot drive": {"driver": cannot_drive, "seed": 1},
     }.items():
         with pytest.raises(RoadproofError, match=message):
             kept(**changed)

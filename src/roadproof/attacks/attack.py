@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
@@ -91,7 +92,9 @@ def attack(
     method = method or GradOpt()
     objective = objective or usual_objective(recordings, method)
     method.check_space(space)
-    made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
+    made_of: dict[str, Any] = {}
+    with suppress(ControllerError):  # one that cannot drive is attacked all the same
+        made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
     if isinstance(recordings, InSimulator):
         _refuse_in_simulator(method, groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
         site = site_at(recordings.simulator, recordings.scenario)
@@ -170,10 +173,7 @@ def _made_of(
     """What identifies a search on recordings, by name, as JSON has it; empty where no search goes on from it."""
     if not isinstance(recordings, RecordingSet):
         return {}
-    try:
-        parts = parts_of(controller, (recordings.view.height_px, recordings.view.width_px))
-    except ControllerError:  # one that cannot drive is attacked all the same
-        return {}
+    parts = parts_of(controller, (recordings.view.height_px, recordings.view.width_px))
     begun = [(each.group, known_by(each.pattern)) for each in starts]
     made_of = {
         "space": space.stated,
