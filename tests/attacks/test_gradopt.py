@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from roadproof.datatypes import Control
 from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
 from roadproof.paint.site import LaneMark
 from roadproof.patterns import Pattern, boxes_from_published
+from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
 
@@ -220,6 +222,31 @@ def test_a_checkpoint_of_another_search_or_a_damaged_one_is_not_used(tmp_path):
     assert not torch.equal(first.history, second.history)
     checkpoint.write_bytes(b"not a checkpoint")
     assert torch.equal(run(0).history, first.history)
+
+
+def test_a_checkpoint_of_other_colours_or_of_another_controller_is_not_used(tmp_path):
+    faint = ColourTransform(AffineResponse(0.2 * torch.eye(3), torch.full((3,), 0.4)))
+    brakes, cannot_drive, another = pull_to_the_right(), pull_to_the_right(), pull_to_the_right()
+    brakes.act = lambda *_: Control(steer=0.0, brake=0.5)
+    cannot_drive.act = another.act = lambda *_: None
+    another.weight *= 2
+    measures = [
+        Surrogate(recordings, controller, (RIGHT_GROUP,))
+        for recordings, controller in (
+            (recording_set(), pull_to_the_right()),
+            (recording_set(colour=faint), pull_to_the_right()),
+            (recording_set(), brakes),
+            (recording_set(), cannot_drive),
+            (recording_set(), another),
+        )
+    ]
+    assert len({each.fingerprint() for each in measures}) == len(measures)
+    again = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,))
+    assert again.fingerprint() == measures[0].fingerprint()
+    search = partial(gradopt, space=SearchSpace(figures=1), rungs=(Rung(1, 3),), seed=0)
+    search(measures[0], checkpoint=tmp_path / "search.safetensors")
+    gone_on = search(measures[1], checkpoint=tmp_path / "search.safetensors")
+    assert torch.equal(gone_on.history, search(measures[1]).history)
 
 
 def test_a_checkpoint_on_a_full_disk_is_one_clear_error(tmp_path, monkeypatch):

@@ -72,6 +72,15 @@ def test_a_search_for_the_speed_beats_chance_and_says_how_much_in_metres_a_secon
     assert (content["objective"], content["predicted_m"]) == ("speed change", None)
 
 
+def test_a_measure_is_known_by_what_its_controller_does_with_the_pedals(road):
+    class Bolder(Careful):
+        def controls(self, frames, speed_mps, command):
+            return super().controls(frames, speed_mps, command) * torch.tensor([1.0, 0.5, 0.5])
+
+    bolder = SpeedChange().measure(road, Bolder(), parse_groups("slower,faster", road), device="cpu")
+    assert measure_on(road).fingerprint() == measure_on(road).fingerprint() != bolder.fingerprint()
+
+
 def test_paint_is_worth_as_much_to_one_side_as_it_costs_the_other(road):
     unit = SPACE.random((1, 3), torch.Generator().manual_seed(2)).expand(2, -1, -1, -1)
     slower, faster = measure_on(road).values(SPACE, unit)

@@ -165,10 +165,8 @@ class ClosedLoopMeasure(BatchedMeasure):
 
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""
-        # The variation is in the fingerprint of the steering shift.
-        obstacles = self._steering.recordings.obstacles
-        worlds = [(each.vehicle, obstacles) for each in self.worlds]
-        more = repr((*self.told(), worlds))
+        # Variation, drives and controller are in the fingerprint of the steering shift.
+        more = repr((*self.told(), [each.vehicle for each in self.worlds]))
         return digest(more, self._steering.fingerprint())
 
     def told(self) -> tuple[object, ...]:

@@ -21,7 +21,10 @@ from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import require_size, steer_of
-from roadproof.io.identity import digest
+from roadproof.controllers.identity import identity_of
+from roadproof.errors import ControllerError
+from roadproof.io.identity import digest, stated
+from roadproof.io.known import known_by
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
 from roadproof.recordings import Recording, RecordingSet
@@ -182,14 +185,13 @@ class Surrogate(BatchedMeasure):
         return self.values(space, unit), None
 
     def fingerprint(self) -> str:
-        """A digest of drives, calibration and the controller's clean answers that tells this surrogate from others."""
-        told = (self.groups, self.lengths) if self.variation is None else (self.groups, self.lengths, self.variation)
-        seen = [
-            tensor.cpu().numpy()
-            for view, steer in zip(self.views, self.clean_steer, strict=True)
-            for tensor in (view.clean, view.footprints.features, view.gain, view.bias, steer)
-        ]
-        return digest(repr(told), *seen)
+        """A digest of the drives with their colours, the controller and the groups: of all that values depend on."""
+        view, steer = self.recordings.view, [each.cpu().numpy() for each in self.clean_steer]
+        try:
+            which = identity_of(self.controller, (view.height_px, view.width_px))
+        except ControllerError:  # one that cannot drive is known by what it is and how it steers
+            which = stated(known_by(self.controller))
+        return digest(repr((self.groups, self.variation)), self.recordings.digest(), which, *steer)
 
     def _compositor(self, copies: int) -> Compositor:
         # Batches of a search are of one size, or two: the frames are kept until another size comes, and for good where
