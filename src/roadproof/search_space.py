@@ -127,6 +127,11 @@ class SearchSpace:
         return replace(self, site=known)
 
     @property
+    def is_limited(self) -> bool:
+        """Whether area or paint is limited, so that a pattern may be another than that of the point's parameters."""
+        return self.limits is not None or self.max_painted_share is not None
+
+    @property
     def unlimited(self) -> SearchSpace:
         """The space without its limits."""
         return replace(self, limits=None, site=None)
@@ -194,6 +199,8 @@ class SearchSpace:
 
     def point(self, pattern: Pattern) -> Float[Tensor, "*b k n"]:
         """The point of a pattern; the nearest point if the pattern is outside of the space.
+
+        What limits on area and paint did is not undone: a pattern that they changed may have no point near it.
 
         Raises:
             PatternError: the pattern has other figures than this space.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -10,7 +11,18 @@ import pytest
 import torch
 
 from recorded_drives import CANVAS, PLAIN, drivable_set
-from roadproof.attacks import METHODS, GradOpt, PathDeviation, Published, SteeringShift, attack, method_of, proposals
+from roadproof.attacks import (
+    METHODS,
+    GradOpt,
+    PathDeviation,
+    Published,
+    SteeringShift,
+    attack,
+    cheapest,
+    method_of,
+    proposals,
+)
+from roadproof.attacks.groups import RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
 from roadproof.attacks.site import site_of
 from roadproof.errors import PatternError
@@ -61,6 +73,14 @@ def test_whatever_the_search_its_patterns_obey(word, monkeypatch, tmp_path):
     kept = AttackResult.load(tmp_path)
     assert kept.conspicuousness == result.conspicuousness
     assert kept.space == result.space
+    for candidate in kept.candidates:
+        again = result.space.pattern(candidate.point_in(result.space))
+        torch.testing.assert_close(again.boxes, candidate.pattern.boxes, rtol=0, atol=1e-3)
+        torch.testing.assert_close(again.colours, candidate.pattern.colours)
+    # In other limits, and where it is not known, it is the nearest point.
+    nearest = space.unlimited.point(kept.pattern)
+    assert torch.equal(kept.point_in(space.unlimited), nearest)
+    assert torch.equal(replace(kept, point=None).point_in(space.unlimited), nearest)
 
 
 def test_a_limited_search_by_gradient_beats_random_patterns_of_the_same_limits():
@@ -107,9 +127,16 @@ def test_a_deviation_search_obeys_too(monkeypatch):
     monkeypatch.setattr(Vehicle, "identified", staticmethod(lambda tracks: VEHICLE))
     method = GradOpt(iterations=2, restarts=1, halving=False)
     space = SearchSpace(figures=2, limits=LIMITS)
-    result = attack(
-        drivable_set(12.0, marks=MARKS), PullsToBrightPaint(), space, method=method, objective=PathDeviation(every=8)
-    )
+    recordings, objective = drivable_set(12.0, marks=MARKS), PathDeviation(every=8)
+    search = partial(attack, recordings, PullsToBrightPaint(), space, method=method, objective=objective)
+    result = search(groups=[RIGHT_GROUP])
     assert result.conspicuousness is not None
     assert result.conspicuousness.area_m2 <= 1.5
     assert result.conspicuousness.mark_distance_m >= 0.3
+    # What goes on from it begins at the pattern itself.
+    gone_on = search(groups=[RIGHT_GROUP], starts=result.candidates)
+    assert gone_on.history[0].max() == pytest.approx(result.by_group[result.group], abs=1e-5)
+    least_m = result.predicted_range_m[0]
+    monkeypatch.setattr(sys.modules[cheapest.__module__], "MOST_LEVELS", 0)
+    less = cheapest(recordings, PullsToBrightPaint(), result, 0.9 * least_m, groups=[RIGHT_GROUP], objective=objective)
+    assert [level.predicted_m for level in less.levels] == [pytest.approx(least_m, abs=1e-4)]

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -269,7 +270,7 @@ def kept_attack(
 
 def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:
     """The start candidates of a group as points of the space; a group without sides, in a simulator, takes all."""
-    points = [space.point(start.pattern) for start in starts if not group.sides or start.group == str(group)]
+    points = [start.point_in(space) for start in starts if not group.sides or start.group == str(group)]
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
@@ -289,17 +290,20 @@ def _candidates(measure: Measure, search: Search, space: SearchSpace) -> tuple[C
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
     candidates: list[Candidate] = []
     for group, restart in (divmod(index, restarts) for index in order):
-        pattern, name = space.pattern(search.best_unit[group, restart].cpu()), str(measure.groups[group])
+        unit = search.best_unit[group, restart].cpu()
+        point = tuple(map(tuple, cast("list[list[float]]", unit.tolist()))) if space.is_limited else None
+        pattern = space.pattern(unit)
+        candidate = partial(Candidate, pattern, str(measure.groups[group]), point=point)
         if isinstance(measure, DrivenMeasure):
-            candidates.append(Candidate(pattern, name, driven=measure.effect(pattern)))
+            candidates.append(candidate(driven=measure.effect(pattern)))
             continue
         if shifts is None or predicted is None:
-            candidates.append(Candidate(pattern, name, float(search.best[group, restart])))
+            candidates.append(candidate(float(search.best[group, restart])))
             continue
         shift, each = float(shifts[group, restart]), predicted[group, restart]
         mean, spread = float(each.mean()), (float(each.min()), float(each.max()))
         if isinstance(measure, SpeedMeasure):
-            candidates.append(Candidate(pattern, name, shift, predicted_mps=mean, predicted_range_mps=spread))
+            candidates.append(candidate(shift, predicted_mps=mean, predicted_range_mps=spread))
         else:
-            candidates.append(Candidate(pattern, name, shift, mean, spread))
+            candidates.append(candidate(shift, mean, spread))
     return tuple(candidates)

@@ -157,7 +157,7 @@ def cheapest(
     area = found.space.limits or PaintLimits()
     limits = replace(area, max_area_m2=area.max_area_m2 or _NO_LIMIT_M2)
     space = replace(found.space, limits=limits, site=None).on(site)
-    run = _Narrowing(measure, space, wanted_m, found.seed, space.point(found.pattern)[None, None].to(measure.device))
+    run = _Narrowing(measure, space, wanted_m, found.seed, found.point_in(space)[None, None].to(measure.device))
     level = run.level()
     if level.predicted_m < wanted_m:
         return None

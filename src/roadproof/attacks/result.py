@@ -8,7 +8,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
@@ -55,6 +57,8 @@ class Candidate:
         predicted_mps: mean change of the speed in the recorded world, m/s, negative where the car is slower, mean over
             recorded weathers and small errors; None if the search was not for a change of the speed.
         predicted_range_mps: least and largest of these predicted changes, m/s; None if there are none.
+        point: point of the search space where a pattern was found under limits on paint, K rows of N parameters; None
+            without limits, where the pattern says it.
     """
 
     pattern: Pattern
@@ -65,6 +69,17 @@ class Candidate:
     driven: Effect | None = None
     predicted_mps: float | None = None
     predicted_range_mps: tuple[float, float] | None = None
+    point: tuple[tuple[float, ...], ...] | None = None
+
+    def point_in(self, space: SearchSpace) -> Float[Tensor, "k n"]:
+        """The point of a space from which to search on: where the pattern was found, if it is the same there."""
+        nearest, pattern = space.point(self.pattern), self.pattern
+        if [len(row) for row in self.point or ()] != [len(space.names)] * space.figures:
+            return nearest
+        found = torch.tensor(self.point)
+        made = space.pattern(found)
+        same = torch.allclose(made.boxes, pattern.boxes, atol=1e-3) and torch.allclose(made.colours, pattern.colours)
+        return found if same else nearest
 
     @property
     def predicted(self) -> str | None:
@@ -173,7 +188,7 @@ class AttackResult(Candidate):
 
 
 class _Ranked(msgspec.Struct, array_like=True, frozen=True):
-    """A candidate without its pattern, as a list."""
+    """A candidate without its pattern, as a list; older files have no point."""
 
     group: str
     surrogate_shift: float | None
@@ -182,6 +197,7 @@ class _Ranked(msgspec.Struct, array_like=True, frozen=True):
     driven: Effect | None
     predicted_mps: float | None
     predicted_range_mps: tuple[float, float] | None
+    point: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,7 +150,7 @@ def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path
         budget = replace(STEERING, select=0, starts=0, weathers=job.weathers[:1])
         found, calls_before, seconds_before = _searched(job, world, controller, folder / "start", budget)
         chosen = first_of_each_group(found.attack.candidates, plan.start)
-        first = torch.stack([space.point(candidate.pattern) for _, candidate in chosen])
+        first = torch.stack([candidate.point_in(space) for _, candidate in chosen])
     stretch = InSimulator(world, job.scenario, job.weathers[0], job.seed, keep=folder / "driven.json")
     measure = DrivenMeasure(stretch, controller, OBJECTIVES[plan.objective])
     trials = blackbox_search(
