@@ -79,6 +79,8 @@ class OnnxGraph(nn.Module):
             attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}
             if isinstance(attributes.get("value"), TensorProto):
                 attributes["value"] = torch.tensor(numpy_helper.to_array(attributes["value"]))
+            if node.op_type == "Split":  # without sizes in parts as long as each other, as many as are used
+                attributes.setdefault("num_outputs", len(node.output))
             if node.op_type == "Constant":
                 self._keep(node.output[0], torch.as_tensor(next(iter(attributes.values()))))
                 continue

@@ -28,6 +28,8 @@ _DTYPES = {
     9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16,
 }  # fmt: skip
 
+_SELU = (1.67326319217681884765625, 1.05070102214813232421875)
+"""Selu's own alpha and gamma."""
 
 # How torch says what Resize asks for: mode, where the pixels of the result lie, and how the nearest is rounded.
 _RESIZED: dict[tuple[bytes, bytes, bytes | None], tuple[str, bool | None]] = {
@@ -38,7 +40,6 @@ _RESIZED: dict[tuple[bytes, bytes, bytes | None], tuple[str, bool | None]] = {
     (b"cubic", b"pytorch_half_pixel", None): ("bicubic", False),
     (b"cubic", b"align_corners", None): ("bicubic", True),
     (b"nearest", b"asymmetric", b"floor"): ("nearest", None),
-    (b"nearest", b"half_pixel", b"round_prefer_floor"): ("nearest-exact", None),
     (b"nearest", b"half_pixel", b"round_prefer_ceil"): ("nearest-exact", None),
 }
 
@@ -111,18 +112,36 @@ def _transposed_conv(a: Attributes, x: Inputs) -> Tensor:
 def _resize(a: Attributes, x: Inputs) -> Tensor:
     if a.get("antialias") or a.get("exclude_outside") or "axes" in a:
         raise ValueError("antialias, exclude_outside or axes")
+    if a.get("keep_aspect_ratio_policy", b"stretch") != b"stretch" or a.get("cubic_coeff_a", -0.75) != -0.75:
+        raise ValueError("keep_aspect_ratio_policy other than stretch, or cubic_coeff_a other than -0.75")
     mode, places = a.get("mode", b"nearest"), a.get("coordinate_transformation_mode", b"half_pixel")
     rounding = a.get("nearest_mode", b"round_prefer_floor") if mode == b"nearest" else None
-    if (mode, places, rounding) not in _RESIZED:
-        raise ValueError(f"{mode.decode()} at {places.decode()}{f', {rounding.decode()}' if rounding else ''}")
-    kind, corners = _RESIZED[mode, places, rounding]
     picture: Tensor = x[0]
-    if kind.endswith("linear"):
-        kind = ("linear", "bilinear", "trilinear")[picture.ndim - 3]
     sizes, scales = _integers(_get(x, 3)), _get(x, 2)
     size = sizes[2:] if sizes else None
     factor = None if sizes or scales is None else [float(each) for each in scales[2:]]
-    return functional.interpolate(picture, size=size, scale_factor=factor, mode=kind, align_corners=corners)
+    if (mode, places, rounding) == (b"nearest", b"half_pixel", b"round_prefer_floor"):
+        return _nearest_first(picture, size, factor)
+    if (mode, places, rounding) not in _RESIZED:
+        raise ValueError(f"{mode.decode()} at {places.decode()}{f', {rounding.decode()}' if rounding else ''}")
+    kind, corners = _RESIZED[mode, places, rounding]
+    if kind.endswith("linear"):
+        kind = ("linear", "bilinear", "trilinear")[picture.ndim - 3]
+    resized = functional.interpolate(picture, size=size, scale_factor=factor, mode=kind, align_corners=corners)
+    pairs = zip(picture.shape, resized.shape, strict=True)
+    if places == b"pytorch_half_pixel" and any(after == 1 < before for before, after in pairs):
+        raise ValueError("pytorch_half_pixel down to one pixel")
+    return resized
+
+
+def _nearest_first(picture: Tensor, size: list[int] | None, factor: list[float] | None) -> Tensor:
+    """The nearest pixels, of two as near the first; torch's "nearest-exact" takes the second."""
+    for axis, count in enumerate(picture.shape[2:]):
+        scale = factor[axis] if factor else (size or [])[axis] / count
+        places = torch.arange(size[axis] if size else math.floor(count * scale), device=picture.device) + 0.5
+        index = (places.double() / scale - 1).ceil().clamp(0, count - 1).long()
+        picture = picture.index_select(axis + 2, index)
+    return picture
 
 
 def _depth_to_space(a: Attributes, x: Inputs) -> Tensor:
@@ -133,24 +152,31 @@ def _depth_to_space(a: Attributes, x: Inputs) -> Tensor:
     return apart.reshape(batch, channels // size**2, height * size, width * size)
 
 
+def _ceils(a: Attributes, x: Tensor, padded: Tensor) -> bool:
+    """Whether windows may reach beyond the picture; in one that was padded they would begin in the padding too."""
+    ceils = bool(a.get("ceil_mode")) and set(a.get("strides", [1])) != {1}
+    if ceils and padded is not x:
+        raise ValueError("ceil_mode with pads")
+    return ceils
+
+
 def _max_pool(a: Attributes, x: Inputs) -> Tensor:
-    padded = _padded(a, x[0], -math.inf)
-    return functional.max_pool2d(
-        padded,
-        a["kernel_shape"],
-        a.get("strides", [1, 1]),
-        dilation=a.get("dilations", 1),
-        ceil_mode=bool(a.get("ceil_mode")),
-    )
+    padded, kernel = _padded(a, x[0], -math.inf), a["kernel_shape"]
+    pool = {1: functional.max_pool1d, 2: functional.max_pool2d, 3: functional.max_pool3d}[len(kernel)]
+    ceil_mode = _ceils(a, x[0], padded)
+    return pool(padded, kernel, a.get("strides", 1), dilation=a.get("dilations", 1), ceil_mode=ceil_mode)
 
 
 def _average_pool(a: Attributes, x: Inputs) -> Tensor:
-    kernel, strides = a["kernel_shape"], a.get("strides", [1, 1])
-    mean = functional.avg_pool2d(_padded(a, x[0], 0.0), kernel, strides)
-    if a.get("count_include_pad"):
+    if set(a.get("dilations", [1])) != {1}:
+        raise ValueError("dilations")
+    padded, kernel, strides = _padded(a, x[0], 0.0), a["kernel_shape"], a.get("strides", 1)
+    pool = {1: functional.avg_pool1d, 2: functional.avg_pool2d, 3: functional.avg_pool3d}[len(kernel)]
+    mean = pool(padded, kernel, strides, ceil_mode=_ceils(a, x[0], padded))
+    if a.get("count_include_pad") or padded is x[0]:
         return mean
     # Averages over real pixels only: divide by their share of the window.
-    return mean / functional.avg_pool2d(_padded(a, torch.ones_like(x[0]), 0.0), kernel, strides)
+    return mean / pool(_padded(a, torch.ones_like(x[0]), 0.0), kernel, strides)
 
 
 def _gemm(a: Attributes, x: Inputs) -> Tensor:
@@ -175,8 +201,10 @@ def _reshape(a: Attributes, x: Inputs) -> Tensor:
 
 
 def _flatten(a: Attributes, x: Inputs) -> Tensor:
-    axis = a.get("axis", 1) % (x[0].ndim + 1)
-    return x[0].reshape(math.prod(x[0].shape[:axis]), -1)
+    axis = a.get("axis", 1)
+    # After the last axis comes one more, which is no negative one.
+    first = x[0].shape[: axis if axis >= 0 else axis + x[0].ndim]
+    return x[0].reshape(math.prod(first), -1)
 
 
 def _squeeze(a: Attributes, x: Inputs) -> Tensor:
@@ -231,6 +259,8 @@ def _pad(a: Attributes, x: Inputs) -> Tensor:
     mode = {b"constant": "constant", b"reflect": "reflect", b"edge": "replicate"}[a.get("mode", b"constant")]
     if mode != "constant":
         # torch reflects and repeats the last two axes of a picture only.
+        if any(last_first[2 * (count - 2) :]):
+            raise ValueError(f"{mode} along the first two axes")
         return functional.pad(x[0], last_first[: 2 * (count - 2)], mode=mode)
     value = _get(x, 2)
     return functional.pad(x[0], last_first, value=0.0 if value is None else float(value))
@@ -250,10 +280,9 @@ def _constant_of_shape(a: Attributes, x: Inputs) -> Tensor:
 def _reduced(kind: Callable[..., Tensor]) -> Operator:
     def apply(a: Attributes, x: Inputs) -> Tensor:
         axes = _axes(a, x)
-        if axes is None and a.get("noop_with_empty_axes"):
+        if not axes and a.get("noop_with_empty_axes"):
             return x[0]
-        every = tuple(range(x[0].ndim)) if axes is None else tuple(axes)
-        return kind(x[0], dim=every, keepdim=bool(a.get("keepdims", 1)))
+        return kind(x[0], dim=tuple(axes or range(x[0].ndim)), keepdim=bool(a.get("keepdims", 1)))
 
     return apply
 
@@ -344,7 +373,7 @@ OPERATORS: dict[str, Operator] = {
     "Reshape": _reshape,
     "Resize": _resize,
     "Round": _elementwise(torch.round),
-    "Selu": lambda _, x: functional.selu(x[0]),
+    "Selu": lambda a, x: a.get("gamma", _SELU[1]) * functional.elu(x[0], a.get("alpha", _SELU[0])),
     "Shape": lambda a, x: torch.tensor(
         x[0].shape[a.get("start", 0) : a.get("end")], dtype=torch.int64, device=x[0].device
     ),
