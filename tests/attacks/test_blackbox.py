@@ -163,3 +163,18 @@ def test_arguments_that_make_no_sense_are_named(options, message):
 def test_a_value_that_is_not_a_number_is_an_error():
     with pytest.raises(RoadproofError, match="NaN or infinite at call 1"):
         search("random", value=lambda unit: torch.full((len(unit),), torch.nan), calls=3)
+
+
+@pytest.mark.parametrize("method", ["random", "tpe", "cma-es"])
+def test_more_calls_go_on_with_a_search_and_fewer_are_its_first(method, tmp_path):
+    given = (TARGET + 0.1 * torch.arange(3).view(3, 1, 1)).expand(3, 1, 4)
+    for first in (None, given):
+        options = {"first": first, "at_once": 16}
+        straight = search(method, calls=40, **options)
+        for calls in (2, 10, 40, 10):
+            again = search(method, calls=calls, checkpoint=tmp_path / "search", **options)
+            assert len(again) == calls
+            assert torch.equal(again.unit[:calls], search(method, calls=calls, **options).unit)
+            if calls == 40:
+                assert torch.equal(again.unit, straight.unit)
+                assert torch.equal(again.value, straight.value)

@@ -234,7 +234,11 @@ def blackbox_search(
     keeping = Checkpoint(checkpoint, identity, aim)
     nothing = torch.empty(0, dtype=torch.float64)
     none = {"unit": nothing.new_empty(0, space.figures, len(space.names)), "value": nothing, "seconds": nothing}
-    trials = Trials(**keeping.load(torch.device("cpu")) or none)
+    kept = keeping.load(torch.device("cpu")) or none
+    count = len(kept["value"])
+    if count < method.calls:  # a batch that fewer calls had cut short is proposed again as a whole
+        count -= max(0, count - len(given or ())) % at_once
+    trials = Trials(**{name: each[: min(count, method.calls)] for name, each in kept.items()})
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
     started = time.perf_counter()
     while len(trials) < method.calls:
