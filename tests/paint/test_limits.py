@@ -194,6 +194,12 @@ def test_limits_out_of_their_range_are_refused(value, message):
         PaintLimits(**value)
 
 
+@pytest.mark.parametrize("points", [(), ((3.0, 3.0),), ((3.0, 3.0), (3.0, 3.0))])
+def test_a_lane_mark_without_length_is_refused(points):
+    with pytest.raises(PatternError, match="expected two different ones or more, in metres on the canvas"):
+        LaneMark(points_m=points)
+
+
 def test_a_space_without_limits_is_stated_as_before_there_were_any():
     assert "limits" not in SearchSpace(figures=2).stated
     assert space(LIMITS).stated["limits"]["max_area_m2"] == 3.0

@@ -48,12 +48,13 @@ class LaneMark:
     """One painted line of the road, on the canvas or near it; a broken line counts as if it had no gaps.
 
     Args:
-        points_m: middle line of the mark, two points or more in canvas metres; parts outside the canvas count too.
+        points_m: middle line of the mark, two points or more in canvas metres, not all the same; parts outside the
+            canvas count too.
         width_m: width of the mark, metres.
         colour: colour of the mark's paint, such as "#dededa".
 
     Raises:
-        PatternError: there are fewer than two points, or a value is out of its range.
+        PatternError: there are fewer than two different points, or a value is out of its range.
     """
 
     points_m: tuple[tuple[float, float], ...]
@@ -62,9 +63,11 @@ class LaneMark:
 
     def __post_init__(self) -> None:
         rgb_of(self.colour)
-        if len(self.points_m) < 2 or not all(abs(value) <= 1e4 for point in self.points_m for value in point):
+        same = all(point == self.points_m[0] for point in self.points_m[1:])
+        if same or not all(abs(value) <= 1e4 for point in self.points_m for value in point):
             raise PatternError(
-                f"a lane mark has the points {self.points_m!r:.80}, expected two or more, in metres on the canvas"
+                f"a lane mark has the points {self.points_m!r:.80}, expected two different ones or more, in metres on "
+                "the canvas"
             )
         if not 0.0 < self.width_m <= 5.0:
             raise PatternError(f"a lane mark has width_m {self.width_m}, expected above 0, and 5 at most")

@@ -31,6 +31,7 @@ def marks_on(canvas: CanvasPlacement, roads: RoadMap) -> tuple[LaneMark, ...]:
             found += [
                 LaneMark(points_m=part, width_m=(2 * strands - 1) * line.mark.painted_width_m, colour=colour)
                 for part in _near(points, canvas)
+                if len(set(part)) > 1
             ]
     return tuple(found)
 
