@@ -13,13 +13,14 @@ from roadproof.attacks import (
     GradOpt,
     PathDeviation,
     Published,
+    RandomSearch,
     SteeringShift,
     attack,
     methods,
     usual_objective,
 )
 from roadproof.attacks.gradopt import BEHIND, MUTATION, Rung, gradopt
-from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.result import AttackResult
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.recorded import BiasedStart, RecordedWorld
@@ -291,3 +292,12 @@ def test_the_deviation_is_searched_for_where_it_can_be_driven_and_nobody_asks_fo
         assert isinstance(usual_objective(recordings, method), SteeringShift)
     assert isinstance(usual_objective(road, BayesianOptimisation(calls=4, random_calls=2)), SteeringShift)
     assert attack(road, RampFollower(), SPACE, method=SHORT).objective == PathDeviation().name
+
+
+@pytest.mark.parametrize("words", ["clean+right,clean+left", "clean+left,clean+right"])
+def test_without_gradients_a_pattern_stands_for_the_group_that_it_is_best_for(road, words):
+    found = search(road, method=RandomSearch(calls=3), groups=parse_groups(words, road))
+    assert list(found.by_group) == words.split(",")
+    assert len(found.candidates) == 3, "each pattern once"
+    assert found.by_group[found.group] == max(found.by_group.values()) > 0
+    assert all(each.surrogate_shift > 0 for each in found.candidates)

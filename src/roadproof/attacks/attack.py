@@ -117,7 +117,7 @@ def attack(
     frames = measure.frames_evaluated
     if search.gave_way and isinstance(measure, BatchedMeasure):
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
-    candidates = _candidates(measure, search, space)
+    candidates = _candidates(measure, search, space, method)
     cost = Cost(
         controller_frames=frames,
         seconds=time.perf_counter() - start,
@@ -274,11 +274,12 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
-def _candidates(measure: Measure, search: Search, space: SearchSpace) -> tuple[Candidate, ...]:
+def _candidates(measure: Measure, search: Search, space: SearchSpace, method: Method) -> tuple[Candidate, ...]:
     """Every start's best, the strongest first: by what is predicted where that is known, else by its own value.
 
     Of what is predicted with small errors the least counts: where the way forks, a pattern that depends on
-    a hair does not come first.
+    a hair does not come first. A method without gradients tries every pattern for all groups; it stands for the one
+    that it is best for.
     """
     shifts, predicted = None, None
     if isinstance(measure, RecordedMeasure):
@@ -288,8 +289,11 @@ def _candidates(measure: Measure, search: Search, space: SearchSpace) -> tuple[C
     if predicted is not None and isinstance(measure, SpeedMeasure):
         rank = measure.rank(predicted)
     order = cast("list[int]", rank.flatten().argsort(descending=True).tolist())
+    suits = cast("list[int]", search.best.argmax(0).tolist())
     candidates: list[Candidate] = []
     for group, restart in (divmod(index, restarts) for index in order):
+        if not method.by_gradient and group != suits[restart]:
+            continue
         unit = search.best_unit[group, restart].cpu()
         point = tuple(map(tuple, cast("list[list[float]]", unit.tolist()))) if space.is_limited else None
         pattern = space.pattern(unit)

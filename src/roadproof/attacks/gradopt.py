@@ -124,7 +124,7 @@ class Search:
 
     best_unit: Points
     best: Values
-    history: Float[Tensor, "i g c"]
+    history: Float[Tensor, "i _ c"]
     gave_way: dict[int, float] = field(default_factory=dict[int, float])
     steps: str = ""
 
