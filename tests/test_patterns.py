@@ -192,3 +192,17 @@ def test_what_cannot_be_painted_is_refused(tmp_path):
     for name, message in (("low.png", "400×300 pixels"), ("text.png", "cannot be read"), ("none.png", "is missing")):
         with pytest.raises(PatternError, match=message):
             read_paint(tmp_path / name)
+
+
+def test_a_batch_or_a_pattern_that_is_not_finite_is_neither_painted_nor_saved(tmp_path):
+    box, colour = torch.tensor([[200.0, 200.0, 40.0, 100.0, 0.0]]), torch.zeros(1, 3)
+    for wrong, message in {
+        Pattern((Shape.RECTANGLE,), box * torch.nan, colour): "boxes of the pattern are not finite",
+        Pattern((Shape.RECTANGLE,), box, colour + torch.inf): "colours of the pattern are not finite",
+        Pattern((Shape.RECTANGLE,), box[None], colour[None]): r"expected one pattern, got a batch of shape \(1,\)",
+    }.items():
+        with pytest.raises(PatternError, match=message):
+            raster(wrong)
+        with pytest.raises(PatternError, match=message):
+            save_pattern(wrong, tmp_path / "pattern.json")
+    assert not list(tmp_path.iterdir())

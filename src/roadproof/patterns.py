@@ -42,7 +42,8 @@ class Pattern:
         colours: RGB of the paint in [0, 1], (*b, K, 3).
 
     Raises:
-        PatternError: no figure, unequal numbers of shapes, boxes and colours, or values that are not finite.
+        PatternError: no figure, or unequal numbers of shapes, boxes and colours. That values are finite is seen where a
+            pattern is painted or saved.
     """
 
     shapes: tuple[Shape, ...]
@@ -142,10 +143,13 @@ def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray,
         size_px: rows and columns of the picture; the canvas has 400.
 
     Raises:
-        PatternError: the pattern is a batch, or size_px is below 1.
+        PatternError: the pattern is a batch or has values that are not finite, or size_px is below 1.
     """
     if pattern.boxes.ndim != 2:
-        raise PatternError(f"raster takes one pattern, got a batch of shape {tuple(pattern.boxes.shape[:-2])}")
+        raise PatternError(f"expected one pattern, got a batch of shape {tuple(pattern.boxes.shape[:-2])}; take one")
+    for name, values in (("boxes", pattern.boxes), ("colours", pattern.colours)):
+        if not bool(values.isfinite().all()):
+            raise PatternError(f"{name} of the pattern are not finite (NaN or infinity); check what made them")
     if size_px < 1:
         raise PatternError(f"raster size is {size_px} px, expected at least 1")
     scale = CANVAS_SIZE_PX / size_px
@@ -208,9 +212,10 @@ def save_pattern(pattern: Pattern, path: AnyPath) -> None:
     """Write `path` (JSON: every figure by name and unit) and, beside it, its raster as PNG.
 
     Raises:
+        PatternError: the pattern is a batch, has values that are not finite, or a figure of it is not valid.
         OutputError: the folder cannot be written.
     """
-    path = as_path(path)
+    path, picture = as_path(path), Image.fromarray(raster(pattern))
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())
     figures = [
@@ -220,7 +225,6 @@ def save_pattern(pattern: Pattern, path: AnyPath) -> None:
         )
     ]
     _FILE.write(path, _Figures(tuple(figures)))
-    picture = Image.fromarray(raster(pattern))
     write_atomically(path.with_suffix(".png"), lambda part: picture.save(part, format="PNG"))
 
 
