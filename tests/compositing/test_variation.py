@@ -13,6 +13,7 @@ from roadproof.compositing.variation import Variation
 from roadproof.coverage import Shape
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
+from roadproof.paint.site import half_edges_m
 from roadproof.patterns import Pattern
 
 ZERO = dict.fromkeys(("noise", "exposure_stops", "white_balance", "blur_px", "shift_m", "turn_deg", "wear"), 0.0)
@@ -22,6 +23,14 @@ CANVAS = CanvasPlacement(x_m=0.0, y_m=0.0)
 
 def only(**ranges):
     return Variation(**{each.name: getattr(NOTHING, each.name) for each in fields(Variation)} | ranges)
+
+
+def cross(one, other):
+    return one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
+
+
+def angle(one, other):
+    return torch.atan2(cross(one, other), (one * other).sum(-1))
 
 
 def pictures(count=6):
@@ -105,6 +114,7 @@ def test_as_much_paint_is_gone_as_was_drawn(wear):
 def test_paint_moves_as_one_piece():
     looks = only(shift_m=0.3, turn_deg=10.0).draw(6)
     boxes = torch.tensor([[[100.0, 120.0, 20.0, 60.0, 30.0], [300.0, 50.0, 10.0, 90.0, 0.0]]]).repeat(3, 1, 1)
+    boxes[:, 1, 4] = torch.tensor([0.0, 90.0, 250.0])
     placed = looks.placed(Pattern((Shape.RECTANGLE,) * 2, boxes, torch.zeros(3, 2, 3)), CANVAS).boxes
     scale = torch.tensor([CANVAS.width_m, CANVAS.length_m]) / 400
     way = (boxes[:, 0, :2] - boxes[:, 1, :2]) * scale
@@ -112,7 +122,13 @@ def test_paint_moves_as_one_piece():
     torch.testing.assert_close(moved.norm(dim=1), way.norm(dim=1))
     turned = torch.rad2deg(torch.atan2(moved[:, 1], moved[:, 0]) - torch.atan2(way[:, 1], way[:, 0]))
     torch.testing.assert_close(turned, looks.turn_deg, atol=1e-3, rtol=1e-4)
-    torch.testing.assert_close(placed[..., 4] - boxes[..., 4], looks.turn_deg[:, None].expand(3, 2))
+    # So does the length of every figure, and its area stays, though pixels are not square.
+    (_, across, along), (_, across_now, along_now) = (
+        half_edges_m(each, (CANVAS.width_m, CANVAS.length_m)) for each in (boxes, placed)
+    )
+    torch.testing.assert_close(along_now.norm(dim=-1), along.norm(dim=-1))
+    torch.testing.assert_close(torch.rad2deg(angle(along, along_now)), looks.turn_deg[:, None].expand(3, 2))
+    torch.testing.assert_close(cross(across_now, along_now), cross(across, along))
 
 
 @pytest.mark.parametrize("ranges", [{"wear": 0.95}, {"draws": 0}, {"blur_px": -0.1}, {"noise": 0.5}])

@@ -131,19 +131,26 @@ class Looks:
         return torch.arange(count, device=self.gain.device) % len(self)
 
     def placed(self, pattern: Pattern, canvas: CanvasPlacement | None) -> Pattern:
-        """R patterns, each shifted and turned as its look says; if no canvas is known, on one of the paper's size."""
+        """R patterns, each shifted and turned as its look says; if no canvas is known, on one of the paper's size.
+
+        In metres figures keep their area, and their length its direction in the whole; as canvas px are not square, the
+        angle between their edges changes a little.
+        """
         canvas = canvas or CanvasPlacement(x_m=0.0, y_m=0.0)
         which = self.rows(len(pattern.boxes))
         scale = pattern.boxes.new_tensor([canvas.width_m, canvas.length_m]) / CANVAS_SIZE_PX
         middle = (CANVAS_SIZE_PX - 1) / 2
         at = (pattern.boxes[..., :2] - middle) * scale
         turn = self.turn_deg.to(at)[which][:, None]
-        c, s = torch.cos(torch.deg2rad(turn)), torch.sin(torch.deg2rad(turn))
-        moved = torch.stack([c * at[..., 0] - s * at[..., 1], s * at[..., 0] + c * at[..., 1]], -1)
-        moved = (moved + self.shift_m.to(at)[which][:, None]) / scale + middle
-        turned = pattern.boxes[..., 4] + turn
-        boxes = torch.cat([moved, pattern.boxes[..., 2:4], turned[..., None]], -1)
-        return Pattern(pattern.shapes, boxes, pattern.colours)
+        moved = (_turned(at, turn) + self.shift_m.to(at)[which][:, None]) / scale + middle
+        width, length, rotation_deg = pattern.boxes[..., 2:].unbind(-1)
+        along = _turned(at.new_tensor([0.0, 1.0]).expand_as(at), rotation_deg)
+        now = _turned(along * scale, turn) / scale
+        across = along[..., 0] * now[..., 1] - along[..., 1] * now[..., 0]
+        turned_deg = torch.rad2deg(torch.atan2(across, (along * now).sum(-1)))
+        longer = now.square().sum(-1).sqrt()
+        rest = torch.stack([width / longer, length * longer, rotation_deg + turned_deg], -1)
+        return Pattern(pattern.shapes, torch.cat([moved, rest], -1), pattern.colours)
 
     def left(self, centre: Float[Tensor, "#r p 2"], count: int) -> Float[Tensor, "r p"]:
         """The share of the paint that wear leaves at the footprints of R rows."""
@@ -178,3 +185,10 @@ class Looks:
             each = torch.randn(len(self), *frames.shape[1:], generator=generator).to(frames)
             shown = shown + self.noise * each[which]
         return shown.clamp(0.0, 1.0)
+
+
+def _turned(points: Float[Tensor, "r k 2"], turn_deg: Float[Tensor, "r _"]) -> Float[Tensor, "r k 2"]:
+    """Points turned about the origin, clockwise on the picture."""
+    c, s = torch.cos(torch.deg2rad(turn_deg)), torch.sin(torch.deg2rad(turn_deg))
+    x, y = points.unbind(-1)
+    return torch.stack([c * x - s * y, s * x + c * y], -1)
