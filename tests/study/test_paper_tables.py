@@ -128,6 +128,24 @@ def test_what_failed_is_noted_and_left_out_on_both_sides(records):
     assert right == ("–", "–", "–")
 
 
+def test_a_note_is_about_the_cases_that_are_compared(records):
+    worse = [each | {"clean_points": 90.0} if each["scenario"] == "left-01" else each for each in records]
+    told = [each for each in worse if (each["scenario"], each["method"]) != ("left-01", "BO")]
+    tables = tables_of(told)
+    for name in ("overall-bo", "paired-bo"):
+        assert "Means over 3 scenarios × 1 seed" in tables[name].note, name
+        assert "as few as 3" in tables[name].note, name
+        assert "bare road: 0.50 at clear noon" in tables[name].note, name
+    assert "Means over 4 scenarios × 1 seed" in tables["methods"].note
+    assert "bare road: 13.29 at clear noon" in tables["methods"].note  # two of 14 cases
+
+
+def test_methods_that_have_no_case_in_common_are_not_averaged():
+    told = tables_of([row(method="C"), row("left-02", method="C"), bad(method="GradOpt"), bad(method="BO")])
+    for name in ("overall-c", "overall-bo"):
+        assert "There is no case that all of them have." in told[name].note
+
+
 def test_one_method_one_k_one_weather_give_what_makes_sense():
     alone = tables_of([row("left-01"), row("left-02")])
     assert list(alone) == ["methods"]

@@ -198,7 +198,7 @@ def methods_table(results: Results) -> Table:
     return Table(
         name="methods",
         title=f"What each method found and what it cost, {in_words(results.home)}",
-        note=table_note(results, blocks, names, said),
+        note=table_note(results, blocks, names, said, compared=False),
         header=(
             (*headings("", "", ""), Heading("Search", 2), Heading("Found", 4)),
             headings("K", "method", *columns),

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from roadproof.report.formatting import in_words
-from roadproof.study.results import JOB, PENALTY, Block, Results
+from roadproof.study.results import PENALTY, Block, Results
+from roadproof.study.rows import Frame
 
 SHOWN_GAPS = 3
 ENOUGH = 10
 """The least scenarios; with fewer a percentile bootstrap covers clearly less than it claims."""
 
 
-def table_note(results: Results, blocks: Sequence[Block], methods: Sequence[str], said: str) -> str:
+def table_note(
+    results: Results, blocks: Sequence[Block], methods: Sequence[str], said: str, *, compared: bool = True
+) -> str:
     """The note of a table.
 
     Args:
@@ -20,13 +25,15 @@ def table_note(results: Results, blocks: Sequence[Block], methods: Sequence[str]
         blocks: the blocks of columns that the table shows.
         methods: names of the methods in the table.
         said: what is particular to this table, in sentences.
+        compared: whether its means are over the cases that all of the methods have, or each over those of its own.
     """
     measured = dict.fromkeys(
         f"{block.metric.title} in {block.metric.unit}, {'in traffic' if block.traffic else 'alone on the road'}"
         for block in blocks
     )
-    bare, missing = _bare_road(results, blocks, methods), _missing(results, blocks, methods)
-    return " ".join([f"{'; '.join(measured)}; all of it driven.", _averaged(results, blocks), said, *bare, *missing])
+    cases = [_cases(results, block, methods, compared=compared) for block in blocks]
+    told = [_averaged(cases), said, *_bare_road(blocks, cases), *_missing(results, blocks, methods)]
+    return " ".join([f"{'; '.join(measured)}; all of it driven.", *told])
 
 
 def counted(count: int, what: str) -> str:
@@ -34,22 +41,34 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' if count != 1 else ''}"
 
 
-def _averaged(results: Results, blocks: Sequence[Block]) -> str:
-    over = f"{counted(len(results.kinds), 'scenario')} × {counted(len(results.seeds), 'seed')}"
-    if len(results.kinds) < 2:
+def _cases(results: Results, block: Block, methods: Sequence[str], *, compared: bool) -> Frame:
+    """The cases that a block's means are over: the penalty of each on the bare road, a column a method."""
+    drives = results.drives_of(block, methods)
+    cases = drives.pivot_table("clean_points", ["scenario", "seed", "figures"], "method").reindex(columns=list(methods))
+    return cases.dropna() if compared else cases
+
+
+def _averaged(cases: Sequence[Frame]) -> str:
+    scenarios: list[set[str]] = [set(each.index.get_level_values("scenario")) for each in cases]
+    seeds: set[int] = {seed for each in cases for seed in each.index.get_level_values("seed")}
+    count = len(set[str]().union(*scenarios))
+    if not count:
+        return "There is no case that all of them have."
+    over = f"{counted(count, 'scenario')} × {counted(len(seeds), 'seed')}"
+    if count < 2:
         return f"Means over {over}; one scenario has no interval."
-    fewest = min(sum(block.kind in (None, kind) for kind in results.kinds.values()) for block in blocks)
+    fewest = min(map(len, scenarios))
     narrow = f", which are too narrow for as few as {fewest}" if fewest < ENOUGH else ""
     return f"Means over {over} with 95 % bootstrap intervals over scenarios{narrow}."
 
 
-def _bare_road(results: Results, blocks: Sequence[Block], methods: Sequence[str]) -> list[str]:
+def _bare_road(blocks: Sequence[Block], cases: Sequence[Frame]) -> list[str]:
     """What the same drives cost without paint, where a penalty is shown over all scenarios."""
-    said: list[str] = []
-    for block in blocks:
-        if block.metric == PENALTY and block.kind is None:
-            clean = results.drives_of(block, methods).groupby(JOB)["clean_points"].mean()
-            said += [f"{clean.mean():.2f} at {in_words(block.weather)}"] if len(clean) else []
+    said = [
+        f"{np.nanmean(each.to_numpy()):.2f} at {in_words(block.weather)}"
+        for block, each in zip(blocks, cases, strict=True)
+        if block.metric == PENALTY and block.kind is None and len(each)
+    ]
     return [f"Penalty of the same drives on the bare road: {', '.join(said)}."] if said else []
 
 
