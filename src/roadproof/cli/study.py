@@ -74,13 +74,13 @@ def _workload(study: Study, who: Controller, workers: int) -> Workload:
 
     traffic, weathers, whole = study.traffic, len(study.weathers), Workload()
     crowded = 0 if traffic is None else traffic.runs * (1 if traffic.weathers == "first" else weathers)
-    judged = of_drives(2 * weathers * study.starts.count, 2 * crowded)
     for method in study.methods:
-        budget = replace(budget_of(method, study.weathers[0]), starts=0, runs=0)
         if isinstance(method, BlackBoxPlan) and method.where == "simulator":
-            whole += of_drives(method.calls + 1) + judged
+            whole += of_drives(method.calls + 1 + 2 * weathers * study.starts.count, 2 * crowded)
         else:
-            whole += of_run(budget, who, film=False) + judged
+            # Its own evaluation is that of the first weather.
+            budget = replace(budget_of(method, study.weathers[0]), starts=study.starts.count, runs=0)
+            whole += of_run(budget, who, film=False) + of_drives(2 * (weathers - 1) * study.starts.count, 2 * crowded)
     return whole.times(len(study.scenarios) * len(study.figures) * len(study.seeds), at_once=workers)
 
 
