@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 import tracemalloc
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from lenses import BARREL, LENSES, behind
-from own_drives import CORNER_NAMES, PLAN, changed_table, through, write_own
+from own_drives import CORNER_NAMES, PLAN, changed_table, through, write_own, write_table
 from paint_shy import PaintShy
 from recorded_drives import CANVAS, track
 from roadproof.attacks import GradOpt, PathDeviation, attack
@@ -81,6 +82,19 @@ def test_corners_of_the_canvas_give_poses_and_its_size(tmp_path):
     assert len(clean.frames) == 40
     assert np.diff(clean.track.step).tolist() == [1] * 71  # of all rows, though not all frames are kept
     assert RecordedWorld(recordings).course.count > 60
+
+
+def test_a_speed_in_another_unit_than_the_poses_is_refused(tmp_path):
+    folder = write_own(tmp_path / "own", ["clean"])
+    table = folder / "clean.csv"
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    # Poses may be logged at half the rate.
+    held = [row | {name: rows[k - k % 2][name] for name in ("x_m", "y_m")} for k, row in enumerate(rows)]
+    write_table(table, held)
+    assert import_drives(folder).is_placed
+    write_table(table, [row | {"speed_mps": 3.6 * float(row["speed_mps"])} for row in rows])
+    with pytest.raises(RecordingError, match=r"clean.csv: poses move 0\.28 times as fast as speed_mps says"):
+        import_drives(folder)
 
 
 def test_a_log_that_ends_before_the_canvas_is_refused(tmp_path):

@@ -41,7 +41,7 @@ _MOST_SKEW = (0.05, 0.15)
 """Cosine between the canvas' axes on the road, which are at right angles: in the median, and in one frame."""
 _MOST_STRETCH = 0.2
 """Size of the canvas in one frame against the median."""
-_SPEED_RATIO = (0.75, 1.33)
+SPEED_RATIO = (0.75, 1.33)
 """Speed of the poses against the recorded speed, in the median of a set."""
 
 
@@ -201,7 +201,7 @@ def _check_speeds(drives: tuple[Recording, ...], tracks: list[Track]) -> None:
     moved, way = np.concatenate(moved_m), np.concatenate(way_m)
     moving = way > 0.05
     ratio = float(np.median(moved[moving] / way[moving])) if moving.any() else 1.0
-    if not _SPEED_RATIO[0] < ratio < _SPEED_RATIO[1]:
+    if not SPEED_RATIO[0] < ratio < SPEED_RATIO[1]:
         raise RecordingError(
             f"poses move {ratio:.2f} times as fast as the recorded speed says, expected about 1; "
             "check dt_s, the camera's height and the unit of speed_mps"

@@ -16,10 +16,12 @@ from roadproof.drives.own.plan import PLAN, GroundPoint, OwnDrives
 from roadproof.drives.own.table import POSE, Table
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement
+from roadproof.recorded.poses import SPEED_RATIO
 from roadproof.recordings import Track
 
 _ORIGIN = VehicleState(0.0, 0.0, 0.0, 0.0, 0.0)
 _MOST_MISSED_PX = 5.0
+_LEAST_WAY_M = 0.5
 
 
 def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
@@ -31,7 +33,7 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
         alone: whether it is the only drive, as integrated poses begin at the world's origin, different for every drive.
 
     Raises:
-        RecordingError: the table does not say where the car was, or poses jump.
+        RecordingError: the table does not say where the car was, poses jump, or they do not move as fast as it says.
     """
     numbers, dt_s = table.numbers, own.dt_s
     if all(name in numbers for name in POSE):
@@ -55,7 +57,7 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
             "and yaw_rate_rad_s, or the canvas' corners, or none of them and one drive whose pictures show its motion"
         )
     try:
-        return Track(
+        track = Track(
             dt_s=dt_s,
             step=np.arange(len(x_m)),
             x_m=x_m,
@@ -68,6 +70,24 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
         )
     except RecordingError as error:
         raise RecordingError(f"{table.drive.table}: {error}") from None
+    if "speed_mps" in numbers:
+        _check_speed(table, track)
+    return track
+
+
+def _check_speed(table: Table, track: Track) -> None:
+    """Refuse a speed in another unit, or another time step, than that of the poses."""
+    # Seconds are compared, not steps: some log poses less often than rows.
+    steps = max(1, round(1 / track.dt_s))
+    driven_m = np.concatenate([[0.0], ((track.speed_mps[1:] + track.speed_mps[:-1]) / 2 * track.dt_s).cumsum()])
+    x, y, way = (values[steps:] - values[:-steps] for values in (track.x_m, track.y_m, driven_m))
+    moving = way > _LEAST_WAY_M
+    ratio = float(np.median(np.hypot(x, y)[moving] / way[moving])) if moving.any() else 1.0
+    if not SPEED_RATIO[0] < ratio < SPEED_RATIO[1]:
+        raise RecordingError(
+            f"{table.drive.table}: poses move {ratio:.2f} times as fast as speed_mps says, expected about 1; check its "
+            "unit, and dt_s"
+        )
 
 
 def canvas_on(own: OwnDrives, track: Track) -> CanvasPlacement:
