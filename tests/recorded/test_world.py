@@ -8,7 +8,7 @@ import torch
 
 from painted_ground import CANVAS, RampFollower, recorded, recorded_road
 from roadproof.coverage import Shape
-from roadproof.errors import RecordingError
+from roadproof.errors import RecordingError, SimulatorError
 from roadproof.patterns import Pattern
 from roadproof.recorded.vehicle import Vehicle
 from roadproof.recorded.world import UNSURE, BiasedStart, RecordedWorld
@@ -180,6 +180,8 @@ def test_sets_too_thin_to_drive_in_are_one_clear_line():
     )
     with pytest.raises(RecordingError, match="no pose for frame"):
         dataclasses.replace(clean, track=few)
+    with pytest.raises(SimulatorError, match=r"the vehicle has steps of 0\.05 s, the recordings have 0\.1 s"):
+        RecordedWorld(road, vehicle=dataclasses.replace(VEHICLE, dt_s=0.05))
 
 
 def without(drive, steps):

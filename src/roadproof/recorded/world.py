@@ -21,7 +21,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_controls_of, steer_of
 from roadproof.driving.deviation import deviation_m
 from roadproof.driving.starts import StartOffset
-from roadproof.errors import RecordingError
+from roadproof.errors import RecordingError, SimulatorError
 from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
 from roadproof.recorded.obstacles import Obstacles
@@ -139,6 +139,7 @@ class RecordedWorld:
     Raises:
         RecordingError: there is no clean drive, the drives are of several weathers, poses are not known, or the vehicle
             cannot be identified.
+        SimulatorError: the vehicle's time step is not the recordings'.
     """
 
     def __init__(
@@ -157,6 +158,11 @@ class RecordedWorld:
         tracks = [drive.track for drive in recordings.recordings if drive.track is not None]
         self.vehicle = vehicle or Vehicle.identified(tracks)
         self.course = Course(clean.track, self.bank.canvas, int(clean.frame_number[0]), device=device)
+        if self.vehicle.dt_s != self.course.dt_s:
+            raise SimulatorError(
+                f"the vehicle has steps of {self.vehicle.dt_s} s, the recordings have {self.course.dt_s} s; expected "
+                "one and the same"
+            )
         path = torch.stack(self.course.poses[:2], 1).cpu().numpy()
         middle = (self.course.canvas.x_m, self.course.canvas.y_m)
         self.obstacles = Obstacles(recordings.obstacles or (), path, middle, device=device)
