@@ -259,6 +259,12 @@ def test_a_table_that_makes_no_sense_is_refused(tmp_path, row, values, message):
         import_drives(folder)
 
 
+def test_a_table_may_begin_with_a_byte_order_mark(tmp_path):
+    table = write_own(tmp_path / "own", ["clean"]) / "clean.csv"
+    table.write_text(table.read_text(), encoding="utf-8-sig")
+    assert import_drives(tmp_path / "own").is_placed
+
+
 def test_columns_are_known_or_named(tmp_path):
     folder = write_own(tmp_path / "own", ["clean"], columns=["x_m", "y_m"])
     with pytest.raises(RecordingError, match="does not say where the car was"):

@@ -83,7 +83,8 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
             raise RecordingError(
                 f"{path} has more than {_MOST_BYTES >> 20} MiB, expected a row a step; leave others out"
             )
-        with path.open(encoding="utf-8", newline="") as file:
+        # Spreadsheets begin a file with a byte order mark.
+        with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             rows = list(reader)
             names = list(reader.fieldnames or ())
