@@ -273,6 +273,9 @@ def test_columns_are_known_or_named(tmp_path):
     table.write_text(table.read_text().replace("x_m", "east_m", 1))
     with pytest.raises(RecordingError, match="column 'east_m', expected picture, x_m"):
         import_drives(folder)
+    table.write_text(table.read_text().replace("throttle", "steer", 1))
+    with pytest.raises(RecordingError, match=r"clean.csv has two columns 'steer', expected one of each name"):
+        import_drives(folder)
     table.write_text("")
     with pytest.raises(RecordingError, match="has 0 rows"):
         import_drives(folder)

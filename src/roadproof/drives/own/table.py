@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from roadproof.drives.own.plan import PLAN, OwnDrive
 from roadproof.errors import RecordingError
 from roadproof.io.files import inside
+from roadproof.io.tables import first_twice
 
 POSE = ("x_m", "y_m", "yaw_rad")
 CORNERS = tuple(f"{corner}_{axis}" for corner in ("far_left", "far_right", "near_right", "near_left") for axis in "xy")
@@ -74,8 +75,8 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
     """Read the table of a drive.
 
     Raises:
-        RecordingError: the file is missing, too long, no table or names no picture, or has an unknown column or a wrong
-            number.
+        RecordingError: the file is missing, too long, no table or names no picture, or has an unknown column, one twice
+            or a wrong number.
     """
     path = inside(folder, drive.table, f"{folder / PLAN}: table", RecordingError)
     try:
@@ -92,6 +93,8 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
         raise RecordingError(f"cannot read {path}: {reason.strerror or reason}; check the path") from None
     except (ValueError, csv.Error) as reason:
         raise RecordingError(f"{path} is no table of comma-separated values ({reason})") from None
+    if (twice := first_twice(names)) is not None:
+        raise RecordingError(f"{path} has two columns {twice!r:.60}, expected one of each name; leave one out")
     if (long := next((k for k, row in enumerate(rows, 1) if None in row), None)) is not None:
         raise RecordingError(f"{path}, row {long}: it has more cells than the {len(names)} columns; check its commas")
     if "picture" not in names or not rows:
