@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.ExifTags import Base
 
 from roadproof.errors import RoadproofError
 from roadproof.io.pictures import read_picture
@@ -74,6 +75,19 @@ def test_pictures_that_would_silently_become_others_are_refused(
     picture.save(tmp_path / "x.png")
     with pytest.raises(RoadproofError, match=reason):
         read_picture(tmp_path / "x.png", RoadproofError, "make it again")
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_a_picture_that_is_stored_turned_is_refused(tmp_path: Path, kind: str) -> None:
+    exif, picture = Image.Exif(), Image.fromarray(np.zeros((4, 5, 3), np.uint8))
+    for orientation in (0, 1, 3, 6):
+        exif[Base.Orientation] = orientation
+        picture.save(tmp_path / f"{orientation}.{kind}", exif=exif)
+    for upright in (0, 1):
+        assert read_picture(tmp_path / f"{upright}.{kind}", RoadproofError, "make it again").shape == (4, 5, 3)
+    for orientation in (3, 6):
+        with pytest.raises(RoadproofError, match=rf"stored turned \(EXIF orientation {orientation}\)"):
+            read_picture(tmp_path / f"{orientation}.{kind}", RoadproofError, "make it again")
 
 
 def test_a_picture_with_alpha_that_hides_nothing_is_read(tmp_path: Path) -> None:

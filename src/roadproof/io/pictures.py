@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
+from PIL.ExifTags import Base
 
 from roadproof.errors import RoadproofError
 from roadproof.io.arrays import DAMAGE
@@ -29,7 +30,7 @@ def read_picture(
 
     Raises:
         error: the picture is missing, damaged, of another kind, larger than any picture here, has more than 8 bits a
-            channel or is animated; or it is transparent where RGB is wanted.
+            channel, is animated or stored turned; or it is transparent where RGB is wanted.
     """
     try:
         # Pillow leaves a file open whose first bytes cannot be read.
@@ -38,6 +39,9 @@ def read_picture(
                 raise ValueError(f"{picture.width}×{picture.height} pixels, expected at most {MOST_PIXELS}")
             if (frames := getattr(picture, "n_frames", 1)) > 1:
                 raise ValueError(f"it is an animation of {frames} pictures, expected one")
+            if (orientation := picture.getexif().get(Base.Orientation)) in range(2, 9):
+                # Viewers would show it turned, Pillow reads it as it lies in the file.
+                raise ValueError(f"it is stored turned (EXIF orientation {orientation}), expected one that is upright")
             if picture.mode[0] in "IF":
                 # Pillow would clip them to 8 bits: nearly all white.
                 raise ValueError(f"its channels have more than 8 bits (mode {picture.mode}), expected 8")
