@@ -260,6 +260,7 @@ DAMAGE = {
     "unknown command": (lambda s: edit_drive(s / "clean", command=np.array([2, 99, 2])), "command of frame 11 is 99"),
     "half a command": (lambda s: edit_drive(s / "clean", command=np.array([2, 2.5, 2])), "expected whole numbers"),
     "more steer than there is": (lambda s: edit_drive(s / "clean", steer=np.array([0, 0, 3.0])), "expected −1 to 1"),
+    "one frame number": (lambda s: edit_drive(s / "clean", frame_number=np.array(10)), r"frame_number has shape \(\)"),
     "frames in disorder": (
         lambda s: edit_drive(s / "clean", frame_number=np.array([12, 11, 10])),
         "frame numbers do not rise",

@@ -209,14 +209,18 @@ def _read_drive(root: Path, drive: _Drive) -> Recording:
     if not folder.is_dir():
         raise RecordingError(f"drive {drive.name} is listed in recordings.json but {folder} is missing")
     content = _PER_FRAME.content(folder / "drive.npz")
+    numbers: np.ndarray = content["frame_number"]
+    if numbers.ndim != 1:
+        told = f"frame_number has shape {numbers.shape}, expected a number for each frame"
+        raise RecordingError(f"{folder / 'drive.npz'}: {told}; {_AGAIN}")
     return _PER_FRAME.made(
         folder / "drive.npz",
         content,
         name=drive.name,
         side=drive.side,
-        frames=_read_frames(folder, content["frame_number"]),
+        frames=_read_frames(folder, numbers),
         maps=_read_maps(folder / "shading.npz"),
-        track=_read_track(folder / "track.npz", content["frame_number"]),
+        track=_read_track(folder / "track.npz", numbers),
         weather=drive.weather,
     )
 
