@@ -25,8 +25,8 @@ class ColourSamples:
         size_px: columns and rows of the camera picture; needed with `pixel`.
 
     Raises:
-        ColourError: lengths differ, a value is NaN, infinite or outside [0, 1], all seen values are saturated, or there
-            are pixels without a picture size.
+        ColourError: lengths differ, a value is NaN, infinite or outside [0, 1], or there are pixels without a picture
+            size.
     """
 
     painted: Float[Tensor, "n 3"]

@@ -10,7 +10,7 @@ Near the clean drive a controller answers to the bare road with about
     u = u_clean(s) + p d + q e + r d |d|
 
 fitted to its answers to the recorded frames. The law stands for the picture where there is none, past the last recorded
-frame, and its slopes stand for what the picture would say of a small change of pose when gradients are taken.
+frame; p and q alone stand for what the picture would say of a small change of pose when gradients are taken.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Course:
         return self.at(self.steer, place.s_m) + p * d + q * place.turned_rad + r * d * d.abs()
 
     def feedback(self, place: Place) -> Float[Tensor, " r"]:
-        """Zero, with the gradient of the law in the pose, which stands for what the picture would answer to a move."""
+        """Zero, with p and q as gradient in the pose, which stands for what the picture would answer to a move."""
         p, q, _ = self._law.unbind()
         d, e = place.right_m, place.turned_rad
         return p * (d - d.detach()) + q * (e - e.detach())
