@@ -403,6 +403,20 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(saved, monkeypa
     assert [path.name for path in saved.parent.iterdir()] == ["set"]
 
 
+@pytest.mark.parametrize(
+    "change", [lambda f: f[..., 0], lambda f: f / 255, lambda f: f.repeat(2, -1)], ids=["grey", "floats", "channels"]
+)
+def test_frames_that_are_no_pictures_in_colour_are_refused(tmp_path, change):
+    drive = recording(Side.CLEAN, frames=2)
+    message = r"drive clean: frames are .*, expected uint8 \(frames, h, w, 3\)"
+    with pytest.raises(RecordingError, match=message):
+        replace(drive, frames=change(drive.frames))
+    save_recordings(replace(recording_set(), recordings=(drive,)), tmp_path / "set", compact=True)
+    np.save(tmp_path / "set" / "clean" / "frames.npy", change(drive.frames))
+    with pytest.raises(RecordingError, match=message):
+        load_recordings(tmp_path / "set")
+
+
 def test_two_drives_need_two_names():
     drive = recording(Side.CLEAN)
     with pytest.raises(RecordingError, match="same name"):

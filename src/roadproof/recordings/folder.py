@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from PIL import Image
 
 from roadproof.datatypes import Obstacle
@@ -246,14 +245,9 @@ def _read_maps(path: Path) -> PixelMaps | None:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _read_frames(folder: Path, numbers: np.ndarray) -> UInt8[np.ndarray, "f h w 3"]:
+def _read_frames(folder: Path, numbers: np.ndarray) -> np.ndarray:
     if (folder / "frames.npy").exists():
-        frames = read_array(folder / "frames.npy", RecordingError, _AGAIN)
-        if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[-1] != 3:
-            raise RecordingError(
-                f"{folder / 'frames.npy'} is {frames.dtype} of shape {frames.shape}, expected uint8 (frames, h, w, 3)"
-            )
-        return frames
+        return read_array(folder / "frames.npy", RecordingError, _AGAIN)
     pictures = (folder / "frames" / f"{number}.png" for number in numbers)
     frames = [read_picture(path, RecordingError, _AGAIN) for path in pictures]
     sizes = {frame.shape[1::-1] for frame in frames}

@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped
 
 from roadproof.datatypes import Command, Obstacle
 from roadproof.errors import GeometryError, RecordingError
@@ -42,7 +42,7 @@ class Recording:
     Args:
         name: name of the drive and of its folder.
         side: side to which the drive was perturbed.
-        frames: the controller's input without any paint, RGB, (F, H, W, 3).
+        frames: the controller's input without any paint, RGB uint8, (F, H, W, 3).
         frame_number: number of each frame's step in the drive, rising, (F,).
         image_from_canvas: one homography per frame, canvas px to camera px, (F, 3, 3).
         speed_mps: speed at each frame, m/s, from −1 (rolling back) to `FASTEST_MPS`, (F,).
@@ -59,7 +59,7 @@ class Recording:
 
     name: str
     side: Side
-    frames: UInt8[np.ndarray, "f h w 3"]
+    frames: Shaped[np.ndarray, "..."]
     frame_number: Int[np.ndarray, "..."]
     image_from_canvas: Float[np.ndarray, "..."]
     speed_mps: Float[np.ndarray, "..."]
@@ -71,7 +71,11 @@ class Recording:
 
     def __post_init__(self) -> None:
         check_name(self.name, "drive", RecordingError)
-        count = len(self.frames)
+        frames = self.frames
+        if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3:
+            told = f"drive {self.name}: frames are {frames.dtype} of shape {frames.shape}"
+            raise RecordingError(f"{told}, expected uint8 (frames, h, w, 3)")
+        count = len(frames)
         if count == 0:
             raise RecordingError(f"drive {self.name} has no frames, expected at least one that shows the canvas")
         for field in PER_FRAME:
