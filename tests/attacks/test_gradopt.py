@@ -149,6 +149,18 @@ def test_the_best_of_a_rung_go_on():
 def test_first_rungs_run_on_few_frames_and_their_cost_is_counted():
     surrogate = Surrogate(recording_set(frames=4), pull_to_the_right(), (RIGHT_GROUP,))
     assert surrogate.thinned(3).lengths == [[2, 2]]
+
+
+def test_drives_whose_last_frames_are_past_the_canvas_are_searched_on_all_frames():
+    whole, away, drives = recording_set(), np.array([[1.0, 0, 1e5], [0, 1, 0], [0, 0, 1]]), []
+    for drive in whole.recordings:
+        seen = drive.image_from_canvas.copy()
+        seen[-1] = away @ seen[-1]
+        drives.append(dataclasses.replace(drive, image_from_canvas=seen))
+    surrogate = Surrogate(dataclasses.replace(whole, recordings=tuple(drives)), pull_to_the_right(), (RIGHT_GROUP,))
+    assert surrogate.thinned(2).lengths == [[2, 2]]
+    search = gradopt(surrogate, SearchSpace(figures=1), (Rung(2, 3, every=4), Rung(1, 3)), seed=0)
+    assert search.best.isfinite().all()
     before, steps = surrogate.frames_evaluated, []
     on_step = lambda step, _best: steps.append(step)  # noqa: E731
     gradopt(surrogate, SearchSpace(figures=1), (Rung(3, 5, every=2), Rung(1, 2)), seed=0, on_step=on_step)

@@ -22,7 +22,7 @@ from roadproof.compositing.variation import Looks, Variation
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import require_size, steer_of
 from roadproof.controllers.identity import identity_of
-from roadproof.errors import ControllerError
+from roadproof.errors import ControllerError, GeometryError
 from roadproof.io.identity import digest, stated
 from roadproof.io.known import known_by
 from roadproof.patterns import Pattern
@@ -93,9 +93,12 @@ class Surrogate(BatchedMeasure):
         return self.views[0].frames.device
 
     def thinned(self, every: int) -> Surrogate:
-        """The surrogate on every n-th frame of each drive."""
+        """The surrogate on every n-th frame of each drive, or on all where none of those shows the canvas."""
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
-        return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
+        try:
+            return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
+        except GeometryError:
+            return self
 
     def of_groups(self, kept: Sequence[int]) -> Surrogate:
         """The surrogate of some of its groups alone."""
