@@ -177,17 +177,21 @@ def gradopt(
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
     checkpoint = Checkpoint(running.get("checkpoint"), identity, aim_of(running))
     state = checkpoint.load(measure.device)
+    resumed = state is not None
     at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
     if state is None:
         state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
         at, behind = int(state.pop("rung")), state.pop("behind").cpu()
-        measure.frames_evaluated += int(state.pop("frames"))
+        # The clean frames that measures count when they are made again are among them.
+        measure.frames_evaluated = int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung = rungs[number]
         if number > at and rung.groups_compete and isinstance(measure, BatchedMeasure):
             state, behind = _without_those_behind(state, behind)
         climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
+        if resumed and number == at and climbed is not measure:
+            climbed.frames_evaluated = 0
         beside = side_by_side(climbed)
         if number > at:
             if rung.offspring:
