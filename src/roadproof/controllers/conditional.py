@@ -74,7 +74,7 @@ class ConditionalNetwork(nn.Module):
     def controls(self, frames: Frames, speed_mps: Speeds, command: Commands) -> Float[Tensor, "b 3"]:
         """The published agent's steer, throttle and brake; see `controllers.PedalController`.
 
-        It does not brake below 0.1, gives gas or brakes but not both, and gives no gas above 10 m/s.
+        It does not brake below 0.1, nor less than it gives gas; where it does not brake, it gives no gas above 10 m/s.
 
         Raises:
             ControllerError: the frames have the wrong size.
