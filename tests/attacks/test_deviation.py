@@ -279,6 +279,8 @@ def test_objectives_that_make_no_sense_are_one_clear_line(road):
         PathDeviation(starts=())
     with pytest.raises(RoadproofError, match="saturation 0"):
         PathDeviation(saturation_m=0.0)
+    with pytest.raises(RoadproofError, match="saturation inf m; expected above 0 and finite"):
+        PathDeviation(saturation_m=float("inf"))
     with pytest.raises(RecordingError, match="where its canvas lies"):
         search(dataclasses.replace(road, canvas=None))
     assert (SteeringShift().name, PathDeviation().name) == ("steering shift", "path deviation")

@@ -8,6 +8,7 @@ recordings.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol, TypeAlias, runtime_checkable
@@ -164,7 +165,7 @@ class PathDeviation(ClosedLoop):
             `ClosedLoop`.
 
     Raises:
-        RoadproofError: `starts` is empty, or `every` or `saturation_m` is not positive.
+        RoadproofError: `starts` is empty, or `every` or `saturation_m` is not positive, or this is infinite.
     """
 
     word: ClassVar[str] = "path deviation"
@@ -173,8 +174,8 @@ class PathDeviation(ClosedLoop):
     def __post_init__(self) -> None:
         # Dataclasses with slots are made anew, which super() without arguments does not know.
         super(PathDeviation, self).__post_init__()
-        if not self.saturation_m > 0:
-            raise RoadproofError(f"path deviation with saturation {self.saturation_m} m; expected above 0")
+        if not 0 < self.saturation_m < math.inf:
+            raise RoadproofError(f"path deviation with saturation {self.saturation_m} m; expected above 0 and finite")
 
     def measure(
         self, recordings: RecordingSet, controller: Controller, groups: Sequence[Group], *, device: torch.device | str
