@@ -93,6 +93,12 @@ def test_the_least_paint_stands_beside_the_strongest(workplace, tmp_path, invoke
     told = answered(printed.out)
     assert told.pop("cheapest") == stored(tmp_path / "cheapest" / "cheapest.json")
     assert told == stored(tmp_path / "result.json")
+    # What was found for another deviation does not stay where none is found.
+    monkeypatch.setattr("roadproof.attacks.cheapest", lambda *_, **_how: None)
+    code, printed = invoke("attack", workplace / "run" / "recordings", *shy, *quick, "--json")
+    assert code == 0, printed.err
+    assert answered(printed.out)["cheapest"] is None
+    assert not list((tmp_path / "cheapest").iterdir())
 
 
 def test_what_a_search_predicted_is_said_in_metres(tmp_path, invoke):

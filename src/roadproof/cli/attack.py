@@ -193,6 +193,8 @@ def _less_paint(
         )
     say(cheapest_in_words(less, wanted_m))
     if less is None:
+        for name in ("cheapest.json", "pattern.json", "pattern.png"):  # of another deviation, asked for before
+            (folder / name).unlink(missing_ok=True)
         return None
     less.save(folder)
     return stored(folder / "cheapest.json")
