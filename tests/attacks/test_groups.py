@@ -5,11 +5,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadproof.attacks import GradOpt
-from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Direction, divergence, parse_groups
-from roadproof.errors import RecordingError
+from roadproof.attacks import GradOpt, RandomSearch, SteeringShift, attack, kept_attack
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, Direction, Group, divergence, parse_groups
+from roadproof.errors import RecordingError, RoadproofError
 from roadproof.recordings import Side
-from scenes import recording_set
+from roadproof.search_space import SearchSpace
+from scenes import LinearController, recording_set
 
 SHIFT = torch.tensor([0.3, 0.1, -0.2, -0.6])
 
@@ -52,6 +53,22 @@ def test_groups_are_read_from_words():
 def test_groups_that_make_no_sense_are_refused(words):
     with pytest.raises(RecordingError, match="group"):
         parse_groups(words, recording_set())
+
+
+def test_groups_of_one_name_are_told_apart_or_refused(tmp_path):
+    controller = LinearController(torch.full((3, 88, 200), 1e-4))
+    recordings, space = recording_set(frames=2), SearchSpace(figures=1)
+    asked = {"objective": SteeringShift(), "method": RandomSearch(calls=2)}
+    right, left = (Group((Side.CLEAN,), direction) for direction in (Direction.RIGHT, Direction.LEFT))
+    for kept, other in ((right, left), (Group((Side.CLEAN,), Direction.EITHER), *parse_groups("all", recordings))):
+        folder = tmp_path / str(kept)
+        kept_attack(folder, recordings, controller, space, groups=[kept], **asked)
+        with pytest.raises(RoadproofError, match=r"holds a search with groups \['?"):
+            kept_attack(folder, recordings, controller, space, groups=[other], **asked)
+    named = attack(recordings, controller, space, groups=(RIGHT_GROUP, LEFT_GROUP), **asked)
+    assert named.made_of["groups"] == ["clean+right", "clean+left"]
+    with pytest.raises(RecordingError, match="groups are clean, clean, expected each name once"):
+        attack(recordings, controller, space, groups=(right, left), **asked)
 
 
 def test_a_group_without_its_drive_is_named():

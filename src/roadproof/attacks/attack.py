@@ -26,7 +26,7 @@ from roadproof.attacks.checks import (
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.gradopt import Search
-from roadproof.attacks.groups import Group
+from roadproof.attacks.groups import Group, known_as, require_names
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import BayesianOptimisation, GradOpt, Published, stored
 from roadproof.attacks.objective import Measure, Objective, PathDeviation, RecordedMeasure, SteeringShift, own_objective
@@ -85,7 +85,7 @@ def attack(
 
     Raises:
         ControllerError: the controller takes frames of another size, or answers NaN.
-        RecordingError: a group names drives that the set lacks.
+        RecordingError: a group names drives that the set lacks, or two groups have one name.
         PatternError: the method cannot search these patterns, or the limits on paint leave none on this road.
         RoadproofError: the method needs gradients, which a simulator does not give; groups, a device or random patterns
             are given for one; or `rollout` fails there.
@@ -102,6 +102,7 @@ def attack(
         measure = DrivenMeasure(recordings, controller, objective)
     else:
         site, groups = site_of(recordings), groups or method.groups(recordings, objective)
+        require_names(groups)
         measure = method.measure(objective, recordings, controller, groups, device=device)
     start = time.perf_counter()
     groups, space = measure.groups, space.on(site)
@@ -181,7 +182,7 @@ def _made_of(
         "objective": objective.name,
         "objective_fields": own_objective(objective) or plain(objective),
         "method": stored(method),
-        "groups": groups and list(map(str, groups)),
+        "groups": groups and [known_as(group, recordings) for group in groups],
         "seed": seed,
         "drives": recordings.digest()[:16],
         "marks": recordings.marks_digest()[:16],

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.errors import RecordingError
+from roadproof.io.records import plain
 from roadproof.recordings import Recording, RecordingSet, Side
 
 Points = Float[Tensor, "g r k n"]
@@ -94,6 +95,27 @@ def parse_groups(text: str, recordings: RecordingSet) -> tuple[Group, ...]:
         return (Group(sides, Direction.EITHER),)
     speeds = {"slower": Group(sides, Direction.SLOWER), "faster": Group(sides, Direction.FASTER)}
     return tuple(speeds.get(part.strip()) or _parse_group(part) for part in text.split(","))
+
+
+def known_as(group: Group, recordings: RecordingSet) -> object:
+    """What tells a group of a set's drives from others: its name, or all of it where another may have that name."""
+    try:
+        (named,) = parse_groups(str(group), recordings)
+    except RecordingError:
+        return plain(group)
+    # Of a speed only the direction counts.
+    return str(group) if named == group or str(group) == group.direction else plain(group)
+
+
+def require_names(groups: Sequence[Group]) -> None:
+    """Refuse groups of which two have one name, since results know them by it.
+
+    Raises:
+        RecordingError: two groups have one name.
+    """
+    names = list(map(str, groups))
+    if len({*names}) < len(names):
+        raise RecordingError(f"groups are {', '.join(names)}, expected each name once; attack one after another")
 
 
 def require_directions(groups: Sequence[Group], allowed: Sequence[Direction], objective: str) -> None:
