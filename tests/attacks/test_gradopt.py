@@ -427,6 +427,12 @@ def test_a_controller_for_other_frames_or_one_that_answers_nan_is_refused():
         Surrogate(recording_set(), LinearController(torch.full((3, 88, 200), torch.nan)), (RIGHT_GROUP,))
 
 
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_out_of_range_is_one_line(seed):
+    with pytest.raises(RoadproofError, match=f"the seed is {seed}, expected 0 to 4,294,967,295"):
+        attack(recording_set(), pull_to_the_right(), SearchSpace(figures=1), method=QUICK, seed=seed)
+
+
 def test_methods_that_make_no_sense_are_refused():
     for wrong in ({"iterations": 0}, {"restarts": 0}, {"restarts": True}, {"restarts": 9}):
         with pytest.raises(RoadproofError, match=f"{next(iter(wrong))} is {next(iter(wrong.values()))}, expected"):

@@ -42,6 +42,7 @@ from roadproof.io.identity import digest, require_same
 from roadproof.io.identity import stated as as_text
 from roadproof.io.known import known_by
 from roadproof.io.records import plain
+from roadproof.limits import MAX_SEED
 from roadproof.paint import conspicuousness
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import site_at
@@ -76,7 +77,7 @@ def attack(
         groups: groups of recorded drives, each attacked together; none in a simulator. By default, for a method with
             gradients and drives perturbed to both sides, the paper's two sides, of which the stronger is kept, or for a
             speed change slower and faster; otherwise one group of all drives, to whichever side they give way.
-        seed: seed of everything random, 0 by default.
+        seed: seed of everything random, 0 to 2³² − 1; 0 by default.
         device: torch device on which a search on recordings computes.
         random_patterns: number of random patterns per group for the self-check on recordings; 0 leaves that check out.
         starts: candidates of an earlier search to start from, each in its own group, in place of as many random starts.
@@ -87,9 +88,11 @@ def attack(
         ControllerError: the controller takes frames of another size, or answers NaN.
         RecordingError: a group names drives that the set lacks, or two groups have one name.
         PatternError: the method cannot search these patterns, or the limits on paint leave none on this road.
-        RoadproofError: the method needs gradients, which a simulator does not give; groups, a device or random patterns
-            are given for one; or `rollout` fails there.
+        RoadproofError: the seed is out of range; the method needs gradients, which a simulator does not give; groups, a
+            device or random patterns are given for one; or `rollout` fails there.
     """
+    if not 0 <= seed <= MAX_SEED:
+        raise RoadproofError(f"the seed is {seed}, expected 0 to {MAX_SEED:,}")
     method = method or GradOpt()
     objective = objective or usual_objective(recordings, method)
     method.check_space(space)
