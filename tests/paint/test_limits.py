@@ -162,6 +162,7 @@ def test_gradients_of_limited_patterns_are_exact_where_figures_shrink():
         ({"contrast": (0.55, 0.6), "printable": True}, Site(asphalt=(0.5, 0.5, 0.5)), "no paint has a contrast"),
         ({"contrast": (0.3, 0.4), "colours": ("#5c5957",)}, SITE, "no colour listed has a contrast of 0.3 to 0.4"),
         ({"contrast": (0.1, 0.2)}, Site(size_m=SIZE_M), "needs the colour of the asphalt"),
+        ({"keep_out_m": 0.1}, Site(size_m=(1e8, 9.5), marks=(MIDDLE,)), r"1e\+08 m × 9\.5 m, expected 100"),
         ({"keep_out_m": 0.1}, Site(size_m=SIZE_M), "needs the lane marks, which are not known"),
         ({"max_area_m2": 1.0}, Site(), "size of the canvas"),
     ],

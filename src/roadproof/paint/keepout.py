@@ -27,6 +27,7 @@ LEAST_M = 0.1
 """A middle is at least so far from the keep-out, so that its figure is no speck."""
 
 _CELL_M = 0.1
+_MOST_CANVAS_M = 100.0
 _INSIDE = 1 - 1e-5
 
 
@@ -96,10 +97,16 @@ def keep_out(site: Site, distance_m: float) -> KeepOut | None:
     """The map that keeps a distance from all lane marks of a site, in metres; None if it has no marks.
 
     Raises:
-        PatternError: no place on the canvas is so far from all marks.
+        PatternError: no place on the canvas is so far from all marks, or it is larger than 100 m.
     """
     ends, widths, _ = site.segments
     assert site.size_m is not None
+    if max(site.size_m) > _MOST_CANVAS_M:
+        width_m, length_m = site.size_m
+        raise PatternError(
+            f"canvas is {width_m:g} m × {length_m:g} m, expected {_MOST_CANVAS_M:g} m at most with a keep-out; "
+            "leave that out"
+        )
     if not len(ends):
         return None
     along = ends[:, 1] - ends[:, 0]
