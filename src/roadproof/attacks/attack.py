@@ -43,7 +43,7 @@ from roadproof.io.identity import stated as as_text
 from roadproof.io.known import known_by
 from roadproof.io.records import plain
 from roadproof.limits import MAX_SEED
-from roadproof.paint import conspicuousness
+from roadproof.paint import Site, conspicuousness
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import site_at
 from roadproof.search_space import SearchSpace
@@ -99,14 +99,7 @@ def attack(
     made_of: dict[str, Any] = {}
     with suppress(ControllerError):  # one that cannot drive is attacked all the same
         made_of = _made_of(recordings, controller, space, objective, method, groups, seed, starts, random_patterns)
-    if isinstance(recordings, InSimulator):
-        _refuse_in_simulator(method, groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
-        site = site_at(recordings.simulator, recordings.scenario)
-        measure = DrivenMeasure(recordings, controller, objective)
-    else:
-        site, groups = site_of(recordings), groups or method.groups(recordings, objective)
-        require_names(groups)
-        measure = method.measure(objective, recordings, controller, groups, device=device)
+    site, measure = _begun(recordings, controller, objective, method, groups, device, random_patterns)
     start = time.perf_counter()
     groups, space = measure.groups, space.on(site)
     search = method.search(
@@ -151,6 +144,24 @@ def usual_objective(recordings: RecordingSet | InSimulator, method: Method) -> O
     """
     driven = isinstance(recordings, InSimulator) or (recordings.is_placed and recordings.has_both_sides)
     return PathDeviation() if driven and not isinstance(method, Published | BayesianOptimisation) else SteeringShift()
+
+
+def _begun(
+    recordings: RecordingSet | InSimulator,
+    controller: Controller,
+    objective: Objective,
+    method: Method,
+    groups: Sequence[Group] | None,
+    device: torch.device | str,
+    random_patterns: int,
+) -> tuple[Site, Measure]:
+    """What is known of the canvas, and the measure that is made large, once both are known to fit what is asked for."""
+    if isinstance(recordings, InSimulator):
+        _refuse_in_simulator(method, groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
+        return site_at(recordings.simulator, recordings.scenario), DrivenMeasure(recordings, controller, objective)
+    groups = groups or method.groups(recordings, objective)
+    require_names(groups)
+    return site_of(recordings), method.measure(objective, recordings, controller, groups, device=device)
 
 
 def _refuse_in_simulator(method: Method, **given: object) -> None:
