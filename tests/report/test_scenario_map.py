@@ -49,7 +49,7 @@ def test_a_way_of_four_points_is_drawn(tmp_path: Path) -> None:
 
 def test_a_ribbon_of_paint_fills_no_memory() -> None:
     paint = np.zeros((8, 8, 4), np.uint8)
-    for width_m, size in ((1e-5, (4, 400)), (2.0, (4, 8)), (1e9, (4, 1))):
+    for width_m, size in ((1e-5, (4, 400)), (2.0, (4, 8)), (9e8, (4, 1))):
         assert on_asphalt(paint, 4, CanvasPlacement(x_m=0.0, y_m=0.0, width_m=width_m, length_m=4.0)).size == size
 
 
