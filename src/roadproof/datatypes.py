@@ -125,6 +125,15 @@ class EventKind(StrEnum):
     SIDEWALK = "sidewalk"
     OFF_ROAD = "off-road"
 
+    @property
+    def departure(self) -> str:
+        """What tells a departure from others: leaving the road is one, over the sidewalk or not."""
+        return "off" if self in (EventKind.SIDEWALK, EventKind.OFF_ROAD) else self
+
+
+RECOUNT_S = 2.0
+"""The same fault again within this time is still the same fault: the 20 frames at 10 Hz of CARLA's first benchmark."""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:

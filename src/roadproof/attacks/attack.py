@@ -189,7 +189,6 @@ def _made_of(
     """What identifies a search on recordings, by name, as JSON has it; empty where no search goes on from it."""
     if not isinstance(recordings, RecordingSet):
         return {}
-    parts = parts_of(controller, (recordings.view.height_px, recordings.view.width_px))
     begun = [(each.group, known_by(each.pattern)) for each in starts]
     made_of = {
         "space": space.stated,
@@ -201,7 +200,7 @@ def _made_of(
         "drives": recordings.digest()[:16],
         "marks": recordings.marks_digest()[:16],
         "starts": digest(as_text(begun))[:16],
-        **parts,
+        **parts_of(controller, (recordings.view.height_px, recordings.view.width_px)),
     }
     # Results are older than this part; those of the pipeline compare with no random patterns.
     made_of |= {"random_patterns": random_patterns} if random_patterns else {}

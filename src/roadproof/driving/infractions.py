@@ -5,11 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from roadproof.datatypes import Event, EventKind
-
-RECOUNT_S = 2.0
-"""The same fault again within this time is still the same fault: the 20 frames at 10 Hz of CARLA's first benchmark."""
-
+from roadproof.datatypes import RECOUNT_S, Event, EventKind
 
 CHALLENGE_POINTS = {
     EventKind.COLLISION_STATIC: 6.0,
@@ -39,9 +35,6 @@ _COLLISIONS = (EventKind.COLLISION_STATIC, EventKind.COLLISION_VEHICLE, EventKin
 _SIGNALS = (EventKind.RED_LIGHT, EventKind.STOP_SIGN)
 
 
-_LEFT_THE_ROAD = (EventKind.SIDEWALK, EventKind.OFF_ROAD)
-
-
 def counted(events: Sequence[Event]) -> tuple[Event, ...]:
     """The events that count: every fault once.
 
@@ -57,10 +50,7 @@ def counted(events: Sequence[Event]) -> tuple[Event, ...]:
     last_s: dict[tuple[str, ...], float] = {}
     for event in events:
         named = event.kind in _COLLISIONS and event.detail
-        if named or event.kind in _SIGNALS:
-            key = (event.kind, event.detail)
-        else:
-            key = ("off",) if event.kind in _LEFT_THE_ROAD else (event.kind,)
+        key = (event.kind, event.detail) if named or event.kind in _SIGNALS else (event.kind.departure,)
         before_s = last_s.get(key, -math.inf)
         last_s[key] = event.time_s
         if before_s == -math.inf or (not named and event.time_s - before_s > RECOUNT_S):

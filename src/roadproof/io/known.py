@@ -41,10 +41,10 @@ def known_by(thing: object) -> Any:  # noqa: ANN401
 
     A function is known by its name and source, and by what it was given: defaults, the arguments of a partial one, and
     what it uses of the user's modules and of its closure; lists, dicts and sets, which may grow as it is called, count
-    as they were when this process was first asked. An
-    object is known by its class with its source, and by what its constructor takes, where it keeps that under the same
-    name; a dataclass by its fields; a network by its weights too. Roadproof's own functions and classes have no source
-    here: their version and their answers tell. A path tells nothing, as a folder may be moved.
+    as they were when this process was first asked. An object is known by its class with its source, and by what its
+    constructor takes, where it keeps that under the same name; a dataclass by its fields; a network by its weights too.
+    Roadproof's own functions and classes have no source here: their version and their answers tell. A path tells
+    nothing, as a folder may be moved.
     """
     return _known(thing, _Within((), set()))
 

@@ -41,7 +41,7 @@ _MOST_SKEW = (0.05, 0.15)
 """Cosine between the canvas' axes on the road, which are at right angles: in the median, and in one frame."""
 _MOST_STRETCH = 0.2
 """Size of the canvas in one frame against the median."""
-SPEED_RATIO = (0.75, 1.33)
+_SPEED_RATIO = (0.75, 1.33)
 """Speed of the poses against the recorded speed, in the median of a set."""
 
 
@@ -192,16 +192,21 @@ def _check_views(ground: _Ground, names: list[str]) -> None:
         )
 
 
+def odd_ratio(moved_m: Float[np.ndarray, " n"], way_m: Float[np.ndarray, " n"], least_m: float) -> float | None:
+    """How far poses move against the way that a speed makes, in the median of ways above the least; None if alike."""
+    moving = way_m > least_m
+    ratio = float(np.median(moved_m[moving] / way_m[moving])) if moving.any() else 1.0
+    return None if _SPEED_RATIO[0] < ratio < _SPEED_RATIO[1] else ratio
+
+
 def _check_speeds(drives: tuple[Recording, ...], tracks: list[Track]) -> None:
     """Refuse poses that do not move as fast as the car did."""
     moved_m = [np.hypot(np.diff(track.x_m), np.diff(track.y_m)) for track in tracks]
     way_m = [
         (track.speed_mps[1:] + track.speed_mps[:-1]) * (0.5 * track.dt_s) * np.diff(track.step) for track in tracks
     ]
-    moved, way = np.concatenate(moved_m), np.concatenate(way_m)
-    moving = way > 0.05
-    ratio = float(np.median(moved[moving] / way[moving])) if moving.any() else 1.0
-    if not SPEED_RATIO[0] < ratio < SPEED_RATIO[1]:
+    ratio = odd_ratio(np.concatenate(moved_m), np.concatenate(way_m), 0.05)
+    if ratio is not None:
         raise RecordingError(
             f"poses move {ratio:.2f} times as fast as the recorded speed says, expected about 1; "
             "check dt_s, the camera's height and the unit of speed_mps"

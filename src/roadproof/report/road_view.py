@@ -109,8 +109,8 @@ def draw_road(axes: Axes, road: RoadMap, around: Callable[[Points], Points], box
     left, low, right, high = box
     colours = {"sidewalk": ground.sidewalk, "shoulder": ground.shoulder or ground.asphalt, "driving": ground.asphalt}
 
-    def inside(plan: Points) -> bool:
-        outside = (plan.max(0) < (left, low)) | (plan.min(0) > (right, high))
+    def inside(points: Points) -> bool:
+        outside = (points.max(0) < (left, low)) | (points.min(0) > (right, high))
         return not bool(outside.any())
 
     for kind, colour in colours.items():

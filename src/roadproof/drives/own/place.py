@@ -16,7 +16,7 @@ from roadproof.drives.own.plan import PLAN, GroundPoint, OwnDrives
 from roadproof.drives.own.table import POSE, Table
 from roadproof.errors import GeometryError, RecordingError
 from roadproof.geometry import CameraModel, CanvasPlacement
-from roadproof.recorded.poses import SPEED_RATIO
+from roadproof.recorded.poses import odd_ratio
 from roadproof.recordings import Track
 
 _ORIGIN = VehicleState(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -81,9 +81,8 @@ def _check_speed(table: Table, track: Track) -> None:
     steps = max(1, round(1 / track.dt_s))
     driven_m = np.concatenate([[0.0], ((track.speed_mps[1:] + track.speed_mps[:-1]) / 2 * track.dt_s).cumsum()])
     x, y, way = (values[steps:] - values[:-steps] for values in (track.x_m, track.y_m, driven_m))
-    moving = way > _LEAST_WAY_M
-    ratio = float(np.median(np.hypot(x, y)[moving] / way[moving])) if moving.any() else 1.0
-    if not SPEED_RATIO[0] < ratio < SPEED_RATIO[1]:
+    ratio = odd_ratio(np.hypot(x, y), way, _LEAST_WAY_M)
+    if ratio is not None:
         raise RecordingError(
             f"{table.drive.table}: poses move {ratio:.2f} times as fast as speed_mps says, expected about 1; check its "
             "unit, and dt_s"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from roadproof.datatypes import Ending, Event, EventKind, VehicleState
+from roadproof.datatypes import RECOUNT_S, Ending, Event, EventKind, VehicleState
 from roadproof.roads.roadmap import RoadMap, Surface
 from roadproof.roads.routes import Route, RoutePosition
 from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WHEELBASE_M, CAR_WIDTH_M
@@ -21,9 +21,6 @@ HEIGHT_M, TRACK_M = 1.45, 1.6
 """Measures of the driven car."""
 
 PERSON_RADIUS_M = 0.3
-REARM_S = 2.0
-"""So long a departure must be over before another counts, as `driving.infractions` counts stored events."""
-
 GOAL_M = 2.0
 OFF_ROUTE_M = 15.0
 STANDS_MPS = 0.1
@@ -36,7 +33,6 @@ _COLLISIONS = {
     "vehicle": EventKind.COLLISION_VEHICLE,
     "pedestrian": EventKind.COLLISION_PEDESTRIAN,
 }
-_LEFT_THE_ROAD = (EventKind.SIDEWALK, EventKind.OFF_ROAD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +73,9 @@ class Judge:
                 self._hit.add(contact.name)
                 events.append(Event(_COLLISIONS[contact.kind], time_s, contact.name))
         for kind, detail in self._departures(state):
-            departure = "off" if kind in _LEFT_THE_ROAD else kind
-            last = self._last.get(departure, -math.inf)
-            self._last[departure] = time_s
-            if time_s - last > REARM_S:
+            last = self._last.get(kind.departure, -math.inf)
+            self._last[kind.departure] = time_s
+            if time_s - last > RECOUNT_S:
                 events.append(Event(kind, time_s, detail))
         return tuple(events)
 
