@@ -172,9 +172,9 @@ def test_frames_that_do_not_show_the_canvas_are_refused():
 
 
 @pytest.mark.gpu
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="this torch sees no CUDA device")
 def test_cuda_gives_the_cpus_frames_and_gradients():
-    if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     space, unit = random_patterns(dtype=torch.float32)
     results = []
     for device in ("cpu", "cuda"):

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from roadproof.compositing.rectangles import PaintedRectangles
 from roadproof.compositing.variation import Looks
-from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews
+from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews, fuses
 from roadproof.coverage import Shape
 from roadproof.patterns import Pattern, coverages, visibilities
 
@@ -129,10 +129,16 @@ def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
 
 def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
+    only_rectangles = all(shape is Shape.RECTANGLE for shape in pattern.shapes)
+    if only_rectangles and fuses(view.clean):
+        # Triton is there on GPUs alone.
+        from roadproof.compositing.fused import painted as painted_at_once
+
+        return painted_at_once(pattern, view)
     if view.runs is None:
         return dense_colours(pattern, view)
     seen = view.response(pattern.colours)
-    if any(shape is not Shape.RECTANGLE for shape in pattern.shapes):
+    if not only_rectangles:
         return blend(visibilities(coverages(pattern, view.footprints)), seen, view)
     batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
     boxes, seen = pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -104,13 +105,32 @@ class OwnViews(CanvasPixels):
             gain=gain,
             bias=bias,
             response=response,
-            runs=None if dense else Runs.of(footprints.features[:, 0], clean, gain, bias),
+            runs=None if dense or fuses(clean) else Runs.of(footprints.features[:, 0], clean, gain, bias),
         )
 
     def pasted(self, frames: Float[Tensor, "b 3 h w"], colours: Float[Tensor, "b p 3"]) -> Float[Tensor, "b 3 h w"]:
         """The pictures with other colours in the canvas' pixels; the rest is copied bit for bit."""
         place = self.pixel[:, None].expand(-1, 3, -1)
         return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+
+
+def fuses(values: Tensor) -> bool:
+    """Whether rectangles are painted in one pass over the pixels where these numbers are (`fused`), without runs."""
+    return values.dtype == torch.float32 and compiles_kernels(values.device)
+
+
+@cache
+def compiles_kernels(device: torch.device) -> bool:
+    """Whether a device is a GPU for which Triton is there and can compile."""
+    if device.type != "cuda":
+        return False
+    try:
+        from roadproof.compositing.fused import try_out
+
+        try_out(device)
+    except Exception:  # without Triton, its C compiler or a GPU it knows, all only takes longer
+        return False
+    return True
 
 
 def picked_pixels(planes: Float[Tensor, "r c n"], index: Int[Tensor, "r p"]) -> Float[Tensor, "r c p"]:
@@ -158,7 +178,7 @@ def view_canvas(
         gain, offset, share = maps.gain.flatten(0, 2)[own], maps.offset.flatten(0, 2)[own], maps.visible.flatten()[own]
     gain, offset, share = (part.to(device=device, dtype=dtype) for part in (gain, offset, share[:, None]))
     gain, bias = share * gain, share * (offset - clean)
-    runs = Runs.of(footprints.features[None], clean[None], gain[None], bias[None])
+    runs = None if fuses(clean) else Runs.of(footprints.features[None], clean[None], gain[None], bias[None])
     return CanvasView(
         frames=levels,
         index=place,

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from roadproof.compositing.view import compiles_kernels
 from roadproof.datatypes import Obstacle
 from roadproof.recorded.vehicle import Motion
 from roadproof.traffic.agents import CAR_WIDTH_M
@@ -71,10 +72,23 @@ class Obstacles:
             dt_s: seconds per step.
             asks: whether the device is asked if any car touches; else all is computed, to the same end.
         """
+        if not len(self):
+            return car
+        if compiles_kernels(car.x_m.device):
+            # Triton is there on GPUs alone.
+            from roadproof.recorded.contact import held
+
+            states = torch.stack([car.x_m, car.y_m, car.yaw_rad, car.speed_mps, before.x_m, before.y_m], 1)
+            x, y, yaw, speed = held(states, self._boxes, self._ahead, _rules(dt_s)).unbind(1)
+            return car._replace(x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
+        return self._pushed(before, car, dt_s, asks=asks)
+
+    def _pushed(self, before: Motion, car: Motion, dt_s: float, *, asks: bool) -> Motion:
+        """What `hold` gives, as plain tensor operations."""
         x, y, yaw = car.x_m, car.y_m, car.yaw_rad
         # Most of the time nothing touches: that is asked without gradients, which would cost twice as much.
         here = (each.detach() for each in (x, y, yaw))
-        if not len(self) or (asks and not (_distances(self._circles(*here), self._boxes)[0] < RADIUS_M).any()):
+        if asks and not (_distances(self._circles(*here), self._boxes)[0] < RADIUS_M).any():
             return car
         pushed = torch.zeros_like(x)
         for _ in range(_PUSHES):
@@ -97,6 +111,12 @@ class Obstacles:
         """The middles of each car's circles."""
         ahead = self._ahead
         return torch.stack([x[:, None] + ahead * yaw.cos()[:, None], y[:, None] + ahead * yaw.sin()[:, None]], -1)
+
+
+def _rules(dt_s: float) -> dict[str, float]:
+    """The numbers by which `hold` pushes cars."""
+    slowed = SLOWED_MPS2 * dt_s
+    return {"radius": RADIUS_M, "gyration": GYRATION_M, "slowed": slowed, "dt_s": dt_s, "pushes": _PUSHES}
 
 
 def _distances(
