@@ -98,6 +98,32 @@ def test_no_process_computes_with_more_threads_than_this_one(monkeypatch):
     assert dict(spread(threads_of, [1, 2], nullcontext, processes=2)) == {1: 1, 2: 1}
 
 
+def place_of(layer, inside, _):
+    del inside
+    return layer.weight.device.type, layer.place.type, layer.weight.sum().item()
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        "cpu",
+        pytest.param(
+            "cuda",
+            marks=[
+                pytest.mark.gpu,
+                pytest.mark.skipif(not torch.cuda.is_available(), reason="this torch sees no CUDA device"),
+            ],
+        ),
+    ],
+)
+def test_what_is_on_a_gpu_is_on_the_processor_beside_this_one(device):
+    layer = torch.nn.Linear(2, 3).to(device)
+    layer.place = torch.device("cuda", 0)
+    expected = "cpu", "cpu", pytest.approx(layer.weight.sum().item(), abs=1e-6)
+    assert dict(spread(partial(place_of, layer), [1, 2], nullcontext, processes=2)) == {1: expected, 2: expected}
+    assert layer.weight.device.type == device
+
+
 def test_what_a_piece_raises_comes_through_and_ends_the_others():
     begun = time.monotonic()
     with pytest.raises(TrainingError, match="is refused"):

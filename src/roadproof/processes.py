@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import io
 import multiprocessing
 import os
 import pickle
@@ -83,7 +84,8 @@ class Pool(Generic[Inside]):
         Args:
             function: a module's own function, or a `partial` of one; it gets what its process has opened and a piece of
                 work, and travels to a process once for all pieces. Long ones look now and then whether they are
-                `stopping`.
+                `stopping`. What it holds on a GPU is on the processor there: many processes with a picture at a time
+                would wait for each other at one GPU.
             works: the pieces; they travel between processes.
 
         Yields:
@@ -96,7 +98,7 @@ class Pool(Generic[Inside]):
             for work in works:
                 yield work, function(self._here, work)
             return
-        travels = pickle.dumps(function)
+        travels = _pickled_for_the_processor(function)
         try:
             # A process that dies at once breaks the pool before all is handed to it.
             waiting = {self._beside.submit(_call, travels, work): work for work in works}
@@ -181,6 +183,25 @@ def require_picklable(driver: object) -> None:
             f"{error}; several processes need a controller that can be pickled: define its class in a module, or "
             "use one process"
         ) from error.__cause__
+
+
+class _Processor(pickle.Pickler):
+    """Pickles what is on a GPU as if it were on the processor."""
+
+    def reducer_override(self, thing: Any) -> Any:  # noqa: ANN401  # as of `pickle`
+        if isinstance(thing, torch.device) and thing.type == "cuda":
+            return torch.device, ("cpu",)
+        if isinstance(thing, torch.nn.Parameter) and thing.is_cuda:
+            return cast("Any", torch.nn.Parameter(thing.detach().cpu(), thing.requires_grad)).__reduce_ex__(2)
+        if isinstance(thing, torch.Tensor) and thing.is_cuda:
+            return cast("Any", thing.detach().cpu().__reduce_ex__(2))
+        return NotImplemented
+
+
+def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:
+    with io.BytesIO() as file:
+        _Processor(file).dump(function)
+        return file.getvalue()
 
 
 _opens: Opens[Any] | None = None
