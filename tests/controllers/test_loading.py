@@ -179,6 +179,8 @@ def test_devices_and_precisions_that_are_not_there_are_refused(cil, tmp_path):
     ):
         with pytest.raises(DeviceError, match=message):
             load_controller(tmp_path / "cil.safetensors", device=device)
+    with pytest.raises(DeviceError, match="dtype tf32 is how GPUs multiply, cpu does not; use float32"):
+        load_controller(tmp_path / "cil.safetensors", dtype="tf32")
     with pytest.raises(DeviceError, match="dtype 'int8' is unknown, expected one of float32"):
         load_controller(tmp_path / "cil.safetensors", dtype="int8")
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from roadproof.controllers.precision import multiplies_bfloat16
+from roadproof.controllers.precision import multiplies_bfloat16, multiply_in
 
 
 @pytest.mark.parametrize(("capability", "expected"), [("AVX512", True), ("AVX2", False), ("DEFAULT", False)])
@@ -14,3 +14,14 @@ def test_a_processor_without_wide_vectors_has_no_bfloat16_arithmetic(
 
 def test_a_gpu_has_it() -> None:
     assert multiplies_bfloat16("cuda:0")
+
+
+def test_multiplications_round_to_tf32_only_where_that_is_asked_for() -> None:
+    before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
+    try:
+        for dtype, expected in (("float32", False), ("tf32", True), ("bfloat16", False)):
+            multiply_in(dtype)
+            assert torch.backends.cudnn.allow_tf32 is expected
+            assert torch.backends.cuda.matmul.allow_tf32 is expected
+    finally:
+        torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32 = before

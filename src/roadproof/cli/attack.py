@@ -72,7 +72,7 @@ def attack(
     cheapest: options.CheapestFor = None,
     seed: options.Seed = 0,
     device: options.Device = "cpu",
-    dtype: Annotated[str, typer.Option(help="What the controller computes in: float32 or bfloat16.")] = "float32",
+    dtype: Annotated[str, typer.Option(help="What it computes in: float32, bfloat16, or on a GPU tf32.")] = "float32",
     out: options.Out = Path("out/attack"),
     *,
     paint: Paint,
@@ -90,6 +90,7 @@ def attack(
     from roadproof.attacks.objective import varied
     from roadproof.cli.progress import progress
     from roadproof.controllers import load_controller
+    from roadproof.controllers.precision import multiply_in
     from roadproof.coverage import Shape
     from roadproof.pipeline.workload import of_cheapest, of_search
     from roadproof.recordings import load_recordings
@@ -115,6 +116,7 @@ def attack(
     if cheapest is not None:
         _check_cheapest(drives, goal)
     attacked = load_controller(controller, device=device, dtype=dtype)
+    multiply_in(dtype)
     _check_attacked(attacked, drives, searched, goal, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     frames = sum(len(each.frames) for each in drives.recordings)

@@ -99,7 +99,10 @@ def _device(device: str) -> str:
     import torch
 
     from roadproof.controllers.loading import device_of
+    from roadproof.controllers.precision import multiply_in
 
+    # So that a GPU answers as a CPU does.
+    multiply_in("float32")
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return str(device_of(device))

@@ -23,7 +23,7 @@ from roadproof.controllers.weights_file import ARCHITECTURES, card_beside, exist
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
 
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
+DTYPES = {"float32": torch.float32, "tf32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 SPECS = (
     "the name of a shipped one (`roadproof controllers`), FILE.safetensors, cil:FILE.safetensors, "
     "pilotnet:FILE.safetensors, FILE.pt2, FILE.onnx, module:factory (a function in your Python) or "
@@ -52,7 +52,8 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
             importable;
             `module:factory@FILE.safetensors`: the same, a `torch.nn.Module`, with weights that `harden` tuned.
         device: "cpu", "cuda" or "cuda:N".
-        dtype: precision in which the network computes: "float32", "bfloat16" or "float64". Frames may stay in float32.
+        dtype: precision in which the network computes: "float32", "bfloat16" or "float64", or on a GPU "tf32": float32,
+            for which `precision.multiply_in` says how to multiply. Frames may stay in float32.
 
     Raises:
         ControllerError: the spec or file does not exist, the weights are not installed or do not fit, or the object is
@@ -64,6 +65,8 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
         numbers alone.
     """
     place, precision = device_of(device), _dtype(dtype)
+    if dtype == "tf32" and place.type != "cuda":
+        raise DeviceError(f"dtype tf32 is how GPUs multiply, {device} does not; use float32")
     text = str(spec)
     controller = _found(text, place, precision)
     return call(f"moving the controller to {place} in {dtype}", _placed, controller, place, precision)
