@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.batched import BatchedMeasure
+from roadproof.attacks.batched import BatchedMeasure, pictures_at_once
 from roadproof.attacks.groups import Group, Points, Values, to_side
 from roadproof.attacks.surrogate import FIXED, Surrogate
 from roadproof.compositing.variation import Looks, Variation
@@ -31,7 +31,7 @@ from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
 MAX_PICTURES = 800
-"""Pictures whose gradients are kept at once: bounds memory, and more make no CPU faster."""
+"""Pictures whose gradients are kept at once on a CPU: bounds memory, and more make none faster."""
 
 
 _ONCE = RLock()
@@ -175,8 +175,8 @@ class ClosedLoopMeasure(BatchedMeasure):
 
     @property
     def at_once(self) -> int:
-        """How many points of each group make no more than MAX_PICTURES pictures."""
-        return MAX_PICTURES // (
+        """How many points of each group make no more pictures than are kept at once."""
+        return pictures_at_once(self.device, MAX_PICTURES) // (
             len(self.groups) * sum(self._pictures(each, self._approach(each)) for each in self.worlds)
         )
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.batched import BatchedMeasure
+from roadproof.attacks.batched import BatchedMeasure, pictures_at_once
 from roadproof.attacks.groups import STEERED, Group, Points, Values, divergence, require_directions
 from roadproof.compositing import CanvasView, Compositor, view_canvas
 from roadproof.compositing.variation import Looks, Variation
@@ -34,7 +34,7 @@ FIXED = 0
 """The seed of the looks in which patterns are compared, whatever step of a search they come from."""
 
 MAX_FRAMES = 256
-"""Frames the controller sees at once: bounds memory, and more make no CPU faster."""
+"""Frames a controller on a CPU sees at once: bounds memory, and more make none faster."""
 
 
 class Surrogate(BatchedMeasure):
@@ -179,9 +179,10 @@ class Surrogate(BatchedMeasure):
 
     @property
     def at_once(self) -> int:
-        """How many points of each group make no more than MAX_FRAMES frames."""
+        """How many points of each group make no more frames than are shown at once."""
         looks = 1 if self._looks is None else len(self._looks)
-        return MAX_FRAMES // (looks * sum(len(view.frames) for view in self.views))
+        most = pictures_at_once(self.device, MAX_FRAMES)
+        return most // (looks * sum(len(view.frames) for view in self.views))
 
     def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, None]:
         """The mean steering shift per frame; None for the deviation, which the surrogate does not know."""
