@@ -89,6 +89,13 @@ def test_the_published_way_takes_61_calls_and_finds_the_canvas_within_pixels(tow
     assert found.recordings.recordings[0].maps is None
 
 
+def test_two_processes_find_what_one_does(town, drives, two_paint, folder):
+    with Pool(TownSimulator, 2) as pool:
+        found = calibrate(town, drives, folder=folder, pool=pool)
+    assert found.recordings.digest() == two_paint.recordings.digest()
+    assert found.report.drives == two_paint.report.drives
+
+
 def test_poses_alone_are_exact_in_the_town_and_take_no_calls_of_their_own(town, drives, two_paint, folder):
     driven = len(list(folder.iterdir()))
     found = calibrate(town, drives, CalibrationMethod.POSE, folder=folder)

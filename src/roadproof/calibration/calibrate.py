@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,12 @@ from roadproof.calibration.published import (
 )
 from roadproof.calibration.replays import Replays, Wanted, replay_in, told_apart
 from roadproof.calibration.report import CalibrationReport, DriveReport, Geometry, Spread, stated_errors_px
-from roadproof.calibration.two_paint import TARGETS, look_at_paints
+from roadproof.calibration.two_paint import TARGETS, Fitted, fit_paints, look_at_paints
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import homography_from_pose
+from roadproof.homographies import Homographies
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import table
 from roadproof.io.identity import digest, require_same
@@ -187,9 +189,12 @@ def calibrate(
         )
     on_call(0)
     began = time.perf_counter()
+    fitted: dict[str, Fitted] = {}
     if pool is not None and pool.processes > 1 and folder is not None:
         replay_in(pool, drives, folder, _wanted(drives, method), on_call)
         replays = Replays(simulator, drives, folder)
+        if method is CalibrationMethod.TWO_PAINT:
+            fitted = dict(pool.each(partial(_fit_beside, drives, folder), [drive.name for drive in drives.drives]))
     else:
         replays = Replays(simulator, drives, folder, on_call)
     if method is CalibrationMethod.PUBLISHED:
@@ -197,7 +202,13 @@ def calibrate(
         maps: Sequence[PixelMaps | None] = [None] * len(geometry)
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
-        looks = [_look(replays, drives, drive, refine=method is CalibrationMethod.TWO_PAINT) for drive in drives.drives]
+        camera, view, refine = settings.camera, settings.view, method is CalibrationMethod.TWO_PAINT
+        looks = [
+            look_at_paints(
+                replays, drive, _poses(drives, drive), camera, view, refine=refine, fitted=fitted.get(drive.name)
+            )
+            for drive in drives.drives
+        ]
         geometry, maps = [found for found, _ in looks], [shading for _, shading in looks]
         colour, residual = ColourTransform(AffineResponse.identity()), None
     for drive, found in zip(drives.drives, geometry, strict=True):
@@ -225,10 +236,17 @@ def calibrate(
     return Calibrated(recordings, report, _parts(drives, method))
 
 
-def _look(replays: Replays, drives: Drives, drive: Drive, *, refine: bool) -> tuple[Geometry, PixelMaps]:
-    camera, view, canvas = drives.settings.camera, drives.settings.view, drives.settings.scenario.canvas
-    poses = np.stack([homography_from_pose(camera, state, canvas) for state in drive.states])
-    return look_at_paints(replays, drive, poses, camera, view, refine=refine)
+def _poses(drives: Drives, drive: Drive) -> Homographies:
+    """The homographies of a drive's poses, canvas px to camera px."""
+    camera, canvas = drives.settings.camera, drives.settings.scenario.canvas
+    return np.stack([homography_from_pose(camera, state, canvas) for state in drive.states])
+
+
+def _fit_beside(drives: Drives, folder: Path, simulator: Simulator, name: str) -> Fitted:
+    """What replays in a folder say of one drive's homographies."""
+    drive, settings = next(each for each in drives.drives if each.name == name), drives.settings
+    replays = Replays(simulator, drives, folder)
+    return fit_paints(replays, drive, _poses(drives, drive), settings.camera, settings.view)
 
 
 def _check(drive: Drive, geometry: Geometry) -> None:
