@@ -6,7 +6,7 @@
 `roadproof demo` with its defaults in a fresh process and a new folder, so many times for each controller, in turn. The
 first time is cold where this process may tell Linux to forget the files that it has read, and as it was otherwise;
 the others find everything in memory. Beside the clock stands what each stage took, by the run's own account; the rest
-is in no stage: start of Python and torch, the predicted path, the page. Nothing else may run meanwhile.
+is in no stage: start of Python, torch and the town, and the page. Nothing else may run meanwhile.
 """
 
 from __future__ import annotations

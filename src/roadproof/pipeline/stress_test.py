@@ -46,7 +46,7 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
-STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "evaluate", "film")
+STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "predict", "evaluate", "film")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -225,7 +225,8 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
         with ledger.stage("cheapest"):
             less = run.cheapest(recordings, found, cheapest_m, drives[0])
             ledger.calls("cheapest", 0 if less is None else less[1].simulator_calls)
-    prediction = run.predict(recordings, pattern, selection, rounds)
+    with ledger.stage("predict"):
+        prediction = run.predict(recordings, pattern, selection, rounds)
     with ledger.stage("evaluate"):
         evaluation = run.evaluate(pattern)
         ledger.calls("evaluate", evaluation.simulator_calls)
