@@ -121,6 +121,13 @@ def test_a_replayed_search_is_the_search_step_by_step_bit_for_bit(replayed_on_th
     assert expected.steps == ""
 
 
+def test_a_few_steps_are_not_worth_recording(replayed_on_the_cpu, monkeypatch):
+    monkeypatch.setattr(captured, "LEAST", 4)
+    found = gradopt(Dense(recording_set(), steering(), GROUPS), SearchSpace(figures=2), LADDER, seed=3)
+    told = "4 of 10 steps were replayed as a CUDA graph; the others ran one operation at a time: too few in a row"
+    assert found.steps.startswith(told)
+
+
 def test_a_replayed_search_finds_what_the_sparse_way_finds(replayed_on_the_cpu, monkeypatch):
     space = SearchSpace(figures=2)
     run = lambda: gradopt(Surrogate(recording_set(), steering(), GROUPS), space, LADDER, seed=3)  # noqa: E731

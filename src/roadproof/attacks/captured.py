@@ -26,6 +26,9 @@ from roadproof.search_space import SearchSpace
 LOOK_S = 0.5
 """Steps are replayed for about so long before their outcome is looked at, told and kept."""
 
+LEAST = 6
+"""So many steps are worth recording: that takes as long as three of them, and some time more."""
+
 _HELD = ("unit", "best_unit", "best", "exp_avg", "exp_avg_sq")
 
 
@@ -124,6 +127,8 @@ def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Step
     same = measure.replayable() if isinstance(measure, BatchedMeasure) else None
     if same is None:
         return "their operations differ from step to step"
+    if steps["iterations"] - int(steps["state"]["done"]) < LEAST:
+        return "too few in a row to be worth recording"
     try:
         return Replay(measure, same, space, **steps)
     except (RuntimeError, RoadproofError) as error:
