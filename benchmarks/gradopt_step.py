@@ -39,7 +39,7 @@ from torch import Tensor
 
 import roadproof
 from roadproof.attacks import PathDeviation, Surrogate
-from roadproof.attacks.captured import Replay, cuda_graph, replay_of
+from roadproof.attacks.captured import LEAST, Replay, cuda_graph, replay_of
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.published import PublishedMeasure
 from roadproof.attacks.step import state_at
@@ -175,18 +175,24 @@ def measure(
         runs["published"] = lambda: authors.values_and_gradients(space, unit)
         if find_spec("kornia"):
             runs["kornia"] = kornia_step(recordings, controller, space, unit)
-    reason = None
+    reason, peak = None, None
     if device != "cpu":
+        torch.cuda.reset_peak_memory_stats()
         replay = replay_of(
-            surrogate, space, learning_rate=0.1, momentum=0.9, iterations=repeats + 2, state=state_at(unit)
+            surrogate,
+            space,
+            learning_rate=0.1,
+            momentum=0.9,
+            iterations=max(LEAST, repeats + 2),
+            state=state_at(unit),
         )
+        peak = torch.cuda.max_memory_allocated() / 2**20
         bare()
         runs["bare_graph"] = cuda_graph(bare, lambda: None, surrogate.device)
         if isinstance(replay, Replay):
             runs["step_graph"] = replay.again
         else:
             reason = replay
-        torch.cuda.reset_peak_memory_stats()
     times: dict[str, list[float]] = {key: [] for key in runs}
     cpu_times: dict[str, list[float]] = {key: [] for key in runs}
     for repeat in range(repeats + 2):
@@ -198,7 +204,6 @@ def measure(
                 times[key].append(elapsed)
                 cpu_times[key].append(processor)
     median = {key: statistics.median(values) for key, values in times.items()}
-    peak = torch.cuda.max_memory_allocated() / 2**20 if device != "cpu" else _peak_mb()
     return {
         "controller": name,
         "figures": figures,
@@ -221,7 +226,7 @@ def measure(
         "kornia_step_ms": round(median["kornia"], 1) if "kornia" in median else None,
         "kornia_over_ours": round(median["kornia"] / median["step"], 2) if "kornia" in median else None,
         "gradient_error": float(error),
-        "peak_mb": round(peak),
+        "peak_mb": round(_peak_mb() if peak is None else peak),
     }
 
 
@@ -253,7 +258,8 @@ def measure_path(recordings: RecordingSet, name: str, device: str, repeats: int,
     }
     reason = None
     if device != "cpu":
-        replay = replay_of(world, space, learning_rate=0.1, momentum=0.9, iterations=repeats + 1, state=state_at(unit))
+        count = max(LEAST, repeats + 1)
+        replay = replay_of(world, space, learning_rate=0.1, momentum=0.9, iterations=count, state=state_at(unit))
         if isinstance(replay, Replay):
             runs["step_graph"] = replay.again
         else:

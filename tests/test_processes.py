@@ -98,6 +98,24 @@ def test_no_process_computes_with_more_threads_than_this_one(monkeypatch):
     assert dict(spread(threads_of, [1, 2], nullcontext, processes=2)) == {1: 1, 2: 1}
 
 
+def digits(inside, _):
+    del inside
+    return torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision()
+
+
+@pytest.mark.parametrize("tf32", [True, False])
+def test_a_gpu_multiplies_beside_this_process_as_in_it(tf32):
+    before = torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision()
+    try:
+        torch.backends.cudnn.allow_tf32 = tf32
+        torch.set_float32_matmul_precision("high" if tf32 else "highest")
+        here = digits(None, 0)
+        assert dict(spread(digits, [1, 2], nullcontext, processes=2)) == {1: here, 2: here}
+    finally:
+        torch.backends.cudnn.allow_tf32 = before[0]
+        torch.set_float32_matmul_precision(before[1])
+
+
 def place_of(layer, inside, _):
     del inside
     return layer.weight.device.type, layer.place.type, layer.weight.sum().item()

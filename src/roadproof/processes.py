@@ -145,7 +145,7 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
 
     Fresh, since graphics and torch's threads do not survive a fork. One that outlived its parent would go on writing to
     the folder in which the next run goes on. As in `load_controller` the current directory is importable, for
-    controllers that travel; foreign calls end as in this process.
+    controllers that travel; foreign calls end, and a GPU multiplies, as in this process.
 
     Args:
         count: number of processes, at least 1.
@@ -153,9 +153,8 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
         arguments: arguments of `begin`.
     """
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(
-        count, mp_context=context, initializer=_begin, initargs=(foreign.limit_s(), begin, arguments)
-    )
+    own = foreign.limit_s(), (torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision())
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(*own, begin, arguments))
 
 
 def require_opened(processes: int, opens: object | None) -> None:
@@ -191,11 +190,12 @@ class _Processor(pickle.Pickler):
     def reducer_override(self, thing: Any) -> Any:  # noqa: ANN401  # as of `pickle`
         if isinstance(thing, torch.device) and thing.type == "cuda":
             return torch.device, ("cpu",)
-        if isinstance(thing, torch.nn.Parameter) and thing.is_cuda:
-            return cast("Any", torch.nn.Parameter(thing.detach().cpu(), thing.requires_grad)).__reduce_ex__(2)
-        if isinstance(thing, torch.Tensor) and thing.is_cuda:
-            return cast("Any", thing.detach().cpu().__reduce_ex__(2))
-        return NotImplemented
+        if not isinstance(thing, torch.Tensor) or not thing.is_cuda:
+            return NotImplemented
+        here = thing.detach().cpu().requires_grad_(thing.requires_grad)
+        parameter = isinstance(thing, torch.nn.Parameter)
+        here = torch.nn.Parameter(here, thing.requires_grad) if parameter else here
+        return cast("Any", here).__reduce_ex__(2)
 
 
 def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:
@@ -232,10 +232,14 @@ def _function(travelled: bytes) -> Callable[[object, object], object]:
     return foreign.call("a controller that travelled to another process", pickle.loads, travelled)
 
 
-def _begin(limit_s: float, begin: Callable[..., object] | None, arguments: tuple[object, ...]) -> None:
+def _begin(
+    limit_s: float, digits: tuple[bool, str], begin: Callable[..., object] | None, arguments: tuple[object, ...]
+) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_freed_memory()
     foreign.end_calls_after(limit_s)
+    torch.backends.cudnn.allow_tf32 = digits[0]
+    torch.set_float32_matmul_precision(digits[1])
     # What a user's code prints is none of the results, for which standard output is.
     sys.stdout = sys.stderr
     # Last, so that nothing in the folder hides an installed module.

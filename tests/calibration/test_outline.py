@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from references import approach
-from roadproof.calibration.outline import GREY, SQUARES, fit_outline, moved, outline_errors_px
+from roadproof.calibration import outline
+from roadproof.calibration.outline import GREY, SQUARES, fit_outline, moved, outline_errors_px, predicted_contrast
 from roadproof.calibration.report import Spread, stated_errors_px
-from roadproof.geometry import CIL_CAMERA, CIL_INPUT
+from roadproof.datatypes import VehicleState
+from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
+from roadproof.lens import Lens
 
 OFF = np.array([0.004, 0.008, 0.002, 0.08, -0.02, 0.1])
 """A camera that looks 0.2° lower, 0.5° aside, is turned by 0.1°, and 8, 2 and 10 cm away."""
@@ -110,3 +113,22 @@ def test_errors_count_only_points_in_view(scene):
     assert 0 < len(errors) <= len(truth) * 81
     assert errors.mean() == pytest.approx(CIL_CAMERA.focal_px * 0.01, rel=0.5)
     assert Spread.of(np.empty(0)) is None
+
+
+FISHEYE = dataclasses.replace(CIL_CAMERA, lens=Lens(model="fisheye", coefficients=(0.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("camera", [CIL_CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
+def test_no_pixel_that_sees_the_canvas_is_left_out(camera, monkeypatch):
+    canvas = CanvasPlacement(x_m=0.0, y_m=0.0, width_m=7.6, length_m=9.5)
+    places = [
+        (x, y, yaw) for x in (-25.0, -14.0, -7.0, -2.0, 3.0) for y in (-6.0, 0.0, 1.5) for yaw in (-0.3, 0.0, 0.1)
+    ]
+    states = [VehicleState(x_m=x, y_m=y, z_m=0.0, yaw_rad=yaw, speed_mps=5.0) for x, y, yaw in places]
+    homographies = np.stack([homography_from_pose(camera, state, canvas) for state in states])
+    found = predicted_contrast(homographies, CIL_INPUT, camera)
+    assert found[0].max() > 0.99
+    everywhere = lambda h, _, through: np.ones((len(h), through.shape[1]), bool)  # noqa: E731
+    monkeypatch.setattr(outline, "_may_see_canvas", everywhere)
+    for few, full in zip(found, predicted_contrast(homographies, CIL_INPUT, camera), strict=True):
+        assert np.array_equal(few, full)

@@ -172,7 +172,6 @@ def test_frames_that_do_not_show_the_canvas_are_refused():
 
 
 @pytest.mark.gpu
-@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="this torch sees no CUDA device")
 def test_cuda_gives_the_cpus_frames_and_gradients():
     space, unit = random_patterns(dtype=torch.float32)

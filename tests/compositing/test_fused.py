@@ -88,11 +88,32 @@ def test_a_single_pattern_needs_no_batch_and_comes_out_the_same_twice():
     assert torch.equal(gradient, same)
 
 
+def test_nan_is_painted_as_nan():
+    space, pixels = SearchSpace(figures=2), some_pixels(20)
+    unit = space.random((1,), torch.Generator().manual_seed(3)).to(DEVICE)
+    for number in (0, 6):
+        unit[0, 1, number] = torch.nan
+        assert fused.painted(space.pattern(unit), pixels).isnan().all()
+
+
+GPU = torch.device("cuda", 0)
+
+
 def test_without_triton_painting_goes_on_as_before(monkeypatch):
     def refuses(device):
         raise RuntimeError("Failed to find C compiler")
 
     monkeypatch.setattr(fused, "try_out", refuses)
     view.compiles_kernels.cache_clear()
-    assert not view.fuses(torch.zeros(1, device=DEVICE))
+    assert not view.compiles_kernels(GPU)
+    view.compiles_kernels.cache_clear()
+
+
+@pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
+def test_whoever_asks_first_may_do_so_without_gradients(monkeypatch, without):
+    tried = fused.try_out
+    monkeypatch.setattr(fused, "try_out", lambda _: tried(torch.device(DEVICE)))
+    view.compiles_kernels.cache_clear()
+    with without():
+        assert view.compiles_kernels(GPU)
     view.compiles_kernels.cache_clear()

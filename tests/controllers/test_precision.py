@@ -17,11 +17,12 @@ def test_a_gpu_has_it() -> None:
 
 
 def test_multiplications_round_to_tf32_only_where_that_is_asked_for() -> None:
-    before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
+    before = torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision()
     try:
-        for dtype, expected in (("float32", False), ("tf32", True), ("bfloat16", False)):
+        for dtype, rounds in (("float32", False), ("tf32", True), ("bfloat16", False)):
             multiply_in(dtype)
-            assert torch.backends.cudnn.allow_tf32 is expected
-            assert torch.backends.cuda.matmul.allow_tf32 is expected
+            assert torch.backends.cudnn.allow_tf32 is rounds
+            assert torch.get_float32_matmul_precision() == ("high" if rounds else "highest")
     finally:
-        torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32 = before
+        torch.backends.cudnn.allow_tf32 = before[0]
+        torch.set_float32_matmul_precision(before[1])

@@ -18,7 +18,7 @@ MeasureT = TypeVar("MeasureT", bound="BatchedMeasure")
 
 
 PICTURE_MB = 16
-"""What a picture takes on a GPU while its gradient is wanted, in shipped controllers: 12 measured."""
+"""What a picture takes on a GPU while its gradient is wanted, in shipped controllers: at most 11 measured."""
 
 
 def pictures_at_once(device: torch.device, usual: int) -> int:

@@ -127,7 +127,8 @@ def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Step
     same = measure.replayable() if isinstance(measure, BatchedMeasure) else None
     if same is None:
         return "their operations differ from step to step"
-    if steps["iterations"] - int(steps["state"]["done"]) < LEAST:
+    # A rung that is resumed is recorded, or not, as it was.
+    if steps["iterations"] < LEAST:
         return "too few in a row to be worth recording"
     try:
         return Replay(measure, same, space, **steps)

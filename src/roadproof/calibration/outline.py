@@ -47,8 +47,8 @@ _REACH_PX = 3
 _GAIN_PX = 5
 _SEEN = 6 / 255
 _DELTA = 1e-5
-_FILTER_PX = 4
-"""Further than any footprint reaches."""
+_FILTER_PX = 16
+"""Further than a footprint reaches, which far beside the road is some pixels wide."""
 COMMON_DOUBT = (0.01, 0.01, 0.01, 0.1, 0.03, 0.1)
 """Standard deviations of (ω, τ) that is common to a drive, rad and m along the camera's axes (right, down, forward)."""
 OWN_DOUBT = (0.001, 0.0005, 0.0005, 0.002, 0.002, 0.002)
@@ -95,7 +95,9 @@ def predicted_contrast(
     through, bend = sight(view, camera)
     shape = (len(image_from_canvas), view.height_px, view.width_px)
     canvas_from_input = np.linalg.inv(input_from_canvas)
-    frame, pixel = np.nonzero(_may_see_canvas(input_from_canvas, canvas_from_input, through))
+    near = _may_see_canvas(input_from_canvas, canvas_from_input, through)
+    # Behind a lens lines are curves, which corners do not bound.
+    frame, pixel = np.nonzero(near if camera.lens is None else np.ones_like(near))
     variance = FOOTPRINT_VARIANCE[view.resampling]
     whole = np.zeros((2, *shape))
     whole.reshape(2, shape[0], -1)[:, frame, pixel] = _canvas_shares(
@@ -107,9 +109,9 @@ def predicted_contrast(
 def _may_see_canvas(
     input_from_canvas: Homographies, canvas_from_input: Homographies, through: Float[np.ndarray, "3 n"]
 ) -> Bool[np.ndarray, "f n"]:
-    """The pixels around the box of the canvas' corners, or all where a corner is not ahead; and those near the horizon.
+    """The pixels near the box around the canvas' corners, or all where a corner is behind the camera; none left out.
 
-    There a footprint is as long as the road.
+    And those near the horizon, where a footprint is as long as the road.
     """
     low, high = -0.5, CANVAS_SIZE_PX - 0.5
     seen = input_from_canvas @ np.array([[low, high, high, low], [low, low, high, high], [1.0, 1.0, 1.0, 1.0]])
@@ -118,7 +120,7 @@ def _may_see_canvas(
     least, most = at.min(2)[..., None] - _FILTER_PX, at.max(2)[..., None] + _FILTER_PX
     inside = ((through[:2] >= least) & (through[:2] <= most)).all(1)
     depth, slope = canvas_from_input[:, 2] @ through, np.hypot(*canvas_from_input[:, 2, :2].T)
-    return inside | behind.any(2) | (np.abs(depth) < 3 * _FILTER_PX * slope[:, None])
+    return inside | behind.any(2) | (np.abs(depth) < _FILTER_PX * slope[:, None])
 
 
 def moved(image_from_canvas: Homographies, moves: Float[np.ndarray, "f 6"], camera: CameraModel) -> Homographies:

@@ -168,7 +168,7 @@ Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]
 Processes: TypeAlias = Annotated[
     int,
     number(
-        "How many simulators drive at once; 0 for one a core.",
+        "How many simulators drive at once; 0 for one a core. Several compute on the CPU.",
         0,
         MAX_PROCESSES,
         meant=lambda count: count or os.cpu_count() or 1,

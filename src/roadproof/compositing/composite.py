@@ -131,7 +131,7 @@ def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
     only_rectangles = all(shape is Shape.RECTANGLE for shape in pattern.shapes)
     if only_rectangles and fuses(view.clean):
-        # Triton is there on GPUs alone.
+        # Triton may be missing.
         from roadproof.compositing.fused import painted as painted_at_once
 
         return painted_at_once(pattern, view)

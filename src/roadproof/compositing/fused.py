@@ -36,17 +36,27 @@ tl: Any = importlib.import_module("triton.language")
 BLOCK = 256
 """Pixels that one program paints."""
 
+OPTIONS = {"enable_fp_fusion": True}
+"""How kernels are compiled; some of Triton warn where it is left to them."""
+
 _LEAST = tl.constexpr(MIN_VARIANCE)
+# Numbers of a figure; then where its size and its colour begin.
+_FIGURE, _HALF, _COLOUR = tl.constexpr(12), tl.constexpr(7), tl.constexpr(9)
+# Numbers of a pixel; then where its clean colour, its gain and its bias begin.
+_PIXEL = 14
+_CLEAN, _GAIN, _BIAS = tl.constexpr(5), tl.constexpr(8), tl.constexpr(11)
 
 
 def try_out(device: torch.device) -> None:
-    """Paint a pixel and go back, which compiles all that is needed.
+    """Paint a pixel and go back, for which Triton needs all that it ever needs.
 
     Raises:
         Exception: whatever keeps Triton from it, such as a missing C compiler or an old GPU.
     """
-    figures, pixels = torch.ones(1, 1, 12, device=device, requires_grad=True), torch.ones(1, 14, 1, device=device)
-    cast("Tensor", _Painted.apply(figures, pixels)).sum().backward()
+    # Whoever asks first may do so without gradients.
+    with torch.inference_mode(mode=False), torch.enable_grad():
+        figures = torch.ones(1, 1, _FIGURE.value, device=device, requires_grad=True)
+        cast("Tensor", _Painted.apply(figures, torch.ones(1, _PIXEL, 1, device=device))).sum().backward()
 
 
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
@@ -55,7 +65,9 @@ def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     boxes, seen = pattern.boxes.reshape(-1, count, 5), view.response(pattern.colours).reshape(-1, count, 3)
     u, v, spread, _ = axis_rows(boxes).unbind(-2)
     figures = torch.cat([u[..., :3], v[..., 2:3], spread[..., 3:], boxes[..., 2:4] / 2, seen], -1)
-    colours = cast("Tensor", _Painted.apply(figures, _numbered(view)))
+    pixels = _numbered(view)
+    assert len(pixels) in (1, len(figures)), "pixels of one view, or of one for each pattern"
+    colours = cast("Tensor", _Painted.apply(figures, pixels))
     return colours.view(*batch, *colours.shape[1:])
 
 
@@ -71,7 +83,9 @@ class _Painted(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, figures: Tensor, pixels: Tensor) -> Tensor:  # noqa: ANN401
         colours = figures.new_empty(len(figures), pixels.shape[-1], 3)
-        _paint[_grid(figures, pixels)](figures, pixels, colours, *_sizes(figures, pixels))
+        # Triton launches where torch is, not where the numbers are.
+        with torch.cuda.device_of(figures):
+            _paint[_grid(figures, pixels)](figures, pixels, colours, *_sizes(figures, pixels), **OPTIONS)
         ctx.save_for_backward(figures, pixels)
         return colours
 
@@ -82,7 +96,8 @@ class _Painted(torch.autograd.Function):
         through = figures.new_empty(*figures.shape[:2], pixels.shape[-1])
         shares = figures.new_empty(batch, blocks, *figures.shape[1:])
         grad = grad_outputs[0].contiguous()
-        _unpaint[blocks, batch](figures, pixels, grad, through, shares, *_sizes(figures, pixels))
+        with torch.cuda.device_of(figures):
+            _unpaint[blocks, batch](figures, pixels, grad, through, shares, *_sizes(figures, pixels), **OPTIONS)
         return shares.sum(1), None
 
 
@@ -93,13 +108,21 @@ def _grid(figures: Tensor, pixels: Tensor) -> tuple[int, int]:
 def _sizes(figures: Tensor, pixels: Tensor) -> tuple[int, int, int, int]:
     """Pixels, numbers from one pattern's pixels to the next one's, figures of a pattern, pixels of a program."""
     many = pixels.shape[-1]
-    return many, 14 * many if len(pixels) > 1 else 0, figures.shape[1], BLOCK
+    return many, _PIXEL * many if len(pixels) > 1 else 0, figures.shape[1], BLOCK
+
+
+@triton.jit
+@no_type_check
+def _clipped(values, least):
+    """Values between the least and 1; NaN stays."""
+    values = tl.maximum(values, least, propagate_nan=tl.PropagateNan.ALL)
+    return tl.minimum(values, 1.0, propagate_nan=tl.PropagateNan.ALL)
 
 
 @triton.jit
 @no_type_check
 def _tent(t):
-    t = tl.minimum(tl.maximum(t, -1.0), 1.0)
+    t = _clipped(t, -1.0)
     return t * (1.0 - 0.5 * tl.abs(t))
 
 
@@ -115,6 +138,14 @@ def _numbers3(place, step, inside):
     """Three numbers of each pixel, rows of pixels or neighbours."""
     red, green = tl.load(place, mask=inside, other=0.0), tl.load(place + step, mask=inside, other=0.0)
     return red, green, tl.load(place + 2 * step, mask=inside, other=0.0)
+
+
+@triton.jit
+@no_type_check
+def _footprint(here, many, inside):
+    """x, y, and xx, 2·xy, yy of each pixel."""
+    xx, xy2, yy = _numbers3(here + 2 * many, many, inside)
+    return tl.load(here, mask=inside, other=0.0), tl.load(here + many, mask=inside, other=0.0), xx, xy2, yy
 
 
 @triton.jit
@@ -150,25 +181,35 @@ def _painted_above(
 
     With `keep`, what of each figure is not under others is written down for the way back.
     """
-    x, y, _ = _numbers3(footprint, pixels, inside)
-    xx, xy2, yy = _numbers3(footprint + 2 * pixels, pixels, inside)
+    x, y, xx, xy2, yy = _footprint(footprint, pixels, inside)
     through = tl.full((block,), 1.0, tl.float32)
     red, green, blue = through * 0.0, through * 0.0, through * 0.0
     for j in range(count):
         k = count - 1 - j
-        figure = figures + k * 12
+        figure = figures + k * _FIGURE
         u, v, variance_u, variance_v = _in_figure(figure, x, y, xx, xy2, yy)
-        _, _, _, share_u = _axis(u, tl.load(figure + 7), variance_u)
-        _, _, _, share_v = _axis(v, tl.load(figure + 8), variance_v)
+        _, _, _, share_u = _axis(u, tl.load(figure + _HALF), variance_u)
+        _, _, _, share_v = _axis(v, tl.load(figure + _HALF + 1), variance_v)
         mask = share_u * share_v
         if keep:
             tl.store(through_at + k * pixels, through, mask=inside)
         shown = mask * through
-        red += shown * tl.load(figure + 9)
-        green += shown * tl.load(figure + 10)
-        blue += shown * tl.load(figure + 11)
+        red += shown * tl.load(figure + _COLOUR)
+        green += shown * tl.load(figure + _COLOUR + 1)
+        blue += shown * tl.load(figure + _COLOUR + 2)
         through *= 1.0 - mask
     return red, green, blue, 1.0 - through
+
+
+@triton.jit
+@no_type_check
+def _composed(here, red, green, blue, share, many, inside):
+    """Eq. composite, not clipped yet, from colours and share of the paint that is seen."""
+    clean_r, clean_g, clean_b = _numbers3(here + _CLEAN * many, many, inside)
+    gain_r, gain_g, gain_b = _numbers3(here + _GAIN * many, many, inside)
+    bias_r, bias_g, bias_b = _numbers3(here + _BIAS * many, many, inside)
+    red, green = clean_r + gain_r * red + bias_r * share, clean_g + gain_g * green + bias_g * share
+    return red, green, clean_b + gain_b * blue + bias_b * share
 
 
 @triton.jit
@@ -179,16 +220,14 @@ def _paint(figures, pixels, colours, many, apart, count: tl.constexpr, block: tl
     p = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     inside = p < many
     here = pixels + b * apart + p
-    red, green, blue, share = _painted_above(figures + b * count * 12, here, here, many, inside, False, count, block)
-    clean_r, clean_g, clean_b = _numbers3(here + 5 * many, many, inside)
-    gain_r, gain_g, gain_b = _numbers3(here + 8 * many, many, inside)
-    bias_r, bias_g, bias_b = _numbers3(here + 11 * many, many, inside)
-    red, green = clean_r + gain_r * red + bias_r * share, clean_g + gain_g * green + bias_g * share
-    blue = clean_b + gain_b * blue + bias_b * share
+    red, green, blue, share = _painted_above(
+        figures + b * count * _FIGURE, here, here, many, inside, False, count, block
+    )
+    red, green, blue = _composed(here, red, green, blue, share, many, inside)
     there = colours + (b * many + p) * 3
-    tl.store(there, tl.minimum(tl.maximum(red, 0.0), 1.0), mask=inside)
-    tl.store(there + 1, tl.minimum(tl.maximum(green, 0.0), 1.0), mask=inside)
-    tl.store(there + 2, tl.minimum(tl.maximum(blue, 0.0), 1.0), mask=inside)
+    tl.store(there, _clipped(red, 0.0), mask=inside)
+    tl.store(there + 1, _clipped(green, 0.0), mask=inside)
+    tl.store(there + 2, _clipped(blue, 0.0), mask=inside)
 
 
 @triton.jit
@@ -198,37 +237,38 @@ def _unpaint(figures, pixels, grad, through, shares, many, apart, count: tl.cons
     b, blocks = tl.program_id(1).to(tl.int64), tl.num_programs(0)
     p = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     inside = p < many
-    here, figures = pixels + b * apart + p, figures + b * count * 12
+    here, figures = pixels + b * apart + p, figures + b * count * _FIGURE
     through += b * count * many + p
     red, green, blue, share = _painted_above(figures, here, through, many, inside, True, count, block)
-    gain_r, gain_g, gain_b = _numbers3(here + 8 * many, many, inside)
-    bias_r, bias_g, bias_b = _numbers3(here + 11 * many, many, inside)
-    clean_r, clean_g, clean_b = _numbers3(here + 5 * many, many, inside)
+    red, green, blue = _composed(here, red, green, blue, share, many, inside)
+    gain_r, gain_g, gain_b = _numbers3(here + _GAIN * many, many, inside)
+    bias_r, bias_g, bias_b = _numbers3(here + _BIAS * many, many, inside)
     grad_r, grad_g, grad_b = _numbers3(grad + (b * many + p) * 3, 1, inside)
     # What was clipped has no gradient.
-    red, green = clean_r + gain_r * red + bias_r * share, clean_g + gain_g * green + bias_g * share
-    blue = clean_b + gain_b * blue + bias_b * share
     grad_r = tl.where((red >= 0.0) & (red <= 1.0), grad_r, 0.0)
     grad_g = tl.where((green >= 0.0) & (green <= 1.0), grad_g, 0.0)
     grad_b = tl.where((blue >= 0.0) & (blue <= 1.0), grad_b, 0.0)
     on_share = grad_r * bias_r + grad_g * bias_g + grad_b * bias_b
     grad_r, grad_g, grad_b = grad_r * gain_r, grad_g * gain_g, grad_b * gain_b
-    x, y, _ = _numbers3(here, many, inside)
-    xx, xy2, yy = _numbers3(here + 2 * many, many, inside)
+    x, y, xx, xy2, yy = _footprint(here, many, inside)
     below = on_share * 0.0
     for k in range(count):
-        figure = figures + k * 12
+        figure = figures + k * _FIGURE
         u, v, variance_u, variance_v = _in_figure(figure, x, y, xx, xy2, yy)
-        low_u, high_u, sharp_u, share_u = _axis(u, tl.load(figure + 7), variance_u)
-        low_v, high_v, sharp_v, share_v = _axis(v, tl.load(figure + 8), variance_v)
+        low_u, high_u, sharp_u, share_u = _axis(u, tl.load(figure + _HALF), variance_u)
+        low_v, high_v, sharp_v, share_v = _axis(v, tl.load(figure + _HALF + 1), variance_v)
         mask, above = share_u * share_v, tl.load(through + k * many, mask=inside, other=0.0)
-        paint = grad_r * tl.load(figure + 9) + grad_g * tl.load(figure + 10) + grad_b * tl.load(figure + 11)
+        paint = (
+            grad_r * tl.load(figure + _COLOUR)
+            + grad_g * tl.load(figure + _COLOUR + 1)
+            + grad_b * tl.load(figure + _COLOUR + 2)
+        )
         seen = paint + on_share
         on_mask = above * (seen - below)
         below = seen * mask + (1.0 - mask) * below
         on_u, on_half_u, on_variance_u = _back(on_mask * share_v, low_u, high_u, sharp_u, variance_u)
         on_v, on_half_v, on_variance_v = _back(on_mask * share_u, low_v, high_v, sharp_v, variance_v)
-        at = shares + ((b * blocks + tl.program_id(0)) * count + k) * 12
+        at = shares + ((b * blocks + tl.program_id(0)) * count + k) * _FIGURE
         tl.store(at, tl.sum(on_u * x + on_v * y, 0))
         tl.store(at + 1, tl.sum(on_u * y - on_v * x, 0))
         tl.store(at + 2, tl.sum(on_u, 0))

@@ -115,7 +115,7 @@ class OwnViews(CanvasPixels):
 
 
 def fuses(values: Tensor) -> bool:
-    """Whether rectangles are painted in one pass over the pixels where these numbers are (`fused`), without runs."""
+    """Whether `fused` paints rectangles on the device of these numbers, and in their precision; it needs no runs."""
     return values.dtype == torch.float32 and compiles_kernels(values.device)
 
 

@@ -24,4 +24,5 @@ def multiply_in(dtype: str) -> None:
     Torch's own choice is TF32 in convolutions alone. Of a gradient of PilotNet it costs about 0.1 %, of CIL 1 to 4 %
     (`benchmarks/gradopt_step.py`).
     """
-    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = dtype == "tf32"
+    torch.backends.cudnn.allow_tf32 = dtype == "tf32"
+    torch.set_float32_matmul_precision("high" if dtype == "tf32" else "highest")

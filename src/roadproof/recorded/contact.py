@@ -1,8 +1,8 @@
 """Holding cars at obstacles on a GPU: what `obstacles` says, all pushes of a step and their derivatives in one kernel.
 
-Operation by operation a step of a few cars takes several hundred kernels there and back, half of a drive's time on a
-GPU. Here each car is one program. It carries the derivatives with it: every number has a value and a row of eight, six
-of which are used, its derivatives with respect to
+Operation by operation a step of a few cars takes several hundred kernels there and back. Here each car is one program.
+It carries the derivatives with it: every number has a value and a row of eight, six of which are used, its derivatives
+with respect to
 
     x, y, yaw, speed of the car after the step as if there were no obstacles; x, y before the step
 """
@@ -19,6 +19,8 @@ from typing import Any, cast, no_type_check
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from roadproof.compositing.fused import OPTIONS
 
 triton: Any = importlib.import_module("triton")
 tl: Any = importlib.import_module("triton.language")
@@ -43,9 +45,10 @@ class _Held(torch.autograd.Function):
     def forward(ctx: Any, states: Tensor, boxes: Tensor, ahead: Tensor, rules: dict[str, float]) -> Tensor:  # noqa: ANN401
         after, slopes = states.new_empty(len(states), 4), states.new_empty(len(states), 4, 8)
         lanes = triton.next_power_of_2(len(boxes))
-        _hold[(len(states),)](
-            states.contiguous(), boxes, ahead, after, slopes, len(boxes), len(ahead), lanes, **rules, num_warps=1
-        )
+        given = (states.contiguous(), boxes, ahead, after, slopes, len(boxes), len(ahead), lanes)
+        # Triton launches where torch is, not where the numbers are.
+        with torch.cuda.device_of(states):
+            _hold[(len(states),)](*given, **rules, **OPTIONS, num_warps=1)
         ctx.save_for_backward(slopes)
         return after
 
@@ -57,7 +60,7 @@ class _Held(torch.autograd.Function):
 
 @triton.jit
 @no_type_check
-def _row(place: tl.constexpr):
+def _unit(place: tl.constexpr):
     """The derivatives of an input: 1 in its own place."""
     return tl.where(tl.arange(0, 8) == place, 1.0, 0.0).to(tl.float64)
 
@@ -118,7 +121,7 @@ def _hold(
     r = tl.program_id(0)
     state = states + r * 6
     x, y, yaw, speed = tl.load(state), tl.load(state + 1), tl.load(state + 2), tl.load(state + 3)
-    on_x, on_y, on_yaw, on_speed = _row(0), _row(1), _row(2), _row(3)
+    on_x, on_y, on_yaw, on_speed = _unit(0), _unit(1), _unit(2), _unit(3)
     pushed = x * 0.0
     for _ in range(pushes):
         c, s = tl.cos(yaw), tl.sin(yaw)
@@ -163,7 +166,7 @@ def _hold(
         pushed += push
     went_x, went_y = x - tl.load(state + 4), y - tl.load(state + 5)
     went = tl.sqrt(went_x * went_x + went_y * went_y + 1e-18)
-    on_went = (went_x * (on_x - _row(4)) + went_y * (on_y - _row(5))) / went / dt_s
+    on_went = (went_x * (on_x - _unit(4)) + went_y * (on_y - _unit(5))) / went / dt_s
     slower = went / dt_s < speed
     left = tl.where(slower, went / dt_s, speed) - slowed
     on_left = tl.where(left > 0, tl.where(slower, on_went, on_speed), on_speed * 0.0)

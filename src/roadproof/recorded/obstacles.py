@@ -75,7 +75,7 @@ class Obstacles:
         if not len(self):
             return car
         if compiles_kernels(car.x_m.device):
-            # Triton is there on GPUs alone.
+            # Triton may be missing.
             from roadproof.recorded.contact import held
 
             states = torch.stack([car.x_m, car.y_m, car.yaw_rad, car.speed_mps, before.x_m, before.y_m], 1)
