@@ -109,9 +109,9 @@ def predicted_contrast(
 def _may_see_canvas(
     input_from_canvas: Homographies, canvas_from_input: Homographies, through: Float[np.ndarray, "3 n"]
 ) -> Bool[np.ndarray, "f n"]:
-    """The pixels near the box around the canvas' corners, or all where a corner is behind the camera; none left out.
+    """The pixels near the box around the canvas' corners, or all where a corner is behind the camera.
 
-    And those near the horizon, where a footprint is as long as the road.
+    Beside them those near the horizon, where a footprint is as long as the road.
     """
     low, high = -0.5, CANVAS_SIZE_PX - 0.5
     seen = input_from_canvas @ np.array([[low, high, high, low], [low, low, high, high], [1.0, 1.0, 1.0, 1.0]])

@@ -59,8 +59,8 @@ def look_at_paints(
         prior: homographies from the drive's poses, canvas px to camera px, (F, 3, 3).
         camera: camera on the car.
         view: crop and resize that make the controller's input from the camera picture.
-        refine: whether the homographies are corrected by what the frames show.
-        fitted: what `fit_paints` gave, where that is done; None does it now.
+        refine: whether the homographies are corrected by what the frames show, where `fitted` is None.
+        fitted: what `fit_paints` gave; None where that is not done yet.
 
     Raises:
         CalibrationError: the two paints look alike or saturate, or a replay goes astray.

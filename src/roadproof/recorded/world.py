@@ -33,7 +33,7 @@ PAST_M = 1.0
 """So far beyond the last recorded frame a picture can still be made."""
 
 AT_ONCE = {"cpu": 32, "cuda": 512}
-"""Drives rolled side by side where there may be thousands, by the type of the device: more make none faster."""
+"""Drives rolled side by side where there may be thousands: more make no CPU faster, and a GPU holds more."""
 
 SEEN = 0.01
 """Where the canvas covers less of the picture than this share, paint hardly moves a car (measured)."""
