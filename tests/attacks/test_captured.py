@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from collections import Counter
 
 import pytest
 import torch
@@ -119,6 +120,12 @@ def test_a_replayed_search_is_the_search_step_by_step_bit_for_bit(replayed_on_th
     assert steps[-1][1] == float(expected.best.max())
     assert found.steps == "10 of 10 steps were replayed as a CUDA graph"
     assert expected.steps == ""
+
+
+def test_a_gpu_for_which_triton_cannot_compile_is_told_of():
+    told = captured.steps_in_words(Counter({"": 3}), kernels=False)
+    assert told.startswith("3 of 3 steps were replayed as a CUDA graph; painting took longer than it could")
+    assert captured.steps_in_words(Counter({None: 3}), kernels=False) == ""
 
 
 def test_a_few_steps_are_not_worth_recording(replayed_on_the_cpu, monkeypatch):

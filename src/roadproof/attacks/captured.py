@@ -136,13 +136,19 @@ def replay_of(measure: RecordedMeasure, space: SearchSpace, **steps: Unpack[Step
         return in_one_line(error)
 
 
-def steps_in_words(steps: Counter[str | None]) -> str:
-    """How steps were run, from their number by what `replay_of` said, "" where they were replayed; "" on a CPU."""
+def steps_in_words(steps: Counter[str | None], *, kernels: bool = True) -> str:
+    """How steps were run; "" on a CPU.
+
+    Args:
+        steps: their number by what `replay_of` said, "" where they were replayed.
+        kernels: whether the device has kernels of our own for painting.
+    """
     reasons = [reason for reason in steps if reason]
     if not reasons and not steps[""]:
         return ""
     told = f"{steps['']} of {sum(steps.values())} steps were replayed as a CUDA graph"
-    return f"{told}; the others ran one operation at a time: {'; '.join(reasons)}" if reasons else told
+    told = f"{told}; the others ran one operation at a time: {'; '.join(reasons)}" if reasons else told
+    return told if kernels else f"{told}; painting took longer than it could, since Triton cannot compile here"
 
 
 def cuda_graph(advance: Callable[[], None], restart: Callable[[], None], device: torch.device) -> Callable[[], object]:

@@ -31,6 +31,7 @@ from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
 from roadproof.attacks.surrogate import FIXED
+from roadproof.compositing.view import compiles_kernels
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
@@ -224,7 +225,9 @@ def gradopt(
         last.redraw(FIXED)
         best = last.values(space, state["best_unit"])
     gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
-    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps_in_words(run))
+    kernels = measure.device.type == "cpu" or compiles_kernels(measure.device)
+    steps = steps_in_words(run, kernels=kernels)
+    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps)
 
 
 def _starts(
