@@ -1,6 +1,7 @@
 """What does each limit on paint cost, in driven metres, and how little paint is enough?
 
-    python studies/plausible.py --json OUT --keep FOLDER [--scenarios 4] [--controllers pilotnet cil] [--limits NAME …]
+    python studies/plausible.py --json OUT --keep FOLDER [--scenarios straight-02 …] [--controllers pilotnet cil]
+        [--limits NAME …]
 
 For every controller and scenario one recording of five drives; then for every row of LIMITS a search of its own in the
 recorded world, whose first choice is driven from five starts at noon: the median of the paper's deviation, the share of
