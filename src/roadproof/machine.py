@@ -91,3 +91,18 @@ def _processor() -> str:
         if named := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
             return named[1]
     return platform.processor() or platform.machine()
+
+
+def digits() -> tuple[bool, str]:
+    """What torch keeps of float32 where a GPU multiplies: whether convolutions round to TF32; its word for matrices."""
+    import torch
+
+    return torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision()
+
+
+def keep_digits(tf32: bool, matrices: str) -> None:
+    """Set what `digits` tells, for the whole process."""
+    import torch
+
+    torch.backends.cudnn.allow_tf32 = tf32
+    torch.set_float32_matmul_precision(matrices)

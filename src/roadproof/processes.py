@@ -22,7 +22,7 @@ import torch
 
 from roadproof import foreign
 from roadproof.errors import ControllerError, RoadproofError, SimulatorError
-from roadproof.machine import keep_freed_memory
+from roadproof.machine import digits, keep_digits, keep_freed_memory
 
 DIED = "a driving process died; is there memory for all of them? try with fewer processes"
 """What is said of one that did not even raise an exception."""
@@ -153,8 +153,8 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
         arguments: arguments of `begin`.
     """
     context = multiprocessing.get_context("spawn")
-    own = foreign.limit_s(), (torch.backends.cudnn.allow_tf32, torch.get_float32_matmul_precision())
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(*own, begin, arguments))
+    given = (foreign.limit_s(), digits(), begin, arguments)
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=given)
 
 
 def require_opened(processes: int, opens: object | None) -> None:
@@ -233,13 +233,12 @@ def _function(travelled: bytes) -> Callable[[object, object], object]:
 
 
 def _begin(
-    limit_s: float, digits: tuple[bool, str], begin: Callable[..., object] | None, arguments: tuple[object, ...]
+    limit_s: float, kept: tuple[bool, str], begin: Callable[..., object] | None, arguments: tuple[object, ...]
 ) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_freed_memory()
     foreign.end_calls_after(limit_s)
-    torch.backends.cudnn.allow_tf32 = digits[0]
-    torch.set_float32_matmul_precision(digits[1])
+    keep_digits(*kept)
     # What a user's code prints is none of the results, for which standard output is.
     sys.stdout = sys.stderr
     # Last, so that nothing in the folder hides an installed module.

@@ -1,17 +1,10 @@
 """Painting in one pass: values and gradients of plain operations; by Triton's interpreter where there is no GPU."""
 
-import os
-
 import numpy as np
 import pytest
 import torch
 
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-if DEVICE == "cpu":
-    # Read when Triton is first imported.
-    os.environ["TRITON_INTERPRET"] = "1"
-pytest.importorskip("triton", reason="triton is not installed: pip install triton (Linux)")
-
+from kernels import DEVICE  # isort: skip  # before Triton is imported
 from roadproof.compositing import fused, view
 from roadproof.compositing.composite import blend
 from roadproof.compositing.view import CanvasPixels

@@ -1,17 +1,10 @@
 """Holding cars in one kernel: what plain operations give; by Triton's interpreter where there is no GPU."""
 
-import os
-
 import numpy as np
 import pytest
 import torch
 
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-if DEVICE == "cpu":
-    # Read when Triton is first imported.
-    os.environ["TRITON_INTERPRET"] = "1"
-pytest.importorskip("triton", reason="triton is not installed: pip install triton (Linux)")
-
+from kernels import DEVICE  # isort: skip  # before Triton is imported
 from roadproof.datatypes import Obstacle
 from roadproof.recorded import obstacles
 from roadproof.recorded.contact import held

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from roadproof.machine import keep_digits
+
 
 def multiplies_bfloat16(device: torch.device | str) -> bool:
     """Whether a device has arithmetic for bfloat16; on a processor without, it is about 16 times slower than float32.
@@ -24,5 +26,4 @@ def multiply_in(dtype: str) -> None:
     Torch's own choice is TF32 in convolutions alone. Of a gradient of PilotNet it costs about 0.1 %, of CIL 1 to 4 %
     (`benchmarks/gradopt_step.py`).
     """
-    torch.backends.cudnn.allow_tf32 = dtype == "tf32"
-    torch.set_float32_matmul_precision("high" if dtype == "tf32" else "highest")
+    keep_digits(dtype == "tf32", "high" if dtype == "tf32" else "highest")
