@@ -22,9 +22,9 @@ def process():
     return fitted.fit(points, wavy(points))
 
 
-def test_one_point_is_valued_as_the_library_predicts_it(process):
+def test_points_one_by_one_and_in_blocks_are_valued_as_the_library_predicts(process):
     improvement = ExpectedImprovement(process)
-    points = np.random.default_rng(1).uniform(size=(50, 3)) * RANGES
+    points = np.random.default_rng(1).uniform(size=(600, 3)) * RANGES
     each = np.array([-improvement.negative(point)[0] for point in points])
     assert np.allclose(each, improvement.at(points), rtol=1e-4, atol=1e-9)
     assert (each > 0).any()
