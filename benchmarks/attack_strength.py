@@ -1,8 +1,12 @@
-"""How strong a pattern GradOpt finds on a set of recordings, against random search, over seeds.
+"""How strong a pattern GradOpt finds on a set of recordings, over seeds and by the digits it climbs with.
 
     python benchmarks/attack_strength.py RECORDINGS --controller SPEC --json OUT [--figures 5] [--seeds 0,1,2]
+        [--objective steering|deviation] [--digits few,all]
 
-All figures are surrogate figures: mean steering shift a frame on all composited frames in float32, not driven.
+Few digits are a search's own choice: bfloat16 where the processor has arithmetic for it. What is found is always judged
+in float32. The steering shift is a surrogate figure: mean shift a frame on all composited frames, beside that of random
+patterns. The deviation is predicted: metres in the recorded world, of the pattern that an attack would name first.
+Nothing is driven.
 """
 
 import argparse
@@ -14,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from roadproof.attacks import GradOpt, SteeringShift, Surrogate
+from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
 from roadproof.attacks.gradopt import dropping, gradopt, random_search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.controllers import load_controller
@@ -24,11 +28,8 @@ from roadproof.recordings import load_recordings
 from roadproof.search_space import SearchSpace
 
 GROUPS = (RIGHT_GROUP, LEFT_GROUP)
-LADDERS = {
-    "halving": lambda restarts: GradOpt(restarts=restarts).ladder(SteeringShift()),
-    "published": lambda restarts: dropping(restarts, 250, 0.1, after=(0.4, 0.8), factor=0.1),
-}
-"""Starts that compete first, or the paper's steps from random ones."""
+OBJECTIVES = {"steering": (SteeringShift(), 4), "deviation": (PathDeviation(), 3)}
+"""What is made large, and how many starts of a side are searched to the end."""
 
 
 def timed(function: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
@@ -51,47 +52,54 @@ def main() -> None:
     parser.add_argument("--controller", required=True)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--figures", type=int, default=5)
-    parser.add_argument("--steps", choices=list(LADDERS), default="halving")
-    parser.add_argument("--restarts", type=int, default=4)
-    parser.add_argument("--dtype", default="float32", help="of the controller while searching")
+    parser.add_argument("--objective", choices=list(OBJECTIVES), default="steering")
+    parser.add_argument("--digits", default="few", help="few, all, or both after a comma")
+    parser.add_argument("--one-rung", action="store_true", help="the paper's 250 steps from random starts")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--random-patterns", type=int, default=500, help="of the random search, 0 for none")
     args = parser.parse_args()
     keep_freed_memory()  # as the command line does
-    recordings = load_recordings(args.recordings)
-    judge = Surrogate(recordings, load_controller(args.controller), GROUPS)
-    searched = Surrogate(recordings, load_controller(args.controller, dtype=args.dtype), GROUPS)
-    space, rungs = SearchSpace(figures=args.figures), LADDERS[args.steps](args.restarts)
-    names = [str(group) for group in GROUPS]
+    objective, restarts = OBJECTIVES[args.objective]
+    steering = args.objective == "steering"
+    recordings, space = load_recordings(args.recordings), SearchSpace(figures=args.figures)
+    judge = objective.measure(recordings, load_controller(args.controller), GROUPS, device="cpu")
+    rungs = GradOpt(restarts=restarts).ladder(objective)
+    if args.one_rung:
+        rungs = dropping(restarts, 250, 0.1, after=(0.4, 0.8), factor=0.1)
     runs = []
     for seed in (int(word) for word in args.seeds.split(",")):
-        search = lambda s=seed: gradopt(searched, space, rungs, seed=s)  # noqa: E731
-        found, cost = timed(search)
-        restarts = judge.values(space, found.best_unit)
-        run = {
-            "seed": seed,
-            "gradopt": dict(zip(names, restarts.amax(1).tolist(), strict=True)),
-            "gradopt_restarts": dict(zip(names, restarts.tolist(), strict=True)),
-            "gradopt_cost": cost,
-        }
-        if args.random_patterns:
+        for digits in args.digits.split(","):
+            search = lambda s=seed, d=digits: gradopt(judge, space, rungs, seed=s, all_digits=d == "all")  # noqa: E731
+            found, cost = timed(search)
+            run = {"seed": seed, "digits": digits, "cost": cost, "values": found.best.tolist()}
+            if steering:
+                run["best"] = max(map(max, run["values"]))
+            else:
+                kept = [k for k in range(len(GROUPS)) if k not in found.gave_way]
+                metres = judge.of_groups(kept).readings(space, found.best_unit)[1].flatten(0, 1)
+                first = metres.amin(1).argmax()
+                run |= {"best": float(metres[first].mean()), "least": float(metres[first].min())}
+            runs.append(run)
+            print(json.dumps(run), flush=True)
+        if args.random_patterns and steering:
             chance = lambda s=seed: random_search(judge, space, patterns=args.random_patterns, seed=s)  # noqa: E731
             (_, best), cost = timed(chance)
-            run |= {"random_search": dict(zip(names, best.tolist(), strict=True)), "random_search_cost": cost}
-        runs.append(run)
-        print(json.dumps(run), flush=True)
-    methods = ("gradopt", "random_search") if args.random_patterns else ("gradopt",)
+            runs.append({"seed": seed, "digits": "random search", "cost": cost, "best": float(best.max())})
+            print(json.dumps(runs[-1]), flush=True)
     result = {
         "benchmark": "attack_strength",
-        "kind": "surrogate: mean steering shift a frame on composited frames",
+        "kind": "surrogate: mean steering shift a frame on composited frames" if steering else "predicted: metres",
         "made_with": made_with(),
+        "recordings": args.recordings.parent.name,
+        "controller": args.controller,
         "figures": args.figures,
-        "dtype": args.dtype,
         "rungs": [asdict(rung) for rung in rungs],
-        "restarts": args.restarts,
-        "random_patterns": args.random_patterns,
+        "random_patterns": args.random_patterns if steering else 0,
         "runs": runs,
-        "spread": {m: {name: spread([run[m][name] for run in runs]) for name in names} for m in methods},
+        "spread": {
+            kind: spread([run["best"] for run in runs if run["digits"] == kind])
+            for kind in dict.fromkeys(run["digits"] for run in runs)
+        },
     }
     write_json(args.json, result)
 

@@ -1,6 +1,7 @@
 """Searching where the car goes: what is found moves it further than chance, and the result says how far."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from roadproof.attacks import (
 from roadproof.attacks.gradopt import BEHIND, MUTATION, Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.result import AttackResult
+from roadproof.controllers import pilotnet_controller
 from roadproof.errors import RecordingError, RoadproofError
 from roadproof.recorded import BiasedStart, RecordedWorld
 from roadproof.recorded.world import UNSURE
@@ -221,6 +223,54 @@ def test_a_side_far_behind_gives_its_places_to_the_other(road, tmp_path):
     assert gone_on.gave_way == found.gave_way
 
 
+NEVER = 3.0
+"""Metres that no car goes aside on average, since the value saturates there."""
+
+
+def test_where_nothing_is_found_the_first_rungs_are_climbed_once_more(road, tmp_path):
+    first = (Rung(3, 2, every=4, open_loop=True, screened=2), Rung(2, 2, every=4))
+    measure = GOAL.measure(road, RampFollower(), (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    seen: list[int] = []
+
+    def search(needs, **running):
+        running = {"on_step": lambda step, _: seen.append(step)} | running
+        return gradopt(measure, SPACE, (*first, Rung(2, 1, needs=needs)), seed=0, **running)
+
+    found = search(NEVER)
+    assert seen == [1, 2, 3, 4, 1, 2, 3, 4, 5]
+    other = gradopt(measure, SPACE, first, seed=derived_seed(0, 3 * 10**6))
+    once = gradopt(measure, SPACE, first, seed=0)
+    points = torch.cat([once.best_unit, other.best_unit], 1)
+    best = torch.cat([once.best, other.best], 1).topk(2, 1).indices
+    assert torch.equal(found.best_unit, points[torch.arange(2)[:, None], best]), "the best of both go on"
+    # Where something is found nothing is climbed again.
+    seen.clear()
+    search(float(once.best.max()))
+    assert seen == [1, 2, 3, 4, 5]
+    # The same again after an interruption in the second time.
+    stopped = tmp_path / "search.safetensors"
+
+    def interrupt(step, _):
+        seen.append(step)
+        if len(seen) == 7:
+            raise KeyboardInterrupt
+
+    seen.clear()
+    with pytest.raises(KeyboardInterrupt):
+        search(NEVER, checkpoint=stopped, on_step=interrupt)
+    seen.clear()
+    gone_on = search(NEVER, checkpoint=stopped)
+    assert seen == [3, 4, 5]
+    assert torch.equal(gone_on.best_unit, found.best_unit)
+    assert [each.name for each in tmp_path.iterdir()] == [stopped.name]
+
+
+def test_a_search_that_begins_at_given_patterns_is_not_begun_again(road):
+    ladder = GradOpt(iterations=2, restarts=2, halving=False).ladder(GOAL)
+    assert not any(math.isfinite(rung.needs) for rung in ladder)
+    assert [rung.needs for rung in GradOpt().ladder(GOAL) if math.isfinite(rung.needs)] == [methods.NOWHERE]
+
+
 def test_a_result_says_which_side_gave_way(road, monkeypatch):
     monkeypatch.setattr(methods, "PATH_RUNGS", (Rung(4, 1, open_loop=True, screened=2), Rung(4, 2, every=4)))
     method = GradOpt(iterations=2, restarts=2)
@@ -303,3 +353,28 @@ def test_without_gradients_a_pattern_stands_for_the_group_that_it_is_best_for(ro
     assert len(found.candidates) == 3, "each pattern once"
     assert found.by_group[found.group] == max(found.by_group.values()) > 0
     assert all(each.surrogate_shift > 0 for each in found.candidates)
+
+
+def test_what_is_found_with_fewer_digits_is_valued_with_all(road, monkeypatch):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    controller = pilotnet_controller(seed=0).eval().requires_grad_(False)
+    measure = GOAL.measure(road, controller, (RIGHT_GROUP, LEFT_GROUP), device="cpu")
+    rungs = (Rung(2, 2, every=8, open_loop=True), Rung(2, 2))
+    found = gradopt(measure, SPACE, rungs, seed=0)
+    assert torch.equal(found.best, measure.values(SPACE, found.best_unit))
+    whole = gradopt(measure, SPACE, rungs, seed=0, all_digits=True)
+    assert not torch.equal(found.history, whole.history)
+    assert torch.allclose(found.history[0], whole.history[0], rtol=0.1, atol=1e-3)
+
+
+@pytest.mark.parametrize("goal", [GOAL, SteeringShift()])
+def test_a_measure_of_another_controller_is_the_measure_made_for_it(goal, road):
+    networks = [pilotnet_controller(seed=seed).eval().requires_grad_(False) for seed in (0, 1)]
+    other, same = (goal.measure(road, each, (RIGHT_GROUP, LEFT_GROUP), device="cpu") for each in networks)
+    unit = SPACE.random((2, 2), torch.Generator().manual_seed(0))
+    found = other.of_controller(networks[1])
+    # The bare road's law of steering stays that of the first.
+    for each in getattr(found, "worlds", ()):
+        each.fit(networks[1])
+    assert torch.equal(found.values(SPACE, unit), same.values(SPACE, unit))
+    assert not torch.equal(other.values(SPACE, unit), same.values(SPACE, unit)) or goal is GOAL

@@ -50,6 +50,10 @@ class BatchedMeasure(ABC):
         """The same measure for some of its groups alone; its frames are counted from nought."""
 
     @abstractmethod
+    def of_controller(self: MeasureT, controller: Controller) -> MeasureT:
+        """The same measure of a controller with the same answers up to rounding."""
+
+    @abstractmethod
     def replayable(self: MeasureT) -> MeasureT | None:
         """The measure with the same operations on tensors of the same shapes in every step; None with a variation.
 

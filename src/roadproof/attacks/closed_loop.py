@@ -116,6 +116,13 @@ class ClosedLoopMeasure(BatchedMeasure):
         vars(part)["_steering"] = self._steering.of_groups(kept)
         return part
 
+    def of_controller(self, controller: Controller) -> ClosedLoopMeasure:
+        """The same measure of a controller with the same answers up to rounding."""
+        other = copy.copy(self)
+        vars(other).update(controller=controller, frames_evaluated=0, _bare={}, _unsure={}, _approaches={})
+        vars(other)["_steering"] = self._steering.of_controller(controller)
+        return other
+
     def replayable(self) -> ClosedLoopMeasure | None:
         """The measure with the same operations in every step, as `BatchedMeasure` says; None with a variation."""
         if self.variation is not None:

@@ -8,6 +8,7 @@ few frames, and the best of them alone go on (successive halving). What makes tw
 figures, so offspring with figures of both compete for the places too. The last rungs have the starts and frames of the
 whole search, and smaller and smaller steps; each begins at the best points so far with a fresh optimiser, as in the
 paper. A group that is far behind by then gives its places to the others: some controllers give way to one side only.
+Where none has found anything by then, the first rungs are climbed a second time from other points.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
 from roadproof.attacks.surrogate import FIXED
 from roadproof.compositing.view import compiles_kernels
+from roadproof.controllers.precision import for_climbing
 from roadproof.errors import RoadproofError
 from roadproof.search_space import SearchSpace, derived_seed
 
@@ -50,6 +52,8 @@ class Rung:
             before this rung, unless the measure is a user's own.
         screened: how many of the random starts of every group are the best of `DRAWN` that are valued first.
         offspring: how many children of the rung before's best points compete with these for the places of this one.
+        needs: value that the best start must have reached before this rung, unless the measure is a user's own. Where
+            none has, the rungs before are climbed once more from other points, and the best of both go on.
 
     Raises:
         RoadproofError: `starts`, `iterations`, `learning_rate` or `every` is not positive.
@@ -63,6 +67,7 @@ class Rung:
     groups_compete: bool = False
     screened: int = 0
     offspring: int = 0
+    needs: float = -math.inf
 
     def __post_init__(self) -> None:
         if min(self.starts, self.iterations, self.every) < 1 or not self.learning_rate > 0:
@@ -91,6 +96,13 @@ PARENTS, MUTATION = 12, 0.02
 """Best points of a group that have offspring, and how far these are moved: the spread of every share of a range."""
 
 
+class Entry(TypedDict, total=False):
+    """What the first of some rungs asks of those before; see `Rung`."""
+
+    groups_compete: bool
+    needs: float
+
+
 def dropping(
     starts: int,
     iterations: int,
@@ -98,7 +110,7 @@ def dropping(
     *,
     after: tuple[float, float],
     factor: float,
-    groups_compete: bool = False,
+    **of_first: Unpack[Entry],
 ) -> Ladder:
     """Rungs whose learning rate falls by a factor twice, after the given shares of the iterations."""
     once, twice = (max(1, int(iterations * share + 1e-9)) for share in after)
@@ -106,7 +118,7 @@ def dropping(
     rates = (learning_rate * factor**k for k in range(3))
     every = (Rung(starts, each, rate) for each, rate in zip(parts, rates, strict=True) if each > 0)
     first, *others = every
-    return replace(first, groups_compete=groups_compete), *others
+    return replace(first, **of_first), *others
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +167,13 @@ def aim_of(running: Running) -> str:
 
 
 def gradopt(
-    measure: RecordedMeasure, space: SearchSpace, rungs: Ladder, *, momentum: float = 0.9, **running: Unpack[Running]
+    measure: RecordedMeasure,
+    space: SearchSpace,
+    rungs: Ladder,
+    *,
+    momentum: float = 0.9,
+    all_digits: bool = False,
+    **running: Unpack[Running],
 ) -> Search:
     """Make a measure large over a search space.
 
@@ -164,6 +182,8 @@ def gradopt(
         space: the search space.
         rungs: the rungs of the search in order, each with its starts, iterations and learning rate.
         momentum: Adam's β₁; 0.9 is Adam's own, the released code has 0.
+        all_digits: whether the controller itself is climbed with. Otherwise it is `precision.for_climbing`, which has
+            fewer digits where that is faster; the values returned are the controller's own either way.
         **running: seed, starts, checkpoint and callback; see `Running`.
 
     Raises:
@@ -180,6 +200,8 @@ def gradopt(
     state = checkpoint.load(measure.device)
     resumed = state is not None
     at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
+    climbing = measure if all_digits else _for_climbing(measure)
+    again = checkpoint.path and checkpoint.path.with_suffix(f".again{checkpoint.path.suffix}")
     if state is None:
         state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
@@ -188,10 +210,16 @@ def gradopt(
         measure.frames_evaluated = int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung = rungs[number]
-        if number > at and rung.groups_compete and isinstance(measure, BatchedMeasure):
+        looks_back = number > at and isinstance(measure, BatchedMeasure)
+        if looks_back and float(state["best"].max()) < rung.needs:
+            before = running | {"seed": derived_seed(seed, 3 * 10**6), "starts": (), "checkpoint": again}
+            other = gradopt(measure, space, rungs[:number], momentum=momentum, all_digits=all_digits, **before)
+            points = {"best_unit": other.best_unit, "best": other.best}
+            state |= {name: torch.cat([state[name], found], 1) for name, found in points.items()}
+        if looks_back and rung.groups_compete:
             state, behind = _without_those_behind(state, behind)
-        climbed, done = rung.view(_of_groups(measure, behind)), sum(before.iterations for before in rungs[:number])
-        if resumed and number == at and climbed is not measure:
+        climbed, done = rung.view(_of_groups(climbing, behind)), sum(before.iterations for before in rungs[:number])
+        if climbed is not measure and (climbed is climbing or (resumed and number == at)):
             climbed.frames_evaluated = 0
         beside = side_by_side(climbed)
         if number > at:
@@ -220,10 +248,12 @@ def gradopt(
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
     best, last = state["best"], _of_groups(measure, behind)
-    if isinstance(last, BatchedMeasure) and last.variation is not None:
-        # Every step had looks of its own; results are compared in the same ones.
+    if isinstance(last, BatchedMeasure) and (last.variation is not None or climbing is not measure):
+        # Every step had looks of its own, or fewer digits; results are compared in the same ones.
         last.redraw(FIXED)
         best = last.values(space, state["best_unit"])
+    if again is not None:
+        again.unlink(missing_ok=True)
     gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
     kernels = measure.device.type == "cpu" or compiles_kernels(measure.device)
     steps = steps_in_words(run, kernels=kernels)
@@ -250,6 +280,14 @@ def _screened(measure: RecordedMeasure | Beside, space: SearchSpace, unit: Point
 def _at(unit: Points, index: Int64[Tensor, "g i"]) -> Float[Tensor, "g i k n"]:
     """Of every group's points those with the given numbers."""
     return unit[torch.arange(len(unit), device=index.device)[:, None], index]
+
+
+def _for_climbing(measure: RecordedMeasure) -> RecordedMeasure:
+    """The measure of the network to climb with, which may be the measure itself."""
+    if not isinstance(measure, BatchedMeasure):
+        return measure
+    network = for_climbing(measure.controller, measure.device)
+    return measure if network is measure.controller else measure.of_controller(network)
 
 
 def _of_groups(measure: RecordedMeasure, behind: Float[Tensor, " g"]) -> RecordedMeasure:

@@ -63,7 +63,8 @@ class GradOpt(Method):
         (measured). Random patterns join them, for controllers that need no such help. Most starts are the best of many
         that are valued once, which helps with controllers that random patterns hardly move, and the others at random,
         which helps with those that nearly every pattern moves (measured). Figures of two good patterns together are
-        often better than either (measured). A side to which the car hardly goes gives its places to the other.
+        often better than either (measured). A side to which the car hardly goes gives its places to the other. Where
+        it goes to neither, as happens with CIL and chance alone decides, all begins once more from other points.
         """
         shift = isinstance(objective, SteeringShift)
         rate, usual, first = (0.1, 100, SHIFT_RUNGS) if shift else (0.05, 32, PATH_RUNGS)
@@ -73,7 +74,7 @@ class GradOpt(Method):
             rate,
             after=(0.5, 0.8),
             factor=0.3,
-            groups_compete=not shift and self.halving,
+            **({} if shift or not self.halving else {"groups_compete": True, "needs": NOWHERE}),
         )
         return (*first, *proper) if self.halving else proper
 
@@ -86,6 +87,9 @@ class GradOpt(Method):
         ladder = self.ladder(running.get("objective", SteeringShift()))
         return gradopt(cast("RecordedMeasure", measure), space, ladder, **running)
 
+
+NOWHERE = 0.2
+"""Metres aside on average, or m/s, below which a car has hardly been moved."""
 
 SHIFT_RUNGS = (Rung(24, 30, every=4), Rung(8, 30, every=2))
 PATH_RUNGS = (

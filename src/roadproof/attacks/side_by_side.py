@@ -18,12 +18,11 @@ from typing import TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch.nn import Module
 
 from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.objective import RecordedMeasure
-from roadproof.controllers import Controller
+from roadproof.controllers.precision import is_torch_alone
 from roadproof.search_space import SearchSpace
 
 Result = TypeVar("Result")
@@ -38,15 +37,7 @@ def side_by_side(measure: RecordedMeasure) -> Beside | RecordedMeasure:
     if not isinstance(measure, BatchedMeasure) or measure.variation is not None:
         return measure
     free = measure.device.type == "cpu" and torch.get_num_threads() > 1
-    return Beside(measure) if free and _is_torch_alone(measure.controller) else measure
-
-
-def _is_torch_alone(controller: Controller) -> bool:
-    """Whether a controller is a network of torch's and roadproof's modules."""
-    ours = ("torch", "roadproof")
-    return isinstance(controller, Module) and all(
-        type(each).__module__.partition(".")[0] in ours for each in controller.modules()
-    )
+    return Beside(measure) if free and is_torch_alone(measure.controller) else measure
 
 
 class Beside:

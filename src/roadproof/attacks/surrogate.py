@@ -96,9 +96,13 @@ class Surrogate(BatchedMeasure):
         """The surrogate on every n-th frame of each drive, or on all where none of those shows the canvas."""
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
         try:
-            return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
+            return self._on(few, self.controller)
         except GeometryError:
             return self
+
+    def of_controller(self, controller: Controller) -> Surrogate:
+        """The surrogate of a controller with the same answers up to rounding."""
+        return self._on(self.recordings, controller)
 
     def of_groups(self, kept: Sequence[int]) -> Surrogate:
         """The surrogate of some of its groups alone."""
@@ -196,6 +200,9 @@ class Surrogate(BatchedMeasure):
         except ControllerError:  # one that cannot drive is known by what it is and how it steers
             which = stated(known_by(self.controller))
         return digest(repr((self.groups, self.variation)), self.recordings.digest(), which, *steer)
+
+    def _on(self, recordings: RecordingSet, controller: Controller) -> Surrogate:
+        return type(self)(recordings, controller, self.groups, device=self.device, variation=self.variation)
 
     def _compositor(self, copies: int) -> Compositor:
         # Batches of a search are of one size, or two: the frames are kept until another size comes, and for good where

@@ -72,7 +72,9 @@ def attack(
     cheapest: options.CheapestFor = None,
     seed: options.Seed = 0,
     device: options.Device = "cpu",
-    dtype: Annotated[str, typer.Option(help="What it computes in: float32, bfloat16, or on a GPU tf32.")] = "float32",
+    dtype: Annotated[
+        str, typer.Option(help="What values are computed in: float32, bfloat16, or on a GPU tf32.")
+    ] = "float32",
     out: options.Out = Path("out/attack"),
     *,
     paint: Paint,
