@@ -83,6 +83,9 @@ def test_a_dry_run_counts_the_evaluation_of_a_search_in_recordings_once(study, t
     code, printed = study("run", plan, "--dry-run", "--json", "--out", tmp_path / "out")
     assert code == 0, printed.err
     assert answered(printed.out)["drives"] == 16 + 2 * 3  # studies/small.toml says what GradOpt makes
+    plan.write_text(plan.read_text().replace("figures = [1]", "figures = [1, 2]"))
+    code, printed = study("run", plan, "--dry-run", "--json", "--out", tmp_path / "out")
+    assert answered(printed.out)["drives"] == 15 + 3 + 2 * (1 + 3), "the second job makes no drives that the first made"
 
 
 BLIND = """

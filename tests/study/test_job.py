@@ -25,7 +25,9 @@ from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.starts import StartPlan
 from roadproof.patterns import load_pattern
 from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING
+from roadproof.pipeline.stage_costs import read_cost
 from roadproof.scenarios import find_scenario
+from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.study.job import run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
 from roadproof.study.plan import Job, TrafficPlan
@@ -76,7 +78,7 @@ def street(tmp_path_factory):
 def test_gradopt_finds_and_is_judged_in_every_condition(street, tmp_path):
     traffic = TrafficPlan(cars=1, pedestrians=1, runs=1, weathers="first")
     job = job_of(GRADOPT, street, traffic=traffic, weathers=(Weather.CLEAR_NOON, Weather.RAINY_NOON))
-    result = run_job(job, tmp_path)
+    result = run_job(job, tmp_path / job.key)
     assert [(row["weather"], row["traffic"]) for row in result.rows] == [
         ("clear-noon", False),
         ("clear-noon", True),
@@ -116,10 +118,42 @@ def check_files(result, figures, conditions=("clear-noon",)):
 
 
 @pytest.mark.slow
+def test_jobs_share_what_they_record_and_drive_over_the_bare_road(street, tmp_path, monkeypatch):
+    begun: list[bool] = []
+    reset = TownSimulator.reset
+
+    def counted(simulator, *args, **options):
+        begun.append(options.get("pattern") is None)
+        return reset(simulator, *args, **options)
+
+    monkeypatch.setattr(TownSimulator, "reset", counted)
+    one, two = (job_of(GRADOPT, street, figures=figures) for figures in (1, 2))
+    run_job(one, tmp_path / "work" / one.key)
+    # One recorded, two to calibrate, one over the candidate; two that judge, one for pictures.
+    assert (len(begun), sum(begun)) == (7, 2)
+    begun.clear()
+    second = run_job(two, tmp_path / "work" / two.key)
+    assert begun == [False] * 3
+    alone = run_job(two, tmp_path / "alone" / two.key)
+    assert timeless(second.rows) == timeless(alone.rows)
+    assert second.files["pattern.json"] == alone.files["pattern.json"]
+    costs = [read_cost(tmp_path / "work" / job.key) for job in (one, two)]
+    recorded = [cost["record"].seconds + cost["calibrate"].seconds for cost in costs]
+    assert recorded[1] < recorded[0] / 2
+    told = json.loads(second.files["history.json"])["seconds"][0], second.rows[0]["search_seconds"]
+    assert min(told) > recorded[0], "what was recorded for another counts"
+    # Another seed, controller or budget shares nothing.
+    (kept,) = (place for place in (tmp_path / "work" / "shared").iterdir() if (place / "run.json").exists())
+    other = dataclasses.replace(one, seed=1)
+    run_job(other, tmp_path / "work" / other.key)
+    assert sum((place / "run.json").exists() for place in kept.parent.iterdir()) == 2
+
+
+@pytest.mark.slow
 def test_the_published_baseline_is_driven_and_judged(street, tmp_path, monkeypatch):
     pytest.importorskip("sklearn", reason="scikit-learn is not installed")
     monkeypatch.setattr(proposals, "PUBLISHED_ACQUISITION", {"drawn": 100, "climbs": 1})
-    result = run_job(job_of(BO, street), tmp_path)
+    result = run_job(job_of(BO, street), tmp_path / "job")
     (row,) = result.rows
     assert (row["search_calls"], row["evaluation_calls"]) == (4, 2)
     history = json.loads(result.files["history.json"])
@@ -135,15 +169,15 @@ def test_a_black_box_search_may_begin_with_what_gradients_found(street, tmp_path
     little = GradOpt(iterations=2, restarts=1, halving=False)
     small = dataclasses.replace(STEERING, method=little, trajectories=Trajectories(count=1), window=Window(frames=4))
     monkeypatch.setattr("roadproof.study.job.STEERING", small)
-    result = run_job(job_of(hybrid, street), tmp_path)
+    result = run_job(job_of(hybrid, street), tmp_path / "job")
     (row,) = result.rows
     # One drive recorded and two to calibrate; then a clean one and two over patterns.
     assert row["search_calls"] == 6
     history = json.loads(result.files["history.json"])
     assert (history["kind"], history["calls"]) == ("closed loop", [5, 6])
     assert history["seconds"][0] > 1, "what came before counts"
-    found = AttackResult.load(tmp_path / "start" / "attack")
-    trials = load_file(tmp_path / "trials.safetensors")["unit"]
+    found = AttackResult.load(tmp_path / "job" / "start" / "attack")
+    trials = load_file(tmp_path / "job" / "trials.safetensors")["unit"]
     first = space_of(job_of(hybrid)).pattern(trials[:1].float())
     assert torch.allclose(first.boxes[0], found.pattern.boxes, atol=1e-3)
     check_files(result, figures=1)

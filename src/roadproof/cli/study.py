@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,20 +67,25 @@ def run(
 
 
 def _workload(study: Study, who: Controller, workers: int) -> Workload:
-    """All jobs, also of those that are done already."""
-    from roadproof.pipeline.workload import Workload, of_drives, of_run
+    """All jobs, also of those that are done already; what they share is made once for each scenario and seed."""
+    from roadproof.pipeline.workload import Workload, of_drives, of_finding, of_recording
     from roadproof.study.methods import BlackBoxPlan, budget_of
+    from roadproof.study.shared import recorded_by
 
-    traffic, weathers, whole = study.traffic, len(study.weathers), Workload()
+    traffic, weathers = study.traffic, len(study.weathers)
     crowded = 0 if traffic is None else traffic.runs * (1 if traffic.weathers == "first" else weathers)
+    judging = of_drives(weathers * study.starts.count, crowded)
+    own, recordings = Workload(), dict[str, Workload]()
     for method in study.methods:
+        own += judging
         if isinstance(method, BlackBoxPlan) and method.where == "simulator":
-            whole += of_drives(method.calls + 1 + 2 * weathers * study.starts.count, 2 * crowded)
+            own += of_drives(method.calls + 1)
         else:
-            # Its own evaluation is that of the first weather.
-            budget = replace(budget_of(method, study.weathers[0]), starts=study.starts.count, runs=0)
-            whole += of_run(budget, who, film=False) + of_drives(2 * (weathers - 1) * study.starts.count, 2 * crowded)
-    return whole.times(len(study.scenarios) * len(study.figures) * len(study.seeds), at_once=workers)
+            budget = budget_of(method, study.weathers[0])
+            own += of_finding(budget, who)
+            recordings[repr(recorded_by(budget))] = of_recording(budget)
+    shared = sum(recordings.values(), judging)
+    return (own.times(len(study.figures)) + shared).times(len(study.scenarios) * len(study.seeds), at_once=workers)
 
 
 def transfer(

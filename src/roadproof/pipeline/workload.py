@@ -21,6 +21,7 @@ from roadproof.calibration import replays_needed
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import steer_of
 from roadproof.controllers.checks import require_usable
+from roadproof.controllers.precision import for_climbing
 from roadproof.machine import threads
 from roadproof.pipeline.budget import Budget
 from roadproof.recorded.world import UNSURE
@@ -83,11 +84,7 @@ def frame_seconds(controller: Controller, *, gradients: bool = True) -> float:
     Raises:
         ControllerError: the controller raises or answers wrongly.
     """
-    size, weights = (
-        controller.input_size or (88, 200),
-        controller.parameters() if isinstance(controller, Module) else (),
-    )
-    device = next((each.device for each in weights), torch.device("cpu"))
+    size, device = controller.input_size or (88, 200), _device_of(controller)
     require_usable(controller, size=size, device=str(device), drives=False, gradients=gradients)
     frames = torch.rand(_BATCH, 3, *size, device=device, requires_grad=gradients)
     speed, command = torch.full((_BATCH,), 7.0, device=device), torch.full((_BATCH,), 2, device=device)
@@ -126,7 +123,8 @@ def of_search(
         * _pictures(rung, objective, frames)
         for rung in rungs
     )
-    seconds = groups * count * _looks(objective) * frame_seconds(controller, gradients=method.by_gradient)
+    timed = for_climbing(controller, _device_of(controller)) if isinstance(method, GradOpt) else controller
+    seconds = groups * count * _looks(objective) * frame_seconds(timed, gradients=method.by_gradient)
     return Workload(seconds=seconds, megabytes=1.0, basis=_MEASURED)
 
 
@@ -142,7 +140,12 @@ def of_cheapest(figures: int, objective: Objective, controller: Controller) -> W
     # Below each limit the pattern, and what it is without each of its figures, is only valued.
     valued = len(UNSURE) * STRETCH_STEPS * (1 + figures) / 3
     count = MOST_LEVELS * (climbed * _looks(objective) + valued)
-    return Workload(seconds=count * frame_seconds(controller), basis=_MEASURED)
+    return Workload(seconds=count * frame_seconds(for_climbing(controller, _device_of(controller))), basis=_MEASURED)
+
+
+def _device_of(controller: Controller) -> torch.device:
+    weights = controller.parameters() if isinstance(controller, Module) else ()
+    return next((each.device for each in weights), torch.device("cpu"))
 
 
 def _looks(objective: Objective) -> int:
@@ -184,12 +187,19 @@ def of_run(budget: Budget, controller: Controller, *, film: bool = True, process
         film: whether the film of two drives is made.
         processes: number of replays and of drives of the evaluation made at once.
     """
-    count, weathers = budget.trajectories.count, len(budget.recorded_in)
-    replays = replays_needed(count, budget.calibration)
-    frames = budget.window.frames * (1 + count // 2) * weathers
-    searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
-    recorded = RECORDED_DRIVE.times(weathers * count)
-    calibrated = RECORDED_DRIVE.times(weathers * replays, at_once=processes)
-    chosen = of_drives(budget.select + budget.rounds * (1 + budget.select))
     judged = of_evaluation(len(budget.weathers), budget.starts, budget.runs, film=film, processes=processes)
-    return searched + recorded + calibrated + chosen + judged
+    return of_finding(budget, controller) + of_recording(budget, processes=processes) + judged
+
+
+def of_recording(budget: Budget, *, processes: int = 1) -> Workload:
+    """Estimate the drives that a stress test records, and their calibration."""
+    count, weathers = budget.trajectories.count, len(budget.recorded_in)
+    replays = weathers * replays_needed(count, budget.calibration)
+    return RECORDED_DRIVE.times(weathers * count) + RECORDED_DRIVE.times(replays, at_once=processes)
+
+
+def of_finding(budget: Budget, controller: Controller) -> Workload:
+    """Estimate the search of a stress test, and the drives over what it finds."""
+    frames = budget.window.frames * (1 + budget.trajectories.count // 2) * len(budget.recorded_in)
+    searched = of_search(budget.method, budget.objective, frames, controller).times(1 + budget.rounds)
+    return searched + of_drives(budget.select + budget.rounds * (1 + budget.select))

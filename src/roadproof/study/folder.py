@@ -8,6 +8,7 @@ jobs/KEY/paths.npz          clean_xy, painted_xy: world x, y in metres of both d
 jobs/KEY/passage-*.jpg      what the car's camera sees while it passes the pattern (`study.passages`)
 jobs/KEY/history.json       how the search went (`study.history`)
 work/KEY/                   what a job keeps while it runs, to go on from
+work/shared/                what several jobs need (`study.shared`)
 rows.parquet                every row of every job (`study.rows`)
 transfer.parquet            the patterns driven by other controllers (`study.transfer`)
 """

@@ -34,6 +34,7 @@ from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
 from roadproof.study.passages import passages
 from roadproof.study.plan import BLACK, Job
 from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns, paint_columns
+from roadproof.study.shared import SharedRecordings, bare_drives, bring_bare_drives, keep_bare_drives
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,8 +66,13 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     controller = load_controller(job.controller)
     with open_simulator(job.simulator) as world:
         drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
+        bare = bare_drives(job, world, controller, scratch.parent)
+        for name in PARTS:
+            bring_bare_drives(bare, scratch / name)
         found = (_by_driving if drives else _in_recordings)(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
+        for name in PARTS:
+            keep_bare_drives(bare, scratch / name)
         shown = parts[0].shown()
         clean, painted = load_episodes(scratch / PARTS[0], [shown.clean, shown.painted])
         paint, pictures = raster(found.pattern), dict[str, bytes]()
@@ -124,9 +130,15 @@ def _in_recordings(job: Job, world: Simulator, controller: Controller, folder: P
 
 
 def _searched(
-    job: Job, world: Simulator, controller: Controller, folder: Path, budget: Budget
+    job: Job, world: Simulator, controller: Controller, scratch: Path, budget: Budget, name: str = ""
 ) -> tuple[StressTest, int, float]:
-    """A search in recordings; its simulator calls and seconds without the evaluation."""
+    """A search in recordings; its simulator calls and seconds without the evaluation.
+
+    Its run is in the scratch folder, or in one of a name there. Drives that another job has recorded and calibrated
+    cost what they cost that one.
+    """
+    folder, shared = scratch / name, SharedRecordings.of(job, world, controller, budget, scratch.parent)
+    shared.bring(folder)
     found = stress_test(
         world,
         controller,
@@ -138,6 +150,8 @@ def _searched(
         controller_name=job.controller,
         film=False,
     )
+    shared.keep(folder)
+    found = replace(found, cost=found.cost | shared.cost)
     costs = [cost for stage, cost in found.cost.items() if stage != "evaluate"]
     return found, sum(cost.simulator_calls for cost in costs), sum(cost.seconds for cost in costs)
 
@@ -148,7 +162,7 @@ def _by_driving(job: Job, world: Simulator, controller: Controller, folder: Path
     if plan.start:
         # Record, calibrate and search the steering shift; the candidates are for the black box to drive.
         budget = replace(STEERING, select=0, starts=0, weathers=job.weathers[:1])
-        found, calls_before, seconds_before = _searched(job, world, controller, folder / "start", budget)
+        found, calls_before, seconds_before = _searched(job, world, controller, folder, budget, "start")
         chosen = first_of_each_group(found.attack.candidates, plan.start)
         first = torch.stack([candidate.point_in(space) for _, candidate in chosen])
     stretch = InSimulator(world, job.scenario, job.weathers[0], job.seed, keep=folder / "driven.json")
