@@ -17,7 +17,15 @@ def test_a_processor_without_wide_vectors_has_no_bfloat16_arithmetic(
     capability: str, expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
     assert multiplies_bfloat16("cpu") is expected
+
+
+@pytest.mark.parametrize("has", [True, False])
+def test_wide_vectors_without_its_instructions_are_not_enough(has: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has}, raising=False)
+    assert multiplies_bfloat16("cpu") is has
 
 
 def test_a_gpu_has_it() -> None:
@@ -27,6 +35,7 @@ def test_a_gpu_has_it() -> None:
 @pytest.fixture
 def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     """A processor with instructions for bfloat16, wherever this runs."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
 
 
