@@ -8,11 +8,13 @@ import multiprocessing
 import os
 import pickle
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -35,6 +37,18 @@ Opens: TypeAlias = Callable[[], AbstractContextManager[Inside]]
 """Makes the context in which a process works, such as a simulator."""
 
 
+@dataclass(frozen=True, slots=True)
+class Settled(Generic[Inside, Work, Result]):
+    """A function that the processes of a pool read from a file when they are first asked."""
+
+    function: Callable[[Inside, Work], Result]
+    file: Path
+
+    def __call__(self, inside: Inside, work: Work) -> Result:
+        """What the function answers."""
+        return self.function(inside, work)
+
+
 class Pool(Generic[Inside]):
     """Processes that stay open while they are wanted, each in a context of its own; one process means this one.
 
@@ -48,18 +62,22 @@ class Pool(Generic[Inside]):
     def __init__(self, opens: Opens[Inside], processes: int) -> None:
         self.processes = processes
         self._opens, self._stack = opens, ExitStack()
+        self._settled: Path | None = None
 
     def __enter__(self) -> Pool[Inside]:
         if self.processes > 1:
             # Never more than here: a controller's last digits depend on how many threads compute them.
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
             self._stop = multiprocessing.get_context("spawn").Event()
+            self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
             self._beside = self._stack.enter_context(
                 processes_beside(self.processes, _begin_work, self._opens, self._stop, threads)
             )
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self.processes > 1:
+            self._folder.cleanup()
         if kind is not None and self.processes > 1:
             self._stop.set()
             # Not where all went well: processes that are not waited for may complain when Python ends.
@@ -78,14 +96,29 @@ class Pool(Generic[Inside]):
             for _ in range(self.processes):
                 self._beside.submit(_inside)
 
+    def settle(self, function: Callable[[Inside, Work], Result]) -> Callable[[Inside, Work], Result]:
+        """The same function for `each`, which then sends it to a process once for however many rounds of work.
+
+        The one settled before it is forgotten.
+        """
+        if self.processes == 1:
+            return function
+        if self._settled is not None:
+            self._settled.unlink()
+        handle, name = tempfile.mkstemp(dir=self._folder.name)
+        with os.fdopen(handle, "wb") as file:
+            _Processor(file).dump(function)
+        self._settled = Path(name)
+        return Settled(function, self._settled)
+
     def each(self, function: Callable[[Inside, Work], Result], works: Sequence[Work]) -> Iterator[tuple[Work, Result]]:
         """Call a function for every piece of work.
 
         Args:
-            function: a module's own function, or a `partial` of one; it gets what its process has opened and a piece of
-                work, and travels to a process once for all pieces. Long ones look now and then whether they are
-                `stopping`. What it holds on a GPU is on the processor there: many processes with a picture at a time
-                would wait for each other at one GPU.
+            function: a module's own function, a `partial` of one, or one that was settled; it gets what its process has
+                opened and a piece of work, and travels to a process once for all pieces. Long ones look now and then
+                whether they are `stopping`. What it holds on a GPU is on the processor there: many processes with a
+                picture at a time would wait for each other at one GPU.
             works: the pieces; they travel between processes.
 
         Yields:
@@ -98,7 +131,7 @@ class Pool(Generic[Inside]):
             for work in works:
                 yield work, function(self._here, work)
             return
-        travels = _pickled_for_the_processor(function)
+        travels = _settled_in(function) or _pickled_for_the_processor(function)
         try:
             # A process that dies at once breaks the pool before all is handed to it.
             waiting = {self._beside.submit(_call, travels, work): work for work in works}
@@ -198,6 +231,10 @@ class _Processor(pickle.Pickler):
         return cast("Any", here).__reduce_ex__(2)
 
 
+def _settled_in(function: object) -> Path | None:
+    return cast("Settled[Any, Any, Any]", function).file if isinstance(function, Settled) else None
+
+
 def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:
     with io.BytesIO() as file:
         _Processor(file).dump(function)
@@ -222,14 +259,15 @@ def _inside() -> Any:  # noqa: ANN401  # whatever the process works in
     return _opened.enter_context(_opens())
 
 
-def _call(travelled: bytes, work: object) -> object:
+def _call(travelled: bytes | Path, work: object) -> object:
     return _function(travelled)(_inside(), work)
 
 
 @lru_cache(maxsize=1)
-def _function(travelled: bytes) -> Callable[[object, object], object]:
+def _function(travelled: bytes | Path) -> Callable[[object, object], object]:
     """What a process is to call; a controller that came with it stays as the pieces before left it."""
-    return foreign.call("a controller that travelled to another process", pickle.loads, travelled)
+    content = travelled.read_bytes() if isinstance(travelled, Path) else travelled
+    return foreign.call("a controller that travelled to another process", pickle.loads, content)
 
 
 def _begin(

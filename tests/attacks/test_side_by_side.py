@@ -1,15 +1,20 @@
 """Groups side by side: the same values and counts as one by one, and only where two calls at once do no harm."""
 
+from contextlib import nullcontext
+from functools import partial
+
 import pytest
 import torch
 
 from painted_ground import RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import PathDeviation, SteeringShift
+from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.side_by_side import Beside, side_by_side
 from roadproof.compositing.variation import Variation
 from roadproof.controllers import pilotnet_controller
 from roadproof.errors import ControllerError
+from roadproof.processes import Pool
 from roadproof.search_space import SearchSpace
 
 SPACE = SearchSpace(figures=2)
@@ -70,6 +75,33 @@ def test_values_gradients_and_counts_are_those_of_each_group(road, network, two_
     # All groups in one batch differ by rounding, which a closed loop enlarges.
     torch.testing.assert_close(beside.values(SPACE, unit), whole, rtol=2e-2, atol=2e-3)
     assert torch.get_num_threads() == 2
+
+
+def test_processes_answer_as_threads_do(road, network, two_threads):
+    with Pool(partial(nullcontext, None), 2) as pool:
+        for objective, groups in ((PathDeviation(), BOTH), (SteeringShift(), BOTH[:1])):
+            measure = measured(objective, road, network, groups)
+            unit = SPACE.random((len(groups), 3), torch.Generator().manual_seed(1))
+            answers, counts = [], []
+            for beside in (side_by_side(measure), side_by_side(measure, pool)):
+                for _ in range(2):
+                    begun = measure.frames_evaluated
+                    answers.append((*beside.values_and_gradients(SPACE, unit), beside.values(SPACE, unit)))
+                    counts.append(measure.frames_evaluated - begun)
+            for found in answers[1:]:
+                assert all(torch.equal(mine, theirs) for mine, theirs in zip(found, answers[0], strict=True))
+            assert len(set(counts)) == 1
+    assert torch.get_num_threads() == 2
+
+
+def test_a_search_in_processes_is_the_search_in_threads(road, network, two_threads):
+    measure = measured(PathDeviation(every=4), road, network)
+    rungs = (Rung(2, 2, every=8, open_loop=True), Rung(2, 1))
+    with Pool(partial(nullcontext, None), 2) as pool:
+        found = gradopt(measure, SPACE, rungs, seed=0, pool=pool)
+    expected = gradopt(measure, SPACE, rungs, seed=0)
+    assert torch.equal(found.best_unit, expected.best_unit)
+    assert torch.equal(found.history, expected.history)
 
 
 def test_a_users_code_a_mean_over_looks_and_one_thread_stay_as_they_are(road, network, two_threads):

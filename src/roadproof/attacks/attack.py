@@ -44,6 +44,7 @@ from roadproof.io.known import known_by
 from roadproof.io.records import plain
 from roadproof.limits import MAX_SEED
 from roadproof.paint import Site, conspicuousness
+from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
 from roadproof.roads.marks import site_at
 from roadproof.search_space import SearchSpace
@@ -62,6 +63,7 @@ def attack(
     random_patterns: int = 0,
     starts: Sequence[Candidate] = (),
     checkpoint: AnyPath | None = None,
+    pool: Pool[Any] | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
     """Find the pattern that moves a controller most, on recorded drives or in a simulator.
@@ -82,6 +84,8 @@ def attack(
         random_patterns: number of random patterns per group for the self-check on recordings; 0 leaves that check out.
         starts: candidates of an earlier search to start from, each in its own group, in place of as many random starts.
         checkpoint: file that keeps the search after every step, so that an interrupted one goes on; None for none.
+        pool: processes that are open, in which groups are searched side by side; None has threads do it, which are
+            slower: they wait for each other.
         on_step: called after every step with its number and the best value so far, in the objective's unit.
 
     Raises:
@@ -109,6 +113,7 @@ def attack(
         seed=seed,
         starts=[_points(space, starts, group) for group in groups],
         checkpoint=None if checkpoint is None else as_path(checkpoint),
+        pool=pool,
         on_step=on_step,
     )
     frames = measure.frames_evaluated
@@ -242,6 +247,7 @@ def kept_attack(
     device: torch.device | str = "cpu",
     random_patterns: int = 0,
     starts: Sequence[Candidate] = (),
+    pool: Pool[Any] | None = None,
     on_step: Callable[[int, float], object] = lambda _iteration, _best: None,
 ) -> AttackResult:
     """Search once: if the folder already holds the result of this search, read it instead.
@@ -276,6 +282,7 @@ def kept_attack(
             random_patterns=random_patterns,
             starts=starts,
             checkpoint=checkpoint,
+            pool=pool,
             on_step=on_step,
         ).save(folder)
     checkpoint.unlink(missing_ok=True)

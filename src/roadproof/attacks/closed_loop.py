@@ -130,8 +130,7 @@ class ClosedLoopMeasure(BatchedMeasure):
         same = copy.copy(self)
         worlds = tuple(world.replayable() for world in self.worlds)
         # They ask for numbers from the device, which a replayed step may not.
-        pairs = zip(worlds, self.worlds, strict=True)
-        approaches = {(id(new), self.every): self._approach(usual) for new, usual in pairs}
+        approaches = {(number, self.every): self._approach(usual) for number, usual in enumerate(self.worlds)}
         vars(same).update(worlds=worlds, frames_evaluated=0, _bare={}, _unsure={}, _approaches=approaches)
         return same
 
@@ -165,10 +164,11 @@ class ClosedLoopMeasure(BatchedMeasure):
     def predictions(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Predicted:
         """What is predicted in one world with small errors; the drives over the bare road are made once."""
         # `readings` draws the same looks each time.
-        if id(world) not in self._unsure:
+        number = self.worlds.index(world)
+        if number not in self._unsure:
             with torch.no_grad():
-                self._unsure[id(world)] = world.roll(self.controller, starts=UNSURE, looks=looks)
-        return world.predict(self.controller, patterns, UNSURE, looks, self._unsure[id(world)])
+                self._unsure[number] = world.roll(self.controller, starts=UNSURE, looks=looks)
+        return world.predict(self.controller, patterns, UNSURE, looks, self._unsure[number])
 
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""
@@ -209,7 +209,7 @@ class ClosedLoopMeasure(BatchedMeasure):
         """The drives over the bare road up to where the canvas is well seen; made once, and not where looks change."""
         if self._looks is not None:
             return None
-        key = (id(world), self.every)
+        key = (self.worlds.index(world), self.every)
         with _ONCE:
             if key not in self._approaches:
                 self._approaches[key] = world.approach(self.controller, self._starts, self.every)
@@ -217,11 +217,14 @@ class ClosedLoopMeasure(BatchedMeasure):
 
     def bare(self, world: RecordedWorld) -> Rolled:
         """The drives over the bare road in one world, from each start with every look; made once."""
-        key = (id(world), self.every)
+        key = (self.worlds.index(world), self.every)
         with _ONCE:  # groups are valued side by side
             if key not in self._bare:
+                counted = self.frames_evaluated
                 with torch.no_grad():
                     self._bare[key] = self.roll(world, None)
+                # Not part of a search's cost: every process that values a group makes them again.
+                self.frames_evaluated = counted
         return self._bare[key]
 
     def _pictures(self, world: RecordedWorld, after: Approach | None) -> int:

@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Required, TypedDict, Unpack, cast
+from typing import Any, Required, TypedDict, Unpack, cast
 
 import torch
 from jaxtyping import Float, Int64
@@ -35,6 +35,7 @@ from roadproof.attacks.surrogate import FIXED
 from roadproof.compositing.view import compiles_kernels
 from roadproof.controllers.precision import for_climbing
 from roadproof.errors import RoadproofError
+from roadproof.processes import Pool
 from roadproof.search_space import SearchSpace, derived_seed
 
 
@@ -152,6 +153,7 @@ class Running(TypedDict, total=False):
         objective: what is made large; its name stands in the checkpoint, where a search for another is refused.
         on_step: called after every step with its number and the best value so far. On a GPU some steps are taken
             together (`captured.LOOK_S`); then the file is written, and this called, after the last of them.
+        pool: processes in which groups are valued side by side; None has threads do it.
     """
 
     seed: Required[int]
@@ -159,6 +161,7 @@ class Running(TypedDict, total=False):
     checkpoint: Path | None
     objective: Objective
     on_step: Callable[[int, float], object]
+    pool: Pool[Any] | None
 
 
 def aim_of(running: Running) -> str:
@@ -221,7 +224,7 @@ def gradopt(
         climbed, done = rung.view(_of_groups(climbing, behind)), sum(before.iterations for before in rungs[:number])
         if climbed is not measure and (climbed is climbing or (resumed and number == at)):
             climbed.frames_evaluated = 0
-        beside = side_by_side(climbed)
+        beside = side_by_side(climbed, running.get("pool"))
         if number > at:
             if rung.offspring:
                 state = _with_offspring(beside, space, state, rung.offspring, derived_seed(seed, 2 * 10**6 + number))

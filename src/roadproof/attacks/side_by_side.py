@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar, cast
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import torch
 from torch import Tensor
@@ -23,21 +24,21 @@ from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.controllers.precision import is_torch_alone
+from roadproof.processes import Pool
 from roadproof.search_space import SearchSpace
 
-Result = TypeVar("Result")
 
-
-def side_by_side(measure: RecordedMeasure) -> Beside | RecordedMeasure:
+def side_by_side(measure: RecordedMeasure, pool: Pool[Any] | None = None) -> Beside | RecordedMeasure:
     """The measure with its groups side by side, where there are threads for that; else the measure itself.
 
     A user's own code may not stand two calls at once, and a mean over new looks is drawn for all groups together: such
-    measures stay as they are, and so does a measure on another device than the processor.
+    measures stay as they are, and so does a measure on another device than the processor. In processes, where there are
+    several, groups do not wait for each other as threads do.
     """
     if not isinstance(measure, BatchedMeasure) or measure.variation is not None:
         return measure
     free = measure.device.type == "cpu" and torch.get_num_threads() > 1
-    return Beside(measure) if free and is_torch_alone(measure.controller) else measure
+    return Beside(measure, pool) if free and is_torch_alone(measure.controller) else measure
 
 
 class Beside:
@@ -47,14 +48,17 @@ class Beside:
 
     Args:
         whole: the measure. What is valued here counts among its `frames_evaluated`.
+        pool: processes to value groups in; with None, or one process, each has a thread.
     """
 
-    def __init__(self, whole: BatchedMeasure) -> None:
+    def __init__(self, whole: BatchedMeasure, pool: Pool[Any] | None = None) -> None:
         self._whole = whole
         self._parts = [whole.of_groups([k]) for k in range(len(whole.groups))]
         if len(self._parts) == 1:
             self._parts.append(whole.of_groups([0]))
         self._threads = min(len(self._parts), torch.get_num_threads())
+        self._pool = pool if pool is not None and pool.processes > 1 else None
+        self._settled = self._pool and self._pool.settle(partial(_answered, self._parts))
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -63,34 +67,60 @@ class Beside:
 
     def values(self, space: SearchSpace, unit: Points) -> Values:
         """The values of R points per group, without gradients."""
-
-        def valued(part: BatchedMeasure, points: Tensor) -> Tensor:
-            return part.values(space, points)
-
-        return self._joined(unit, self._each(valued, unit))
+        return self._joined(unit, [value for (value,) in self._each(_valued, space, unit)])
 
     def values_and_gradients(self, space: SearchSpace, unit: Points) -> tuple[Values, Points]:
         """The values of R points per group, and their gradients."""
-
-        def climbed(part: BatchedMeasure, points: Tensor) -> tuple[Tensor, Tensor]:
-            return part.values_and_gradients(space, points)
-
-        each = self._each(climbed, unit)
+        each = self._each(_climbed, space, unit)
         return self._joined(unit, [value for value, _ in each]), self._joined(unit, [slope for _, slope in each])
 
     def _joined(self, unit: Tensor, parts: Sequence[Tensor]) -> Tensor:
         return torch.cat(list(parts), 0 if len(unit) > 1 else 1)
 
-    def _each(self, function: Callable[[BatchedMeasure, Tensor], Result], unit: Tensor) -> list[Result]:
+    def _each(self, ask: _Ask, space: SearchSpace, unit: Tensor) -> list[tuple[Tensor, ...]]:
         points = cast("tuple[Tensor, ...]", unit.split(1) if len(unit) > 1 else unit.tensor_split(2, 1))
-        busy = [(part, some) for part, some in zip(self._parts, points, strict=True) if some.numel()]
         threads = torch.get_num_threads()
-        own = (max(1, threads // self._threads),)
-        try:
-            with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=own) as pool:
-                return list(pool.map(function, *zip(*busy, strict=True)))
-        finally:
-            torch.set_num_threads(threads)
-            for part in self._parts:
-                self._whole.frames_evaluated += part.frames_evaluated
-                part.frames_evaluated = 0
+        own = max(1, threads // self._threads)
+        pieces = [_Piece(number, ask, space, some, own) for number, some in enumerate(points) if some.numel()]
+        if self._pool is not None and self._settled is not None:
+            found = {piece.number: answer for piece, answer in self._pool.each(self._settled, pieces)}
+        else:
+            try:
+                with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=(own,)) as pool:
+                    found = dict(enumerate(pool.map(partial(_answered, self._parts, None), pieces)))
+            finally:
+                torch.set_num_threads(threads)
+        self._whole.frames_evaluated += sum(frames for _, frames in found.values())
+        return [found[number][0] for number in sorted(found)]
+
+
+_Ask: TypeAlias = Callable[[BatchedMeasure, SearchSpace, Tensor], tuple[Tensor, ...]]
+
+
+class _Piece(NamedTuple):
+    """What is asked of the group of this number, of so many points, on so many threads."""
+
+    number: int
+    ask: _Ask
+    space: SearchSpace
+    points: Tensor
+    threads: int
+
+
+def _answered(parts: Sequence[BatchedMeasure], _: object, piece: _Piece) -> tuple[tuple[Tensor, ...], int]:
+    """What a group's measure answers, and how many frames that took."""
+    part, before = parts[piece.number], torch.get_num_threads()
+    part.frames_evaluated = 0
+    torch.set_num_threads(piece.threads)
+    try:
+        return piece.ask(part, piece.space, piece.points), part.frames_evaluated
+    finally:
+        torch.set_num_threads(before)
+
+
+def _valued(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> tuple[Tensor, ...]:
+    return (part.values(space, points),)
+
+
+def _climbed(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> tuple[Tensor, ...]:
+    return part.values_and_gradients(space, points)

@@ -156,6 +156,7 @@ def search_on(
             found,
             [candidate for _, candidate in known],
             device,
+            pool,
             lambda step, best, tell=tell: tell(step, f"{best:.2f}"),
         )
         chosen = select_by_driving(
@@ -189,6 +190,7 @@ def _search_again(
     found: AttackResult,
     starts: Sequence[Candidate],
     device: torch.device | str,
+    pool: Pool[Simulator] | None,
     on_step: Callable[[int, float], object],
 ) -> AttackResult:
     """The search before, gone on with from what is known, on one more recorded drive."""
@@ -205,6 +207,7 @@ def _search_again(
         seed=found.seed,
         starts=starts,
         device=device,
+        pool=pool,
         on_step=on_step,
     )
 

@@ -148,6 +148,7 @@ class Stages:
             groups=self.groups(recordings),
             seed=self.seed,
             device=self.device,
+            pool=self.pool,
             on_step=lambda step, best: self.on_progress("Searching", step, steps, f"{best:.2f}"),
         )
 
