@@ -193,11 +193,10 @@ def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
             counts = sorted(asked for asked, there in first + second if there == process)
             assert counts == list(range(1, len(counts) + 1)), "it travels to a process once"
         settled = pool.settle(Tally())
-        for _ in range(2):
-            first = list(pool.each(settled, range(4)))
-        for process in {process for _, (_, process) in first}:
-            counts = sorted(asked for _, (asked, there) in first if there == process)
-            assert counts[0] > 1, "it stays from one round to the next"
+        rounds = [dict(pool.each(settled, range(2))) for _ in range(3)]
+        assert len({process for _, process in rounds[0].values()}) == 2
+        for piece in range(2):
+            assert [found[piece] for found in rounds] == [(k, rounds[0][piece][1]) for k in (1, 2, 3)], "it stays there"
         pool.settle(Tally())
         assert not settled.file.exists(), "only the last one is kept"
         with pytest.raises(ControllerError, match="a controller that travelled"):

@@ -10,8 +10,9 @@ import pickle
 import sys
 import tempfile
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
@@ -70,9 +71,10 @@ class Pool(Generic[Inside]):
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
             self._stop = multiprocessing.get_context("spawn").Event()
             self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
-            self._beside = self._stack.enter_context(
-                processes_beside(self.processes, _begin_work, self._opens, self._stop, threads)
-            )
+            self._beside = [
+                self._stack.enter_context(processes_beside(1, _begin_work, self._opens, self._stop, threads))
+                for _ in range(self.processes)
+            ]
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -81,7 +83,8 @@ class Pool(Generic[Inside]):
         if kind is not None and self.processes > 1:
             self._stop.set()
             # Not where all went well: processes that are not waited for may complain when Python ends.
-            self._beside.shutdown(wait=False, cancel_futures=True)
+            for process in self._beside:
+                process.shutdown(wait=False, cancel_futures=True)
             return
         self._stack.close()
 
@@ -93,13 +96,13 @@ class Pool(Generic[Inside]):
     def begin(self) -> None:
         """Let every process beside this one enter its context now, and do not wait for it."""
         if self.processes > 1:
-            for _ in range(self.processes):
-                self._beside.submit(_inside)
+            for process in self._beside:
+                process.submit(_inside)
 
     def settle(self, function: Callable[[Inside, Work], Result]) -> Callable[[Inside, Work], Result]:
         """The same function for `each`, which then sends it to a process once for however many rounds of work.
 
-        The one settled before it is forgotten.
+        In each round the first process gets the first piece of work, and so on. The one settled before is forgotten.
         """
         if self.processes == 1:
             return function
@@ -131,12 +134,19 @@ class Pool(Generic[Inside]):
             for work in works:
                 yield work, function(self._here, work)
             return
-        travels = _settled_in(function) or _pickled_for_the_processor(function)
+        settled = _settled_in(function)
+        call = partial(_call, settled or _pickled_for_the_processor(function))
+        left = deque(works)
         try:
-            # A process that dies at once breaks the pool before all is handed to it.
-            waiting = {self._beside.submit(_call, travels, work): work for work in works}
-            for future in as_completed(waiting):
-                yield waiting[future], cast("Result", future.result())
+            free = self._beside if settled is None else self._beside * -(-len(works) // self.processes)
+            waiting = {process.submit(call, work): (process, work) for process, work in _paired(free, left)}
+            while waiting:
+                done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+                finished = {future: waiting.pop(future) for future in done}
+                free = [process for process, _ in finished.values()]
+                waiting |= {process.submit(call, work): (process, work) for process, work in _paired(free, left)}
+                for future, (_, work) in finished.items():
+                    yield work, cast("Result", future.result())
         except BrokenProcessPool:
             raise SimulatorError(DIED) from None
 
@@ -229,6 +239,11 @@ class _Processor(pickle.Pickler):
         parameter = isinstance(thing, torch.nn.Parameter)
         here = torch.nn.Parameter(here, thing.requires_grad) if parameter else here
         return cast("Any", here).__reduce_ex__(2)
+
+
+def _paired(processes: Sequence[ProcessPoolExecutor], works: deque[Work]) -> list[tuple[ProcessPoolExecutor, Work]]:
+    """Processes with a piece of work each, taken from those that are left."""
+    return [(process, works.popleft()) for process in processes[: len(works)]]
 
 
 def _settled_in(function: object) -> Path | None:
