@@ -14,6 +14,7 @@ from roadproof.attacks.blackbox import blackbox_search
 from roadproof.attacks.driven import DrivenMeasure, InSimulator
 from roadproof.attacks.objective import OBJECTIVES, varied
 from roadproof.controllers import Controller, load_controller
+from roadproof.datatypes import Weather
 from roadproof.driving.deviation import path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
@@ -32,7 +33,7 @@ from roadproof.simulators.protocol import Simulator
 from roadproof.study.history import History, Progress
 from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
 from roadproof.study.passages import passages
-from roadproof.study.plan import BLACK, Job
+from roadproof.study.plan import BLACK, Job, TrafficPlan
 from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns, paint_columns
 from roadproof.study.shared import SharedRecordings, bare_drives, bring_bare_drives, keep_bare_drives
 
@@ -67,12 +68,12 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     with open_simulator(job.simulator) as world:
         drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
         bare = bare_drives(job, world, controller, scratch.parent)
-        for name in PARTS:
+        for name, *_ in _conditions(job):
             bring_bare_drives(bare, scratch / name)
         found = (_by_driving if drives else _in_recordings)(job, world, controller, scratch)
         parts = _evaluate(job, world, controller, found.pattern, scratch)
-        for name in PARTS:
-            keep_bare_drives(bare, scratch / name)
+        for name, part in zip(PARTS, parts, strict=False):
+            keep_bare_drives(bare, scratch / name, part)
         shown = parts[0].shown()
         clean, painted = load_episodes(scratch / PARTS[0], [shown.clean, shown.painted])
         paint, pictures = raster(found.pattern), dict[str, bytes]()
@@ -197,12 +198,7 @@ def _said(job: Job, site: Site) -> Site:
 def _evaluate(
     job: Job, world: Simulator, controller: Controller, pattern: Pattern, scratch: Path
 ) -> tuple[Evaluation, ...]:
-    """All the study's conditions; where traffic is for the first weather alone, the others are a part of their own."""
-    traffic = job.traffic
-    split = traffic is not None and traffic.weathers == "first" and len(job.weathers) > 1
-    parts = [(PARTS[0], job.weathers[:1] if split else job.weathers, traffic)]
-    if split:
-        parts.append((PARTS[1], job.weathers[1:], None))
+    """All the study's conditions."""
     return tuple(
         evaluate(
             world,
@@ -219,5 +215,13 @@ def _evaluate(
             pedestrians=others.pedestrians if others else 0,
             seed=job.seed,
         )
-        for name, weathers, others in parts
+        for name, weathers, others in _conditions(job)
     )
+
+
+def _conditions(job: Job) -> tuple[tuple[str, tuple[Weather, ...], TrafficPlan | None], ...]:
+    """Folder, weathers and traffic of each evaluation; where traffic is for the first weather alone, there are two."""
+    traffic = job.traffic
+    if traffic is None or traffic.weathers == "all" or len(job.weathers) == 1:
+        return ((PARTS[0], job.weathers, traffic),)
+    return (PARTS[0], job.weathers[:1], traffic), (PARTS[1], job.weathers[1:], None)

@@ -17,6 +17,7 @@ from typing import Any
 import roadproof
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
+from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import OutputError
 from roadproof.io.files import write_folder_atomically
 from roadproof.io.identity import digest, stated
@@ -102,9 +103,12 @@ def bring_bare_drives(shared: Path, evaluation: Path) -> None:
     _link(shared, evaluation / "episodes")
 
 
-def keep_bare_drives(shared: Path, evaluation: Path) -> None:
-    """Keep the drives over the bare road that an evaluation made."""
+def keep_bare_drives(shared: Path, evaluation: Path, told: Evaluation) -> None:
+    """Keep the drives over the bare road that an evaluation made, and leave it those that it tells of."""
     _link(evaluation / "episodes", shared, _CLEAN)
+    for file in set((evaluation / "episodes").glob(_CLEAN)):
+        if file.name not in {trial.clean for trial in told.trials}:
+            file.unlink()
 
 
 def bare_drives(job: Job, world: Simulator, controller: Controller, work: Path) -> Path:
