@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Required, TypedDict, Unpack, cast
 
@@ -97,13 +97,6 @@ PARENTS, MUTATION = 12, 0.02
 """Best points of a group that have offspring, and how far these are moved: the spread of every share of a range."""
 
 
-class Entry(TypedDict, total=False):
-    """What the first of some rungs asks of those before; see `Rung`."""
-
-    groups_compete: bool
-    needs: float
-
-
 def dropping(
     starts: int,
     iterations: int,
@@ -111,15 +104,12 @@ def dropping(
     *,
     after: tuple[float, float],
     factor: float,
-    **of_first: Unpack[Entry],
 ) -> Ladder:
     """Rungs whose learning rate falls by a factor twice, after the given shares of the iterations."""
     once, twice = (max(1, int(iterations * share + 1e-9)) for share in after)
     parts = (once, twice - once, iterations - twice)
     rates = (learning_rate * factor**k for k in range(3))
-    every = (Rung(starts, each, rate) for each, rate in zip(parts, rates, strict=True) if each > 0)
-    first, *others = every
-    return replace(first, **of_first), *others
+    return tuple(Rung(starts, each, rate) for each, rate in zip(parts, rates, strict=True) if each > 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ A method knows what to make large only by its measure; where a pattern's value c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar, Unpack, cast
 
 import torch
@@ -74,9 +74,12 @@ class GradOpt(Method):
             rate,
             after=(0.5, 0.8),
             factor=0.3,
-            **({} if shift or not self.halving else {"groups_compete": True, "needs": NOWHERE}),
         )
-        return (*first, *proper) if self.halving else proper
+        if not self.halving:
+            return proper
+        if not shift:
+            proper = replace(proper[0], groups_compete=True, needs=NOWHERE), *proper[1:]
+        return *first, *proper
 
     def steps(self, objective: Objective, /) -> int:
         """Number of iterations of all rungs together."""

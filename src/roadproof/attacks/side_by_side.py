@@ -27,6 +27,7 @@ from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import Group, Points, Values
 from roadproof.attacks.objective import RecordedMeasure
 from roadproof.controllers.precision import is_torch_alone
+from roadproof.machine import threads
 from roadproof.processes import Pool
 from roadproof.search_space import SearchSpace
 
@@ -61,7 +62,7 @@ class Beside:
             self._parts.append(whole.of_groups([0]))
         self._threads = min(len(self._parts), torch.get_num_threads())
         self._pool = pool if pool is not None and pool.processes > 1 else None
-        self._settled = self._pool and self._pool.settle(partial(_answered, self._parts))
+        self._settled = self._pool and self._pool.settle(partial(_answered_beside, self._parts))
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -82,17 +83,17 @@ class Beside:
 
     def _each(self, ask: _Ask, space: SearchSpace, unit: Tensor) -> list[tuple[Tensor, ...]]:
         points = cast("tuple[Tensor, ...]", unit.split(1) if len(unit) > 1 else unit.tensor_split(2, 1))
-        threads = torch.get_num_threads()
-        own = max(1, threads // self._threads)
+        usual = torch.get_num_threads()
+        own = max(1, usual // self._threads)
         pieces = [_Piece(number, ask, space, some, own) for number, some in enumerate(points) if some.numel()]
         if self._pool is not None and self._settled is not None:
             found = {piece.number: answer for piece, answer in self._pool.each(self._settled, pieces)}
         else:
             try:
                 with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=(own,)) as pool:
-                    found = dict(enumerate(pool.map(partial(_answered, self._parts, None), pieces)))
+                    found = dict(enumerate(pool.map(partial(_answered, self._parts), pieces)))
             finally:
-                torch.set_num_threads(threads)
+                torch.set_num_threads(usual)
         self._whole.frames_evaluated += sum(frames for _, frames in found.values())
         return [found[number][0] for number in sorted(found)]
 
@@ -110,15 +111,17 @@ class _Piece(NamedTuple):
     threads: int
 
 
-def _answered(parts: Sequence[BatchedMeasure], _: object, piece: _Piece) -> tuple[tuple[Tensor, ...], int]:
+def _answered(parts: Sequence[BatchedMeasure], piece: _Piece) -> tuple[tuple[Tensor, ...], int]:
     """What a group's measure answers, and how many frames that took."""
-    part, before = parts[piece.number], torch.get_num_threads()
+    part = parts[piece.number]
     part.frames_evaluated = 0
-    torch.set_num_threads(piece.threads)
-    try:
-        return piece.ask(part, piece.space, piece.points), part.frames_evaluated
-    finally:
-        torch.set_num_threads(before)
+    return piece.ask(part, piece.space, piece.points), part.frames_evaluated
+
+
+def _answered_beside(parts: Sequence[BatchedMeasure], _: object, piece: _Piece) -> tuple[tuple[Tensor, ...], int]:
+    """The same in another process."""
+    with threads(piece.threads):
+        return _answered(parts, piece)
 
 
 def _valued(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> tuple[Tensor, ...]:

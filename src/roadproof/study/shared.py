@@ -106,8 +106,9 @@ def bring_bare_drives(shared: Path, evaluation: Path) -> None:
 def keep_bare_drives(shared: Path, evaluation: Path, told: Evaluation) -> None:
     """Keep the drives over the bare road that an evaluation made, and leave it those that it tells of."""
     _link(evaluation / "episodes", shared, _CLEAN)
-    for file in set((evaluation / "episodes").glob(_CLEAN)):
-        if file.name not in {trial.clean for trial in told.trials}:
+    kept = {trial.clean for trial in told.trials}
+    for file in list((evaluation / "episodes").glob(_CLEAN)):
+        if file.name not in kept:
             file.unlink()
 
 
