@@ -197,6 +197,7 @@ def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
         assert len({process for _, process in rounds[0].values()}) == 2
         for piece in range(2):
             assert [found[piece] for found in rounds] == [(k, rounds[0][piece][1]) for k in (1, 2, 3)], "it stays there"
+        assert pool.settle(settled.function) is settled
         pool.settle(Tally())
         assert not settled.file.exists(), "only the last one is kept"
         with pytest.raises(ControllerError, match="a controller that travelled"):

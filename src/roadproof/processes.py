@@ -63,7 +63,7 @@ class Pool(Generic[Inside]):
     def __init__(self, opens: Opens[Inside], processes: int) -> None:
         self.processes = processes
         self._opens, self._stack = opens, ExitStack()
-        self._settled: Path | None = None
+        self._settled: Settled[Inside, Any, Any] | None = None
 
     def __enter__(self) -> Pool[Inside]:
         if self.processes > 1:
@@ -102,17 +102,19 @@ class Pool(Generic[Inside]):
     def settle(self, function: Callable[[Inside, Work], Result]) -> Callable[[Inside, Work], Result]:
         """The same function for `each`, which then sends it to a process once for however many rounds of work.
 
-        In each round the first process gets the first piece of work, and so on. The one settled before is forgotten.
+        In each round the first process gets the first piece of work, and so on. One function is settled at a time: that
+        one stays where it is, and any other is forgotten.
         """
         if self.processes == 1:
             return function
-        if self._settled is not None:
-            self._settled.unlink()
-        handle, name = tempfile.mkstemp(dir=self._folder.name)
-        with os.fdopen(handle, "wb") as file:
-            _Processor(file).dump(function)
-        self._settled = Path(name)
-        return Settled(function, self._settled)
+        if self._settled is None or self._settled.function is not function:
+            if self._settled is not None:
+                self._settled.file.unlink()
+            handle, name = tempfile.mkstemp(dir=self._folder.name)
+            with os.fdopen(handle, "wb") as file:
+                _Processor(file).dump(function)
+            self._settled = Settled(function, Path(name))
+        return self._settled
 
     def each(self, function: Callable[[Inside, Work], Result], works: Sequence[Work]) -> Iterator[tuple[Work, Result]]:
         """Call a function for every piece of work.

@@ -10,7 +10,7 @@ from painted_ground import RampFollower, known_vehicle, recorded_road
 from roadproof.attacks import PathDeviation, SteeringShift
 from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
-from roadproof.attacks.side_by_side import Beside, side_by_side
+from roadproof.attacks.side_by_side import Beside, Sides
 from roadproof.compositing.variation import Variation
 from roadproof.controllers import pilotnet_controller
 from roadproof.errors import ControllerError
@@ -37,6 +37,10 @@ def network(road):
 def measured(objective, road, controller, groups=BOTH):
     with known_vehicle():
         return objective.measure(road, controller, groups, device="cpu")
+
+
+def side_by_side(measure, pool=None):
+    return Sides((measure,), pool).of(0, measure)
 
 
 def one_by_one(measure, unit):
@@ -86,7 +90,8 @@ def test_processes_answer_as_threads_do(road, network, two_threads):
             for beside in (side_by_side(measure), side_by_side(measure, pool)):
                 for _ in range(2):
                     begun = measure.frames_evaluated
-                    answers.append((*beside.values_and_gradients(SPACE, unit), beside.values(SPACE, unit)))
+                    read = [each for each in beside.readings(SPACE, unit) if each is not None]
+                    answers.append((*beside.values_and_gradients(SPACE, unit), beside.values(SPACE, unit), *read))
                     counts.append(measure.frames_evaluated - begun)
             for found in answers[1:]:
                 assert all(torch.equal(mine, theirs) for mine, theirs in zip(found, answers[0], strict=True))
@@ -119,7 +124,7 @@ def test_an_error_in_one_group_is_raised_and_leaves_the_threads_as_they_were(roa
     def fails(*_):
         raise ControllerError("the controller answers NaN")
 
-    monkeypatch.setattr(beside._parts[1], "values", fails)
+    monkeypatch.setattr(type(beside._whole), "values", fails)
     with pytest.raises(ControllerError, match="answers NaN"):
         beside.values(SPACE, SPACE.random((2, 1), torch.Generator().manual_seed(3)))
     assert torch.get_num_threads() == 2

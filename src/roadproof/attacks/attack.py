@@ -29,8 +29,17 @@ from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group, known_as, require_names
 from roadproof.attacks.method import Method
 from roadproof.attacks.methods import BayesianOptimisation, GradOpt, Published, stored
-from roadproof.attacks.objective import Measure, Objective, PathDeviation, RecordedMeasure, SteeringShift, own_objective
+from roadproof.attacks.objective import (
+    Measure,
+    Objective,
+    PathDeviation,
+    Readings,
+    RecordedMeasure,
+    SteeringShift,
+    own_objective,
+)
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
+from roadproof.attacks.side_by_side import Beside, Sides
 from roadproof.attacks.site import site_of
 from roadproof.attacks.speed import SpeedMeasure
 from roadproof.checks import Check
@@ -119,7 +128,9 @@ def attack(
     frames = measure.frames_evaluated
     if search.gave_way and isinstance(measure, BatchedMeasure):
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
-    candidates = _candidates(measure, search, space, method)
+    beside = Sides((measure,), pool).of(0, measure) if isinstance(measure, RecordedMeasure) else None
+    readings = (None, None) if beside is None else beside.readings(space, search.best_unit)
+    candidates = _candidates(measure, search, space, method, readings)
     cost = Cost(
         controller_frames=frames,
         seconds=time.perf_counter() - start,
@@ -132,7 +143,7 @@ def attack(
         candidates=candidates,
         history=search.history.double().numpy(),
         cost=cost,
-        checks=_checks(measure, method, space, search, groups, candidates[0], random_patterns, seed),
+        checks=_checks(measure, beside, method, space, search, groups, candidates[0], random_patterns, seed),
         space=space,
         method=method,
         seed=seed,
@@ -214,6 +225,7 @@ def _made_of(
 
 def _checks(
     measure: Measure,
+    beside: RecordedMeasure | Beside | None,
     method: Method,
     space: SearchSpace,
     search: Search,
@@ -224,11 +236,11 @@ def _checks(
 ) -> tuple[Check, ...]:
     """The self-checks that suit what a search ran on: recordings, a recorded world or a simulator."""
     of_search = (*check_groups(groups, search), *check_steps(search))
-    if not isinstance(measure, RecordedMeasure):
+    if beside is None:
         return check_bounds(space, search), *of_search
-    checks = check_search(measure, space, search, random_patterns=random_patterns, seed=seed)
+    checks = check_search(beside, space, search, random_patterns=random_patterns, seed=seed)
     if method.by_gradient:
-        checks = (check_gradients(measure, space, search), *checks)
+        checks = (check_gradients(beside, space, search), *checks)
     if isinstance(measure, ClosedLoopMeasure):
         checks += check_world(measure, found.pattern)
     return *checks, *of_search
@@ -295,16 +307,16 @@ def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Fl
     return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
 
 
-def _candidates(measure: Measure, search: Search, space: SearchSpace, method: Method) -> tuple[Candidate, ...]:
+def _candidates(
+    measure: Measure, search: Search, space: SearchSpace, method: Method, readings: Readings | tuple[None, None]
+) -> tuple[Candidate, ...]:
     """Every start's best, the strongest first: by what is predicted where that is known, else by its own value.
 
     Of what is predicted with small errors the least counts: where the way forks, a pattern that depends on
     a hair does not come first. A method without gradients tries every pattern for all groups; it stands for the one
     that it is best for.
     """
-    shifts, predicted = None, None
-    if isinstance(measure, RecordedMeasure):
-        shifts, predicted = measure.readings(space, search.best_unit)
+    shifts, predicted = readings
     restarts = search.best.shape[1]
     rank = search.best.cpu() if predicted is None else predicted.amin(-1)
     if predicted is not None and isinstance(measure, SpeedMeasure):

@@ -69,6 +69,10 @@ class BatchedMeasure(ABC):
     def valued(self, space: SearchSpace, unit: Points) -> Values:
         """Values of R points per group, all at once and differentiable in the points."""
 
+    @abstractmethod
+    def readings(self, space: SearchSpace, unit: Points) -> tuple[Values, Tensor | None]:
+        """Steering shift and predictions of R points per group, as a `RecordedMeasure` has them."""
+
     @property
     @abstractmethod
     def at_once(self) -> int:

@@ -9,7 +9,8 @@ import torch
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
 from roadproof.attacks.gradopt import Search, random_search
 from roadproof.attacks.groups import Group
-from roadproof.attacks.objective import Measure, RecordedMeasure
+from roadproof.attacks.objective import RecordedMeasure
+from roadproof.attacks.side_by_side import Beside
 from roadproof.checks import Check
 from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
@@ -22,7 +23,7 @@ ASIDE_M, TURNED_RAD = 1.0, 0.3
 
 
 def check_search(
-    measure: Measure, space: SearchSpace, search: Search, *, random_patterns: int, seed: int
+    measure: RecordedMeasure | Beside, space: SearchSpace, search: Search, *, random_patterns: int, seed: int
 ) -> tuple[Check, ...]:
     """Look for the usual reasons why a search disappoints.
 
@@ -72,7 +73,7 @@ def check_world(measure: ClosedLoopMeasure, pattern: Pattern) -> tuple[Check, ..
     )
 
 
-def _check_determinism(measure: Measure, space: SearchSpace, search: Search) -> Check:
+def _check_determinism(measure: RecordedMeasure | Beside, space: SearchSpace, search: Search) -> Check:
     again = measure.values(space, search.best_unit)
     drift = float((again - search.best).abs().max())
     passed = drift <= 1e-3 * max(float(search.best.abs().max()), 1e-3)
@@ -84,7 +85,7 @@ def _check_determinism(measure: Measure, space: SearchSpace, search: Search) -> 
     )
 
 
-def check_gradients(measure: RecordedMeasure, space: SearchSpace, search: Search) -> Check:
+def check_gradients(measure: RecordedMeasure | Beside, space: SearchSpace, search: Search) -> Check:
     """Check whether gradients reach the frames through the controller, at what was found and at random patterns."""
     _, gradient = measure.values_and_gradients(space, search.best_unit)
     _, at_start = measure.values_and_gradients(
@@ -132,7 +133,9 @@ def check_steps(search: Search) -> tuple[Check, ...]:
     return (Check("steps on the GPU", True, search.steps),) if search.steps else ()
 
 
-def _check_against_random(measure: Measure, space: SearchSpace, search: Search, patterns: int, seed: int) -> Check:
+def _check_against_random(
+    measure: RecordedMeasure | Beside, space: SearchSpace, search: Search, patterns: int, seed: int
+) -> Check:
     _, by_chance = random_search(measure, space, patterns=patterns, seed=seed + 1)
     found, chance = float(search.best.max()), float(by_chance.max())
     passed = found > chance

@@ -29,7 +29,7 @@ from roadproof.attacks.captured import Replay, replay_of, steps_in_words
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.groups import Points, Values
 from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
-from roadproof.attacks.side_by_side import Beside, side_by_side
+from roadproof.attacks.side_by_side import Beside, Sides
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
 from roadproof.attacks.surrogate import FIXED
 from roadproof.compositing.view import compiles_kernels
@@ -194,6 +194,8 @@ def gradopt(
     resumed = state is not None
     at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
     climbing = measure if all_digits else _for_climbing(measure)
+    views = [rung.view(climbing) for rung in rungs]
+    sides = Sides((*views, measure), running.get("pool"))
     again = checkpoint.path and checkpoint.path.with_suffix(f".again{checkpoint.path.suffix}")
     if state is None:
         state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
@@ -211,10 +213,10 @@ def gradopt(
             state |= {name: torch.cat([state[name], found], 1) for name, found in points.items()}
         if looks_back and rung.groups_compete:
             state, behind = _without_those_behind(state, behind)
-        climbed, done = rung.view(_of_groups(climbing, behind)), sum(before.iterations for before in rungs[:number])
+        climbed, done = _of_groups(views[number], behind), sum(before.iterations for before in rungs[:number])
         if climbed is not measure and (climbed is climbing or (resumed and number == at)):
             climbed.frames_evaluated = 0
-        beside = side_by_side(climbed, running.get("pool"))
+        beside = sides.of(number, climbed)
         if number > at:
             if rung.offspring:
                 state = _with_offspring(beside, space, state, rung.offspring, derived_seed(seed, 2 * 10**6 + number))
@@ -244,7 +246,7 @@ def gradopt(
     if isinstance(last, BatchedMeasure) and (last.variation is not None or climbing is not measure):
         # Every step had looks of its own, or fewer digits; results are compared in the same ones.
         last.redraw(FIXED)
-        best = last.values(space, state["best_unit"])
+        best = sides.of(len(rungs), last).values(space, state["best_unit"])
     if again is not None:
         again.unlink(missing_ok=True)
     gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
@@ -340,7 +342,7 @@ def _step(
 
 
 def random_search(
-    measure: Measure, space: SearchSpace, *, patterns: int, seed: int
+    measure: Measure | Beside, space: SearchSpace, *, patterns: int, seed: int
 ) -> tuple[Float[Tensor, "g k n"], Float[Tensor, " g"]]:
     """The best of a number of random patterns for every group: the least an attack has to beat."""
     unit = space.random((1, patterns), torch.Generator().manual_seed(seed)).to(measure.device)

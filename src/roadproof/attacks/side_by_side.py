@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, NamedTuple, TypeAlias, cast
 
 import torch
@@ -25,49 +24,67 @@ from torch import Tensor
 
 from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.groups import Group, Points, Values
-from roadproof.attacks.objective import RecordedMeasure
+from roadproof.attacks.objective import Readings, RecordedMeasure
 from roadproof.controllers.precision import is_torch_alone
 from roadproof.machine import threads
 from roadproof.processes import Pool
 from roadproof.search_space import SearchSpace
 
 
-def side_by_side(measure: RecordedMeasure, pool: Pool[Any] | None = None) -> Beside | RecordedMeasure:
-    """The measure with its groups side by side, where there are threads for that; else the measure itself.
+class Sides:
+    """Measures of one search, such as those of its rungs, whose groups are valued side by side.
 
-    A user's own code may not stand two calls at once, and a mean over new looks is drawn for all groups together: such
-    measures stay as they are, and so does a measure on another device than the processor. In processes, where there are
-    several, groups do not wait for each other as threads do.
+    Args:
+        measures: the measures; they travel to processes together, once, and what they share travels once too.
+        pool: processes to value groups in; with None, or one process, each group has a thread.
     """
-    if not isinstance(measure, BatchedMeasure) or measure.variation is not None:
-        return measure
-    free = measure.device.type == "cpu" and torch.get_num_threads() > 1
-    return Beside(measure, pool) if free and is_torch_alone(measure.controller) else measure
+
+    def __init__(self, measures: Sequence[RecordedMeasure], pool: Pool[Any] | None = None) -> None:
+        self._parts = _Parts(tuple(measures))
+        self._pool = pool if pool is not None and pool.processes > 1 else None
+
+    def of(self, number: int, measure: RecordedMeasure) -> Beside | RecordedMeasure:
+        """The measure of this number with its groups side by side, where there are threads for that; else itself.
+
+        A user's own code may not stand two calls at once, and a mean over new looks is drawn for all groups together:
+        such measures stay as they are, and so does a measure on another device than the processor. In processes, where
+        there are several, groups do not wait for each other as threads do.
+
+        Args:
+            number: number of the measure.
+            measure: that measure, or the same of some of its groups.
+        """
+        if not isinstance(measure, BatchedMeasure) or measure.variation is not None:
+            return measure
+        free = measure.device.type == "cpu" and torch.get_num_threads() > 1
+        if not free or not is_torch_alone(measure.controller):
+            return measure
+        return Beside(number, measure, self._parts, self._pool)
 
 
 class Beside:
     """A measure whose groups are valued side by side; of one group alone, two halves of its points.
 
-    Values are those of the measure but for rounding: its batches are smaller.
-
-    Args:
-        whole: the measure. What is valued here counts among its `frames_evaluated`.
-        pool: processes to value groups in; with None, or one process, each has a thread.
+    Values are those of the measure but for rounding: its batches are smaller. `Sides` makes them.
     """
 
-    def __init__(self, whole: BatchedMeasure, pool: Pool[Any] | None = None) -> None:
-        self._whole = whole
-        self._parts = [whole.of_groups([k]) for k in range(len(whole.groups))]
-        if len(self._parts) == 1:
-            self._parts.append(whole.of_groups([0]))
-        self._threads = min(len(self._parts), torch.get_num_threads())
-        self._pool = pool if pool is not None and pool.processes > 1 else None
-        self._settled = self._pool and self._pool.settle(partial(_answered_beside, self._parts))
+    def __init__(self, number: int, whole: RecordedMeasure, parts: _Parts, pool: Pool[Any] | None) -> None:
+        self._whole, self._parts, self._pool = whole, parts, pool
+        known = parts.measures[number].groups
+        self._sides = [(number, known.index(group), 0) for group in whole.groups]
+        if len(self._sides) == 1:
+            self._sides.append((*self._sides[0][:2], 1))
+        self._threads = min(len(self._sides), torch.get_num_threads())
 
     @property
     def groups(self) -> tuple[Group, ...]:
         """The groups of the measure."""
         return self._whole.groups
+
+    @property
+    def device(self) -> torch.device:
+        """The torch device on which the measure computes."""
+        return self._whole.device
 
     def values(self, space: SearchSpace, unit: Points) -> Values:
         """The values of R points per group, without gradients."""
@@ -78,50 +95,75 @@ class Beside:
         each = self._each(_climbed, space, unit)
         return self._joined(unit, [value for value, _ in each]), self._joined(unit, [slope for _, slope in each])
 
+    def readings(self, space: SearchSpace, unit: Points) -> Readings:
+        """What the measure reads of R points per group."""
+        each = self._each(_read, space, unit)
+        shifts, predicted = zip(*each, strict=True)
+        return self._joined(unit, shifts), None if predicted[0] is None else self._joined(unit, predicted)
+
     def _joined(self, unit: Tensor, parts: Sequence[Tensor]) -> Tensor:
         return torch.cat(list(parts), 0 if len(unit) > 1 else 1)
 
-    def _each(self, ask: _Ask, space: SearchSpace, unit: Tensor) -> list[tuple[Tensor, ...]]:
+    def _each(self, ask: _Ask, space: SearchSpace, unit: Tensor) -> list[tuple[Any, ...]]:
         points = cast("tuple[Tensor, ...]", unit.split(1) if len(unit) > 1 else unit.tensor_split(2, 1))
         usual = torch.get_num_threads()
         own = max(1, usual // self._threads)
-        pieces = [_Piece(number, ask, space, some, own) for number, some in enumerate(points) if some.numel()]
-        if self._pool is not None and self._settled is not None:
-            found = {piece.number: answer for piece, answer in self._pool.each(self._settled, pieces)}
+        asked = zip(self._sides, points, strict=True)
+        pieces = [_Piece(side, ask, space, some, own) for side, some in asked if some.numel()]
+        if self._pool is not None:
+            # Only here is it sent, and again where another search has worked there since.
+            settled = self._pool.settle(self._parts)
+            found = {piece.side: answer for piece, answer in self._pool.each(settled, pieces)}
+            answers = [found[side] for side in self._sides if side in found]
         else:
             try:
                 with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=(own,)) as pool:
-                    found = dict(enumerate(pool.map(partial(_answered, self._parts), pieces)))
+                    answers = list(pool.map(self._parts.answer, pieces))
             finally:
                 torch.set_num_threads(usual)
-        self._whole.frames_evaluated += sum(frames for _, frames in found.values())
-        return [found[number][0] for number in sorted(found)]
+        self._whole.frames_evaluated += sum(frames for _, frames in answers)
+        return [answer for answer, _ in answers]
 
 
-_Ask: TypeAlias = Callable[[BatchedMeasure, SearchSpace, Tensor], tuple[Tensor, ...]]
+_Ask: TypeAlias = Callable[[BatchedMeasure, SearchSpace, Tensor], tuple[Any, ...]]
 
 
 class _Piece(NamedTuple):
-    """What is asked of the group of this number, of so many points, on so many threads."""
+    """What is asked of a side, of so many points, on so many threads.
 
-    number: int
+    A side is the number of a measure, that of a group, and 1 for the second half of a group's points, else 0.
+    """
+
+    side: tuple[int, int, int]
     ask: _Ask
     space: SearchSpace
     points: Tensor
     threads: int
 
 
-def _answered(parts: Sequence[BatchedMeasure], piece: _Piece) -> tuple[tuple[Tensor, ...], int]:
-    """What a group's measure answers, and how many frames that took."""
-    part = parts[piece.number]
-    part.frames_evaluated = 0
-    return piece.ask(part, piece.space, piece.points), part.frames_evaluated
+class _Parts:
+    """Each group of some measures by itself, here or in another process."""
 
+    def __init__(self, measures: tuple[RecordedMeasure, ...]) -> None:
+        self.measures = measures
+        self._made: dict[tuple[int, int, int], BatchedMeasure] = {}
 
-def _answered_beside(parts: Sequence[BatchedMeasure], _: object, piece: _Piece) -> tuple[tuple[Tensor, ...], int]:
-    """The same in another process."""
-    with threads(piece.threads):
-        return _answered(parts, piece)
+    def __reduce__(self) -> tuple[type[_Parts], tuple[object]]:
+        return _Parts, (self.measures,)
+
+    def __call__(self, _: object, piece: _Piece) -> tuple[tuple[Any, ...], int]:
+        """What a side answers in another process, and how many frames that took."""
+        with threads(piece.threads):
+            return self.answer(piece)
+
+    def answer(self, piece: _Piece) -> tuple[tuple[Any, ...], int]:
+        """What a side answers on this thread, and how many frames that took."""
+        if piece.side not in self._made:
+            number, group, _ = piece.side
+            self._made[piece.side] = cast("BatchedMeasure", self.measures[number]).of_groups([group])
+        part = self._made[piece.side]
+        part.frames_evaluated = 0
+        return piece.ask(part, piece.space, piece.points), part.frames_evaluated
 
 
 def _valued(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> tuple[Tensor, ...]:
@@ -130,3 +172,7 @@ def _valued(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> tuple[T
 
 def _climbed(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> tuple[Tensor, ...]:
     return part.values_and_gradients(space, points)
+
+
+def _read(part: BatchedMeasure, space: SearchSpace, points: Tensor) -> Readings:
+    return part.readings(space, points)

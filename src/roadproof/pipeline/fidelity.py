@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,9 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import look_again, rollout
 from roadproof.errors import EpisodeError, RecordingError
 from roadproof.io.records import RecordFile, Saved
-from roadproof.patterns import Pattern
+from roadproof.patterns import Pattern, raster
 from roadproof.photometry import AffineResponse, ColourTransform
+from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Recording, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
@@ -88,6 +90,7 @@ def measure_fidelity(
     weather: Weather,
     clean: Episode | None = None,
     device: torch.device | str = "cpu",
+    pool: Pool[Simulator] | None = None,
 ) -> Fidelity | None:
     """Render the clean drive of a set over the real paint, compare with composites, and keep what came of it.
 
@@ -101,6 +104,7 @@ def measure_fidelity(
         weather: the weather in which the set was recorded.
         clean: the clean drive that was recorded; driven again where it is not given.
         device: torch device on which frames are composited.
+        pool: processes that are open already, one of which renders instead.
 
     Returns:
         The comparison; None where the set holds no clean drive, or one that this controller would not drive here, and
@@ -116,7 +120,9 @@ def measure_fidelity(
         clean = rollout(simulator, controller, scenario, weather=weather)
     if not is_drive_of(recorded, clean) or not _covered(pattern, recordings, recorded).any():
         return None
-    rendered = rendered_frames(simulator, scenario, clean, pattern, recorded.frame_number)
+    with open_or_here(pool, simulator) as rendering:
+        asked = partial(_rendered, scenario, clean, recorded.frame_number)
+        ((_, rendered),) = rendering.each(asked, [raster(pattern)])
     fidelity = compare_with_rendered(pattern, recordings, controller, rendered, drive=recorded.name, device=device)
     fidelity.save(folder / "fidelity.npz")
     return fidelity
@@ -193,6 +199,16 @@ def rendered_frames(
         raise RecordingError(f"frames up to {max(wanted, default=0)} are asked of a drive of {len(episode)} steps")
     frames = look_again(simulator, episode, scenario, wanted, lambda seen: seen.frame, pattern=pattern)
     return np.stack(list(frames.values()))
+
+
+def _rendered(
+    scenario: Scenario,
+    episode: Episode,
+    frame_number: Int[np.ndarray, " f"],
+    simulator: Simulator,
+    paint: PatternImage,
+) -> UInt8[np.ndarray, "f h w 3"]:
+    return rendered_frames(simulator, scenario, episode, paint, frame_number)
 
 
 def is_drive_of(recorded: Recording, episode: Episode) -> bool:

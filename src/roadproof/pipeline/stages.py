@@ -289,6 +289,7 @@ class Stages:
             weather=drives.settings.weather,
             clean=drives.drives[0].episode,
             device=self.device,
+            pool=self.pool,
         )
 
     def _folder_of(self, number: int) -> Path:
