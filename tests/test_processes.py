@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from roadproof.errors import ControllerError, TrainingError
+from roadproof.errors import ControllerError, OutputError, TrainingError
 from roadproof.processes import Pool, processes_beside, spread, stopping
 
 SCRIPT = """
@@ -200,6 +201,9 @@ def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
         assert pool.settle(settled.function) is settled
         pool.settle(Tally())
         assert not settled.file.exists(), "only the last one is kept"
+        shutil.rmtree(pool._folder.name)
+        with pytest.raises(OutputError, match="TMPDIR"):
+            pool.settle(Tally())
         with pytest.raises(ControllerError, match="a controller that travelled"):
             list(pool.each(Lost(), [1]))
     opened = {int(each.name) for each in tmp_path.iterdir()}

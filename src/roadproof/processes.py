@@ -24,7 +24,7 @@ from typing import Any, Generic, TypeAlias, TypeVar, cast
 import torch
 
 from roadproof import foreign
-from roadproof.errors import ControllerError, RoadproofError, SimulatorError
+from roadproof.errors import ControllerError, OutputError, RoadproofError, SimulatorError
 from roadproof.machine import digits, keep_digits, keep_freed_memory
 
 DIED = "a driving process died; is there memory for all of them? try with fewer processes"
@@ -104,15 +104,25 @@ class Pool(Generic[Inside]):
 
         In each round the first process gets the first piece of work, and so on. One function is settled at a time: that
         one stays where it is, and any other is forgotten.
+
+        Raises:
+            OutputError: the folder for temporary files cannot hold it.
         """
         if self.processes == 1:
             return function
         if self._settled is None or self._settled.function is not function:
             if self._settled is not None:
-                self._settled.file.unlink()
-            handle, name = tempfile.mkstemp(dir=self._folder.name)
-            with os.fdopen(handle, "wb") as file:
-                _Processor(file).dump(function)
+                self._settled.file.unlink(missing_ok=True)
+                self._settled = None
+            try:
+                handle, name = tempfile.mkstemp(dir=self._folder.name)
+                with os.fdopen(handle, "wb") as file:
+                    _Processor(file).dump(function)
+            except OSError as error:
+                raise OutputError(
+                    f"cannot write what the processes of a search need to {self._folder.name}: {error.strerror}; let "
+                    "TMPDIR be a folder with room for some hundred MB, or use one process"
+                ) from None
             self._settled = Settled(function, Path(name))
         return self._settled
 
