@@ -88,6 +88,16 @@ def test_a_dry_run_counts_the_evaluation_of_a_search_in_recordings_once(study, t
     assert answered(printed.out)["drives"] == 15 + 3 + 2 * (1 + 3), "the second job makes no drives that the first made"
 
 
+def test_jobs_of_one_scenario_are_shared_out_among_workers(study, tmp_path):
+    plan = write_plan(tmp_path, PLAN.replace('["1-b"]', "[1, 2, 3, 4]").replace("calls = 1", "calls = 100"))
+    said = []
+    for workers in (1, 4):
+        code, printed = study("run", plan, "--workers", workers, "--dry-run", "--json", "--out", tmp_path / "out")
+        assert code == 0, printed.err
+        said.append(answered(printed.out)["seconds"])
+    assert 0.2 < said[1] / said[0] < 0.35
+
+
 BLIND = """
 class Blind:
     input_size = None

@@ -7,8 +7,10 @@ import io
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +34,7 @@ from roadproof.study.job import run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
 from roadproof.study.plan import Job, TrafficPlan
 from roadproof.study.rows import CostColumns, DriveColumns, JobColumns, PaintColumns
+from roadproof.study.shared import SharedRecordings, _link
 
 COSTS = ("search_seconds", "seconds")
 GRADOPT = GradOptPlan(
@@ -147,6 +150,47 @@ def test_jobs_share_what_they_record_and_drive_over_the_bare_road(street, tmp_pa
     other = dataclasses.replace(one, seed=1)
     run_job(other, tmp_path / "work" / other.key)
     assert sum((place / "run.json").exists() for place in kept.parent.iterdir()) == 2
+    # A run that has drives of its own is given none of another's.
+    own = tmp_path / "own"
+    shutil.copytree(kept / "record", own / "record")
+    SharedRecordings(kept, ("clear-noon",)).bring(own)
+    assert [each.name for each in own.iterdir()] == ["record"]
+    # What is damaged is made again, and shared anew.
+    bare = kept.parent.glob("*/episodes/*.npz")
+    damaged = [*kept.glob("recordings/clean/*.npz"), *bare, kept / "run.json"]
+    for file in damaged:
+        content = file.read_bytes()
+        file.unlink()
+        file.write_bytes(content[: len(content) // 2])
+    third = dataclasses.replace(one, figures=3)
+    begun.clear()
+    run_job(third, tmp_path / "work" / third.key)
+    assert (len(begun), sum(begun)) == (7, 2)
+    begun.clear()
+    fourth = dataclasses.replace(one, figures=4)
+    run_job(fourth, tmp_path / "work" / fourth.key)
+    assert begun == [False] * 3
+
+
+def test_where_links_are_refused_files_are_copied_whole(tmp_path, monkeypatch):
+    def refuses(*_):
+        raise OSError("links are not permitted")
+
+    def interrupted(source, target):
+        Path(target).write_bytes(Path(source).read_bytes()[:2])
+        raise KeyboardInterrupt
+
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared" / "clear-noon-alone-clean-0123456789ab.npz").write_bytes(b"a drive")
+    monkeypatch.setattr(os, "link", refuses)
+    copy = shutil.copy2
+    monkeypatch.setattr(shutil, "copy2", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _link(tmp_path / "shared", tmp_path / "job")
+    assert not list((tmp_path / "job").iterdir())
+    monkeypatch.setattr(shutil, "copy2", copy)
+    _link(tmp_path / "shared", tmp_path / "job")
+    assert [each.read_bytes() for each in (tmp_path / "job").iterdir()] == [b"a drive"]
 
 
 @pytest.mark.slow

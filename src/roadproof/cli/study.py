@@ -83,9 +83,10 @@ def _workload(study: Study, who: Controller, workers: int) -> Workload:
         else:
             budget = budget_of(method, study.weathers[0])
             own += of_finding(budget, who)
-            recordings[repr(recorded_by(budget))] = of_recording(budget)
+            recordings[recorded_by(budget)] = of_recording(budget)
     shared = sum(recordings.values(), judging)
-    return (own.times(len(study.figures)) + shared).times(len(study.scenarios) * len(study.seeds), at_once=workers)
+    places = len(study.scenarios) * len(study.seeds)
+    return own.times(places * len(study.figures), at_once=workers) + shared.times(places, at_once=workers)
 
 
 def transfer(

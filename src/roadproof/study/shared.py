@@ -10,33 +10,34 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import roadproof
 from roadproof.controllers import Controller
-from roadproof.controllers.identity import parts_of
+from roadproof.drives import Drives
+from roadproof.driving.drive_store import Episodes
+from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
-from roadproof.errors import OutputError
-from roadproof.io.files import write_folder_atomically
+from roadproof.errors import OutputError, RoadproofError
+from roadproof.io.files import write_atomically, write_folder_atomically
 from roadproof.io.identity import digest, stated
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.stage_costs import FILE, StageCost, read_cost
-from roadproof.scenarios import identity
-from roadproof.simulators.protocol import Simulator, world_of
+from roadproof.recordings import load_recordings
+from roadproof.simulators.protocol import Simulator
 from roadproof.study.plan import Job
 
 STAGES = ("record", "calibrate")
 """Stages of a run whose folders jobs share, and what those took."""
 
 _PARTS = ("record", "calibration", "recordings")
-_CLEAN = "*-clean-*.npz"
+_CLEAN = "[!.]*-clean-*.npz"
 
 
-def recorded_by(budget: Budget) -> tuple[object, ...]:
+def recorded_by(budget: Budget) -> str:
     """What of a budget its recordings depend on."""
-    return budget.trajectories, budget.window, budget.calibration, budget.recorded_in
+    return repr((budget.trajectories, budget.window, budget.calibration, budget.recorded_in))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,23 +55,33 @@ class SharedRecordings:
     @staticmethod
     def of(job: Job, world: Simulator, controller: Controller, budget: Budget, work: Path) -> SharedRecordings:
         """Those of a job that searches with a budget."""
-        folder = _folder(job, world, controller, work, repr(recorded_by(budget)))
+        folder = _folder(job, world, controller, work, recorded_by(budget))
         return SharedRecordings(folder, tuple(map(str, budget.recorded_in)))
 
     @property
     def cost(self) -> dict[str, StageCost]:
-        """What they took, by the name of the stage; empty before they are made."""
-        return {stage: read_cost(self.folder)[stage] for stage in STAGES} if self.folder.is_dir() else {}
+        """What they took, by the name of the stage; empty before they are made, and where nobody can say any more."""
+        with suppress(RoadproofError):
+            return {stage: cost for stage, cost in read_cost(self.folder).items() if stage in STAGES}
+        return {}
 
     def bring(self, run: Path) -> None:
-        """Give a run what it has not begun to make.
+        """Give a run what it has not begun to record; what is damaged is removed, for the next run to make again.
 
         Raises:
             OutputError: the run's folder cannot be written.
         """
-        for part in self._parts:
-            if (self.folder / part).is_dir() and not (run / part).exists():
-                write_folder_atomically(run / part, lambda place, part=part: _link(self.folder / part, place))
+        wanted = [place for place in self._places if not (run / place / "record").exists()]
+        if not wanted or not self.folder.is_dir():
+            return
+        if not self._is_whole():
+            shutil.rmtree(self.folder, ignore_errors=True)
+            return
+        for place in wanted:
+            # Drives last: a run that has drives has begun, and calibrates them itself.
+            for part in (place / name for name in reversed(_PARTS)):
+                if not (run / part).exists():
+                    write_folder_atomically(run / part, lambda target, part=part: _link(self.folder / part, target))
 
     def keep(self, run: Path) -> None:
         """Keep what a finished run made, where nobody has yet.
@@ -80,7 +91,7 @@ class SharedRecordings:
         """
 
         def fill(place: Path) -> None:
-            for part in self._parts:
+            for part in (each / name for each in self._places for name in _PARTS):
                 _link(run / part, place / part)
             shutil.copy(run / FILE, place / FILE)
 
@@ -93,13 +104,27 @@ class SharedRecordings:
                 raise
 
     @property
-    def _parts(self) -> tuple[Path, ...]:
-        places = (Path(), *map(Path, self.weathers[1:]))
-        return tuple(place / name for place in places for name in _PARTS)
+    def _places(self) -> tuple[Path, ...]:
+        return Path(), *map(Path, self.weathers[1:])
+
+    def _is_whole(self) -> bool:
+        try:
+            for place in self._places:
+                Drives.load(self.folder / place / "record")
+                load_recordings(self.folder / place / "recordings")
+        except RoadproofError:
+            return False
+        return bool(self.cost)
 
 
 def bring_bare_drives(shared: Path, evaluation: Path) -> None:
-    """Give an evaluation the drives over the bare road that others have made."""
+    """Give an evaluation the drives over the bare road that others have made, but none that is damaged."""
+    for file in shared.glob(_CLEAN):
+        if not (evaluation / "episodes" / file.name).exists():
+            try:
+                Episode.load(file)
+            except RoadproofError:
+                file.unlink(missing_ok=True)
     _link(shared, evaluation / "episodes")
 
 
@@ -118,16 +143,10 @@ def bare_drives(job: Job, world: Simulator, controller: Controller, work: Path) 
 
 
 def _folder(job: Job, world: Simulator, controller: Controller, work: Path, asked: str) -> Path:
-    size = world.input.height_px, world.input.width_px
-    parts: dict[str, Any] = {
-        "version": roadproof.__version__,
-        "scenario": identity(job.scenario),
-        "controller": [job.controller, parts_of(controller, size)],
-        "world": [job.simulator, world.paint, world_of(world)],
-        "seed": job.seed,
-        "asked": asked,
-    }
-    return work / "shared" / digest(stated(parts))[:16]
+    # What a drive depends on is for the store of drives to say.
+    parts = Episodes.of(world, controller, job.scenario, {}, work).parts
+    told = {"drives": parts, "simulator": job.simulator, "controller": job.controller, "seed": job.seed, "asked": asked}
+    return work / "shared" / digest(stated(told))[:16]
 
 
 def _link(source: Path, target: Path, pattern: str = "**/*") -> None:
@@ -141,4 +160,4 @@ def _link(source: Path, target: Path, pattern: str = "**/*") -> None:
             except FileExistsError:
                 pass
             except OSError:
-                shutil.copy2(file, place)
+                write_atomically(place, lambda part, file=file: shutil.copy2(file, part))
