@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--figures", type=int, default=5)
     parser.add_argument("--objective", choices=list(OBJECTIVES), default="steering")
-    parser.add_argument("--digits", default="few", help="few, all, or both after a comma")
+    parser.add_argument("--digits", choices=("few", "all", "few,all"), default="few")
     parser.add_argument("--one-rung", action="store_true", help="the paper's 250 steps from random starts")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--random-patterns", type=int, default=500, help="of the random search, 0 for none")

@@ -43,11 +43,7 @@ class Settled(Generic[Inside, Work, Result]):
     """A function that the processes of a pool read from a file when they are first asked."""
 
     function: Callable[[Inside, Work], Result]
-    file: Path
-
-    def __call__(self, inside: Inside, work: Work) -> Result:
-        """What the function answers."""
-        return self.function(inside, work)
+    file: Path | None
 
 
 class Pool(Generic[Inside]):
@@ -99,7 +95,7 @@ class Pool(Generic[Inside]):
             for process in self._beside:
                 process.submit(_inside)
 
-    def settle(self, function: Callable[[Inside, Work], Result]) -> Callable[[Inside, Work], Result]:
+    def settle(self, function: Callable[[Inside, Work], Result]) -> Settled[Inside, Work, Result]:
         """The same function for `each`, which then sends it to a process once for however many rounds of work.
 
         In each round the first process gets the first piece of work, and so on. One function is settled at a time: that
@@ -109,11 +105,8 @@ class Pool(Generic[Inside]):
             OutputError: the folder for temporary files cannot hold it.
         """
         if self.processes == 1:
-            return function
+            return Settled(function, None)
         if self._settled is None or self._settled.function is not function:
-            if self._settled is not None:
-                self._settled.file.unlink(missing_ok=True)
-                self._settled = None
             try:
                 handle, name = tempfile.mkstemp(dir=self._folder.name)
                 with os.fdopen(handle, "wb") as file:
@@ -123,10 +116,14 @@ class Pool(Generic[Inside]):
                     f"cannot write what the processes of a search need to {self._folder.name}: {error.strerror}; let "
                     "TMPDIR be a folder with room for some hundred MB, or use one process"
                 ) from None
-            self._settled = Settled(function, Path(name))
+            before, self._settled = self._settled, Settled(function, Path(name))
+            if before is not None and before.file is not None:
+                before.file.unlink(missing_ok=True)
         return self._settled
 
-    def each(self, function: Callable[[Inside, Work], Result], works: Sequence[Work]) -> Iterator[tuple[Work, Result]]:
+    def each(
+        self, function: Callable[[Inside, Work], Result] | Settled[Inside, Work, Result], works: Sequence[Work]
+    ) -> Iterator[tuple[Work, Result]]:
         """Call a function for every piece of work.
 
         Args:
@@ -142,15 +139,17 @@ class Pool(Generic[Inside]):
         Raises:
             SimulatorError: a process died.
         """
+        known = isinstance(function, Settled)
+        settled = cast("Settled[Inside, Work, Result]", function) if known else Settled(function, None)
+        asked, file = settled.function, settled.file
         if self.processes == 1:
             for work in works:
-                yield work, function(self._here, work)
+                yield work, asked(self._here, work)
             return
-        settled = _settled_in(function)
-        call = partial(_call, settled or _pickled_for_the_processor(function))
+        call = partial(_call, file or _pickled_for_the_processor(asked))
         left = deque(works)
         try:
-            free = self._beside if settled is None else self._beside * -(-len(works) // self.processes)
+            free = self._beside if file is None else self._beside * -(-len(works) // self.processes)
             waiting = {process.submit(call, work): (process, work) for process, work in _paired(free, left)}
             while waiting:
                 done, _ = wait(waiting, return_when=FIRST_COMPLETED)
@@ -256,10 +255,6 @@ class _Processor(pickle.Pickler):
 def _paired(processes: Sequence[ProcessPoolExecutor], works: deque[Work]) -> list[tuple[ProcessPoolExecutor, Work]]:
     """Processes with a piece of work each, taken from those that are left."""
     return [(process, works.popleft()) for process in processes[: len(works)]]
-
-
-def _settled_in(function: object) -> Path | None:
-    return cast("Settled[Any, Any, Any]", function).file if isinstance(function, Settled) else None
 
 
 def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:

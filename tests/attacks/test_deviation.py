@@ -237,12 +237,15 @@ def test_where_nothing_is_found_the_first_rungs_are_climbed_once_more(road, tmp_
         return gradopt(measure, SPACE, (*first, Rung(2, 1, needs=needs)), seed=0, **running)
 
     found = search(NEVER)
-    assert seen == [1, 2, 3, 4, 1, 2, 3, 4, 5]
+    assert seen == [1, 2, 3, 4, 4, 4, 4, 4, 5], "what is climbed once more counts no further"
     other = gradopt(measure, SPACE, first, seed=derived_seed(0, 3 * 10**6))
     once = gradopt(measure, SPACE, first, seed=0)
     points = torch.cat([once.best_unit, other.best_unit], 1)
     best = torch.cat([once.best, other.best], 1).topk(2, 1).indices
     assert torch.equal(found.best_unit, points[torch.arange(2)[:, None], best]), "the best of both go on"
+    # So do they where the next rung would go on from the same starts.
+    rungs = (Rung(2, 1, every=4), Rung(2, 1, learning_rate=0.01, every=4, needs=NEVER))
+    assert gradopt(measure, SPACE, rungs, seed=0).best.shape == (2, 2)
     # Where something is found nothing is climbed again.
     seen.clear()
     search(float(once.best.max()))
@@ -260,7 +263,7 @@ def test_where_nothing_is_found_the_first_rungs_are_climbed_once_more(road, tmp_
         search(NEVER, checkpoint=stopped, on_step=interrupt)
     seen.clear()
     gone_on = search(NEVER, checkpoint=stopped)
-    assert seen == [3, 4, 5]
+    assert seen == [4, 4, 5]
     assert torch.equal(gone_on.best_unit, found.best_unit)
     assert [each.name for each in tmp_path.iterdir()] == [stopped.name]
 

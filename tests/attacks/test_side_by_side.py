@@ -11,6 +11,7 @@ from roadproof.attacks import PathDeviation, SteeringShift
 from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.attacks.side_by_side import Beside, Sides
+from roadproof.attacks.surrogate import Surrogate
 from roadproof.compositing.variation import Variation
 from roadproof.controllers import pilotnet_controller
 from roadproof.errors import ControllerError
@@ -116,6 +117,36 @@ def test_a_users_code_a_mean_over_looks_and_one_thread_stay_as_they_are(road, ne
     torch.set_num_threads(1)
     measure = measured(SteeringShift(), road, network)
     assert side_by_side(measure) is measure
+
+
+class Twice(Surrogate):
+    """A user's own measure, made from one of roadproof's."""
+
+    def valued(self, space, unit):
+        return 2 * super().valued(space, unit)
+
+
+def test_a_measure_derived_from_ours_is_neither_split_nor_had_with_fewer_digits(
+    road, network, two_threads, monkeypatch
+):
+    monkeypatch.setattr("roadproof.controllers.precision.multiplies_bfloat16", lambda _: True)
+    derived, usual = Twice(road, network, BOTH), measured(SteeringShift(), road, network)
+    sides = Sides((derived, usual))
+    assert sides.of(0, derived) is derived
+    assert sides.of(1, usual) is usual, "they would travel together"
+    found, whole = (
+        gradopt(derived, SPACE, (Rung(1, 2),), seed=0, all_digits=all_digits) for all_digits in (False, True)
+    )
+    assert torch.equal(found.history, whole.history)
+
+
+def test_only_the_rung_that_is_climbed_keeps_its_frames(road, network, two_threads):
+    measure = measured(SteeringShift(), road, network)
+    sides = Sides((measure.thinned(2), measure))
+    unit = SPACE.random((2, 1), torch.Generator().manual_seed(1))
+    for number, each in enumerate((measure.thinned(2), measure)):
+        sides.of(number, each).values(SPACE, unit)
+        assert {side[0] for side in sides._parts._made} == {number}
 
 
 def test_an_error_in_one_group_is_raised_and_leaves_the_threads_as_they_were(road, network, two_threads, monkeypatch):

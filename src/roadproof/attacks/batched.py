@@ -45,6 +45,11 @@ class BatchedMeasure(ABC):
     variation: Variation | None
     frames_evaluated: int
 
+    @property
+    def is_derived(self) -> bool:
+        """Whether a user has derived it from one of roadproof's own, so that little is known of what it does."""
+        return not type(self).__module__.startswith("roadproof.")
+
     @abstractmethod
     def of_groups(self: MeasureT, kept: Sequence[int]) -> MeasureT:
         """The same measure for some of its groups alone; its frames are counted from nought."""

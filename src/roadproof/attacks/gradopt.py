@@ -54,7 +54,8 @@ class Rung:
         screened: how many of the random starts of every group are the best of `DRAWN` that are valued first.
         offspring: how many children of the rung before's best points compete with these for the places of this one.
         needs: value that the best start must have reached before this rung, unless the measure is a user's own. Where
-            none has, the rungs before are climbed once more from other points, and the best of both go on.
+            none has, the rungs before are climbed once more from other points, and the best of both go on. In none of
+            these may groups compete.
 
     Raises:
         RoadproofError: `starts`, `iterations`, `learning_rate` or `every` is not positive.
@@ -140,9 +141,11 @@ class Running(TypedDict, total=False):
         seed: seed of everything random; required.
         starts: points to begin at, one tensor (S, K, N) per group; random points fill the remaining starts.
         checkpoint: file that keeps the search after every step and from which the same search goes on; None for none.
+            One of its name with ".again" before the ending lies beside it while a search is begun once more.
         objective: what is made large; its name stands in the checkpoint, where a search for another is refused.
-        on_step: called after every step with its number and the best value so far. On a GPU some steps are taken
-            together (`captured.LOOK_S`); then the file is written, and this called, after the last of them.
+        on_step: called after every step with its number and the best value so far; the number stays while a search is
+            begun once more. On a GPU some steps are taken together (`captured.LOOK_S`); then the file is written, and
+            this called, after the last of them.
         pool: processes in which groups are valued side by side; None has threads do it.
     """
 
@@ -185,43 +188,80 @@ def gradopt(
     References:
         Eqs. tloss and composite; "Computing Adversarial Perturbations" of the paper.
     """
+    climbing = measure if all_digits else _for_climbing(measure)
+    views = tuple(rung.view(climbing) for rung in rungs)
+    climb = _Climb(measure, climbing, views, Sides((*views, measure), running.get("pool")), space, momentum, Counter())
+    state, behind = _climbed(climb, rungs, **running)
+    best, last = state["best"], _of_groups(measure, behind)
+    if isinstance(last, BatchedMeasure) and (last.variation is not None or climbing is not measure):
+        # Every step had looks of its own, or fewer digits; results are compared in the same ones.
+        last.redraw(FIXED)
+        best = climb.sides.of(len(rungs), last).values(space, state["best_unit"])
+    gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
+    kernels = measure.device.type == "cpu" or compiles_kernels(measure.device)
+    steps = steps_in_words(climb.run, kernels=kernels)
+    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Climb:
+    """What is climbed: the measure, the same of the network to climb with, and its view from each rung.
+
+    `run` counts how steps were run.
+    """
+
+    measure: RecordedMeasure
+    climbing: RecordedMeasure
+    views: tuple[RecordedMeasure, ...]
+    sides: Sides
+    space: SearchSpace
+    momentum: float
+    run: Counter[str | None]
+
+
+def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[State, Float[Tensor, " g"]]:
+    """The state after these rungs, and the best value of each group that has given way by then, else NaN."""
+    measure, climbing, space, momentum = climb.measure, climb.climbing, climb.space, climb.momentum
     seed, starts = running["seed"], running.get("starts", ())
     on_step = running.get("on_step", lambda _iteration, _best: None)
     given = [cast("list[object]", points.tolist()) for points in starts]
     identity = repr((space, rungs, momentum, seed, given, measure.fingerprint()))
+    # Values of few digits are no other's.
+    identity += "" if climbing is measure else " in few digits"
     checkpoint = Checkpoint(running.get("checkpoint"), identity, aim_of(running))
     state = checkpoint.load(measure.device)
     resumed = state is not None
-    at, behind, run = 0, torch.full((len(measure.groups),), torch.nan), Counter[str | None]()
-    climbing = measure if all_digits else _for_climbing(measure)
-    views = [rung.view(climbing) for rung in rungs]
-    sides = Sides((*views, measure), running.get("pool"))
+    at, behind = 0, torch.full((len(measure.groups),), torch.nan)
     again = checkpoint.path and checkpoint.path.with_suffix(f".again{checkpoint.path.suffix}")
     if state is None:
+        if again is not None:
+            again.unlink(missing_ok=True)
         state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
         at, behind = int(state.pop("rung")), state.pop("behind").cpu()
         # The clean frames that measures count when they are made again are among them.
         measure.frames_evaluated = int(state.pop("frames"))
     for number in range(at, len(rungs)):
-        rung = rungs[number]
+        rung, done = rungs[number], sum(before.iterations for before in rungs[:number])
         looks_back = number > at and isinstance(measure, BatchedMeasure)
-        if looks_back and float(state["best"].max()) < rung.needs:
-            before = running | {"seed": derived_seed(seed, 3 * 10**6), "starts": (), "checkpoint": again}
-            other = gradopt(measure, space, rungs[:number], momentum=momentum, all_digits=all_digits, **before)
-            points = {"best_unit": other.best_unit, "best": other.best}
-            state |= {name: torch.cat([state[name], found], 1) for name, found in points.items()}
+        goes_on = number > at and rung.goes_on(rungs[number - 1])
+        if looks_back and (best := float(state["best"].max())) < rung.needs:
+            apart: Running = {"seed": derived_seed(seed, 3 * 10**6), "starts": (), "checkpoint": again}
+            apart["on_step"] = _standing_at(done, best, on_step)
+            other, _ = _climbed(climb, rungs[:number], **{**running, **apart})
+            state |= {name: torch.cat([state[name], other[name]], 1) for name in ("best_unit", "best")}
+            goes_on = False
         if looks_back and rung.groups_compete:
             state, behind = _without_those_behind(state, behind)
-        climbed, done = _of_groups(views[number], behind), sum(before.iterations for before in rungs[:number])
+        climbed = _of_groups(climb.views[number], behind)
         if climbed is not measure and (climbed is climbing or (resumed and number == at)):
             climbed.frames_evaluated = 0
-        beside = sides.of(number, climbed)
+        beside = climb.sides.of(number, climbed)
         if number > at:
             if rung.offspring:
                 state = _with_offspring(beside, space, state, rung.offspring, derived_seed(seed, 2 * 10**6 + number))
             places = rung.starts * len(measure.groups) // len(state["best"])
-            state = _next_rung(state, space, rungs[number - 1], rung, places, derived_seed(seed, number))
+            state = _next_rung(state, space, places, derived_seed(seed, number), goes_on=goes_on)
         free = rung.starts - (0 if number else max(map(len, starts), default=0))
         if min(rung.screened, free) > 0 and not int(state["done"]):
             # Far from the numbers of other draws.
@@ -229,7 +269,7 @@ def gradopt(
             state["unit"] = _screened(beside, space, state["unit"], min(rung.screened, free), own)
         adam = {"learning_rate": rung.learning_rate, "momentum": momentum}
         replay = replay_of(climbed, space, iterations=rung.iterations, state=state, **adam)
-        run["" if isinstance(replay, Replay) else replay] += rung.iterations - int(state["done"])
+        climb.run["" if isinstance(replay, Replay) else replay] += rung.iterations - int(state["done"])
         while int(state["done"]) < rung.iterations:
             if isinstance(climbed, BatchedMeasure):
                 climbed.redraw(derived_seed(seed, 1 + done + int(state["done"])))
@@ -242,17 +282,14 @@ def gradopt(
         del replay
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
-    best, last = state["best"], _of_groups(measure, behind)
-    if isinstance(last, BatchedMeasure) and (last.variation is not None or climbing is not measure):
-        # Every step had looks of its own, or fewer digits; results are compared in the same ones.
-        last.redraw(FIXED)
-        best = sides.of(len(rungs), last).values(space, state["best_unit"])
     if again is not None:
         again.unlink(missing_ok=True)
-    gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
-    kernels = measure.device.type == "cpu" or compiles_kernels(measure.device)
-    steps = steps_in_words(run, kernels=kernels)
-    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps)
+    return state, behind
+
+
+def _standing_at(number: int, best: float, on_step: Callable[[int, float], object]) -> Callable[[int, float], object]:
+    """What is told of steps that are taken once more: they count no further."""
+    return lambda _, value: on_step(number, max(best, value))
 
 
 def _starts(
@@ -279,7 +316,7 @@ def _at(unit: Points, index: Int64[Tensor, "g i"]) -> Float[Tensor, "g i k n"]:
 
 def _for_climbing(measure: RecordedMeasure) -> RecordedMeasure:
     """The measure of the network to climb with, which may be the measure itself."""
-    if not isinstance(measure, BatchedMeasure):
+    if not isinstance(measure, BatchedMeasure) or measure.is_derived:
         return measure
     network = for_climbing(measure.controller, measure.device)
     return measure if network is measure.controller else measure.of_controller(network)
@@ -322,9 +359,9 @@ def _with_offspring(
     return {"best_unit": unit, "best": measure.values(space, unit)}
 
 
-def _next_rung(state: State, space: SearchSpace, before: Rung, rung: Rung, places: int, seed: int) -> State:
+def _next_rung(state: State, space: SearchSpace, places: int, seed: int, *, goes_on: bool) -> State:
     """State of the next rung, begun at the best points of every group; random points fill the remaining places."""
-    if rung.goes_on(before):
+    if goes_on:
         return {name: state[name] for name in ("best_unit", "best", "history")} | begun(state["best_unit"])
     unit = _at(state["best_unit"], state["best"].topk(min(places, state["best"].shape[1]), 1).indices)
     drawn = space.random((len(unit), places - unit.shape[1]), torch.Generator().manual_seed(seed))

@@ -23,7 +23,7 @@ class Method:
     by_gradient: ClassVar[bool] = True
 
     def steps(self, objective: Objective, /) -> int:
-        """How often `on_step` is called during a search for an objective."""
+        """Number of the last step of a search for an objective."""
         raise NotImplementedError
 
     def groups(self, recordings: RecordingSet, objective: Objective | None = None) -> tuple[Group, ...]:

@@ -41,20 +41,21 @@ class Sides:
 
     def __init__(self, measures: Sequence[RecordedMeasure], pool: Pool[Any] | None = None) -> None:
         self._parts = _Parts(tuple(measures))
+        self._of_a_user = any(not isinstance(each, BatchedMeasure) or each.is_derived for each in measures)
         self._pool = pool if pool is not None and pool.processes > 1 else None
 
     def of(self, number: int, measure: RecordedMeasure) -> Beside | RecordedMeasure:
         """The measure of this number with its groups side by side, where there are threads for that; else itself.
 
-        A user's own code may not stand two calls at once, and a mean over new looks is drawn for all groups together:
-        such measures stay as they are, and so does a measure on another device than the processor. In processes, where
-        there are several, groups do not wait for each other as threads do.
+        A user's own controller or measure may not stand two calls at once, and a mean over new looks is drawn for all
+        groups together: such measures stay as they are, and so does a measure on another device than the processor. In
+        processes, where there are several, groups do not wait for each other as threads do.
 
         Args:
             number: number of the measure.
             measure: that measure, or the same of some of its groups.
         """
-        if not isinstance(measure, BatchedMeasure) or measure.variation is not None:
+        if not isinstance(measure, BatchedMeasure) or self._of_a_user or measure.variation is not None:
             return measure
         free = measure.device.type == "cpu" and torch.get_num_threads() > 1
         if not free or not is_torch_alone(measure.controller):
@@ -160,6 +161,9 @@ class _Parts:
         """What a side answers on this thread, and how many frames that took."""
         if piece.side not in self._made:
             number, group, _ = piece.side
+            for other in list(self._made):  # the frames of rungs that are done
+                if other[0] != number:
+                    self._made.pop(other, None)
             self._made[piece.side] = cast("BatchedMeasure", self.measures[number]).of_groups([group])
         part = self._made[piece.side]
         part.frames_evaluated = 0

@@ -78,14 +78,7 @@ class Surrogate(BatchedMeasure):
         self.views = [_view(recordings, members, device) for members in drives]
         self._speed = [_joined([drive.speed_mps for drive in members], device, torch.float32) for members in drives]
         self._command = [_joined([drive.command for drive in members], device, torch.int64) for members in drives]
-        with torch.no_grad():
-            self.clean_steer = [
-                self._steer(view.clean_frames, speed, command)
-                for view, speed, command in zip(self.views, self._speed, self._command, strict=True)
-            ]
-        self._clean_looked = self.clean_steer
-        if variation is not None:
-            self.redraw(FIXED)
+        self.show_clean()
 
     @property
     def device(self) -> torch.device:
@@ -96,13 +89,16 @@ class Surrogate(BatchedMeasure):
         """The surrogate on every n-th frame of each drive, or on all where none of those shows the canvas."""
         few = replace(self.recordings, recordings=tuple(r.thinned(every) for r in self.recordings.recordings))
         try:
-            return self._on(few, self.controller)
+            return type(self)(few, self.controller, self.groups, device=self.device, variation=self.variation)
         except GeometryError:
             return self
 
     def of_controller(self, controller: Controller) -> Surrogate:
         """The surrogate of a controller with the same answers up to rounding."""
-        return self._on(self.recordings, controller)
+        other = copy.copy(self)
+        vars(other).update(controller=controller, frames_evaluated=0, _kept={})
+        other.show_clean()
+        return other
 
     def of_groups(self, kept: Sequence[int]) -> Surrogate:
         """The surrogate of some of its groups alone."""
@@ -201,8 +197,15 @@ class Surrogate(BatchedMeasure):
             which = stated(known_by(self.controller))
         return digest(repr((self.groups, self.variation)), self.recordings.digest(), which, *steer)
 
-    def _on(self, recordings: RecordingSet, controller: Controller) -> Surrogate:
-        return type(self)(recordings, controller, self.groups, device=self.device, variation=self.variation)
+    def show_clean(self) -> None:
+        """Learn what the controller answers to the frames without paint."""
+        with torch.no_grad():
+            self.clean_steer = [
+                self._steer(view.clean_frames, speed, command)
+                for view, speed, command in zip(self.views, self._speed, self._command, strict=True)
+            ]
+        self._clean_looked = self.clean_steer
+        self.redraw(FIXED)
 
     def _compositor(self, copies: int) -> Compositor:
         # Batches of a search are of one size, or two: the frames are kept until another size comes, and for good where
