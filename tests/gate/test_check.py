@@ -197,6 +197,15 @@ def test_a_controller_worse_than_the_reference_fails(accepted, failed, tmp_path)
     shutil.copytree(accepted.reference.parents[2] / "accepted/drives", tmp_path / "same/drives")
     same = run_check(accepted, MagentaShy(gain=0.5), tmp_path / "same")
     assert (same.status, same.compared) == (Status.PASSED, True)
+    # A pattern that the reference lacks is judged by a limit, or not at all.
+    fewer = CHECK_FILE.content(accepted.reference)
+    fewer["cases"] = [case for case in fewer["cases"] if case["name"] != "magenta"]
+    accepted.reference.with_name("fewer.json").write_text(json.dumps(fewer))
+    added = replace(accepted, reference=accepted.reference.with_name("fewer.json"))
+    assert run_check(added, MagentaShy(gain=0.5), tmp_path / "same").status is Status.PASSED
+    unlimited = replace(added, limits={**added.limits, Kind.STORED: {}})
+    (new,) = run_check(unlimited, MagentaShy(gain=0.5), tmp_path / "same").not_passed
+    assert (new.name, new.reasons[0].partition(":")[0]) == ("magenta", "nothing judges it")
     shutil.copytree(failed[0] / "drives", tmp_path / "worse/drives")
     worse = run_check(accepted, magenta_shy(), tmp_path / "worse")
     assert [case.name for case in worse.not_passed] == ["magenta"]

@@ -51,6 +51,7 @@ def test_the_least_number_of_drives_is_the_first_that_can_pass(limit):
 def test_a_share_of_zero_is_met_by_the_drives_made():
     assert least_drives("left_lane", 0.0) == 1
     assert judge({"left_lane": share_95(0, 6)}, {"left_lane": 0.0}, {}, None)[0] is Status.PASSED
+    assert judge({"left_lane": share_95(0, 6)}, {"left_lane": 0.0}, {}, None, is_new=True)[0] is Status.PASSED
     assert judge({"left_lane": share_95(1, 6)}, {"left_lane": 0.0}, {}, None)[0] is Status.FAILED
 
 
@@ -85,6 +86,9 @@ def test_a_change_fails_where_it_exceeds_both(before, now, fails):
     assert status is (Status.FAILED if fails else Status.PASSED)
     assert not fails or f"was {before:.2f} m in the reference" in reasons[0]
     assert judge(measures, {}, {"deviation_m": change}, None)[0] is Status.PASSED
+    status, reasons = judge(measures, {}, {"deviation_m": change}, None, is_new=True)
+    assert status is Status.FAILED
+    assert "nothing judges it" in reasons[0]
 
 
 def test_a_case_without_drives_does_not_pass():

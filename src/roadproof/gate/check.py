@@ -184,7 +184,9 @@ class _Check:
         measures = measures_of(kind, drives)
         stored = self.before.get(key)
         left_out = sum(len(paint.drives) for paint in paints) - len(drives) if paints else 0
-        status, reasons = judge(measures, plan.limits[kind], plan.change, stored and stored.measures, left_out)
+        is_new = bool(self.before) and stored is None
+        against = stored and stored.measures
+        status, reasons = judge(measures, plan.limits[kind], plan.change, against, left_out, is_new=is_new)
         # Where there is none over paint, the drives past the bare road are to be seen.
         shown = paints or stretch.paints
         worst = worst_of(drives) or JudgedDrive(seed=shown[0].drives[0][0], start=NOMINAL, wrong="", clean="")

@@ -103,6 +103,8 @@ def judge(
     changes: Mapping[str, Change],
     before: Measures | None,
     left_out: int = 0,
+    *,
+    is_new: bool = False,
 ) -> tuple[Status, tuple[str, ...]]:
     """Whether a case passes, and why not.
 
@@ -112,11 +114,17 @@ def judge(
         changes: how much worse than the reference each measure may be, by measure.
         before: the reference's measures; None where nothing is compared.
         left_out: how many drives over paint were not made, since the same drive on the bare road did not go well.
+        is_new: whether there is a reference, and it lacks the case; without a limit nothing would judge it then.
     """
     if not measures:
         return Status.TOO_FEW, ("too few drives: on the bare road none went well, so there is none to compare with",)
     failed: list[str] = []
     undecided = [f"too few drives: {left_out} had no good drive on the bare road to compare with"] if left_out else []
+    if is_new and not limits:
+        failed.append(
+            "nothing judges it: it has no limit, and the reference lacks it; give it one, or make the reference again "
+            "with --accept"
+        )
     for name, limit in limits.items():
         found = measures[name]
         if found.value > limit:
