@@ -358,7 +358,7 @@ def test_without_gradients_a_pattern_stands_for_the_group_that_it_is_best_for(ro
     assert all(each.surrogate_shift > 0 for each in found.candidates)
 
 
-def test_what_is_found_with_fewer_digits_is_valued_with_all(road, monkeypatch):
+def test_what_is_found_with_fewer_digits_is_valued_with_all(road, monkeypatch, tmp_path):
     monkeypatch.setattr("roadproof.controllers.precision.multiplies_bfloat16", lambda _: True)
     controller = pilotnet_controller(seed=0).eval().requires_grad_(False)
     measure = GOAL.measure(road, controller, (RIGHT_GROUP, LEFT_GROUP), device="cpu")
@@ -366,6 +366,13 @@ def test_what_is_found_with_fewer_digits_is_valued_with_all(road, monkeypatch):
     found = gradopt(measure, SPACE, rungs, seed=0)
     assert torch.equal(found.best, measure.values(SPACE, found.best_unit))
     whole = gradopt(measure, SPACE, rungs, seed=0, all_digits=True)
+    # Begun with few digits and gone on with where there are none of these: from the beginning, with all of them.
+    kept, steps = tmp_path / "search.safetensors", list[int]()
+    gradopt(measure, SPACE, rungs, seed=0, checkpoint=kept)
+    monkeypatch.setattr("roadproof.controllers.precision.multiplies_bfloat16", lambda _: False)
+    other = gradopt(measure, SPACE, rungs, seed=0, checkpoint=kept, on_step=lambda step, _: steps.append(step))
+    assert steps == [1, 2, 3, 4]
+    assert torch.equal(other.best, whole.best)
     assert not torch.equal(found.history, whole.history)
     assert torch.allclose(found.history[0], whole.history[0], rtol=0.1, atol=1e-3)
 

@@ -165,8 +165,8 @@ class ClosedLoopMeasure(BatchedMeasure):
         """What is predicted in one world with small errors; the drives over the bare road are made once."""
         # `readings` draws the same looks each time.
         number = self.worlds.index(world)
-        if number not in self._unsure:
-            with torch.no_grad():
+        with _ONCE, torch.no_grad():
+            if number not in self._unsure:
                 self._unsure[number] = world.roll(self.controller, starts=UNSURE, looks=looks)
         return world.predict(self.controller, patterns, UNSURE, looks, self._unsure[number])
 

@@ -70,12 +70,8 @@ class Beside:
     """
 
     def __init__(self, number: int, whole: RecordedMeasure, parts: _Parts, pool: Pool[Any] | None) -> None:
-        self._whole, self._parts, self._pool = whole, parts, pool
-        known = parts.measures[number].groups
-        self._sides = [(number, known.index(group), 0) for group in whole.groups]
-        if len(self._sides) == 1:
-            self._sides.append((*self._sides[0][:2], 1))
-        self._threads = min(len(self._sides), torch.get_num_threads())
+        self._number, self._whole, self._parts, self._pool = number, whole, parts, pool
+        self._threads = min(max(2, len(whole.groups)), torch.get_num_threads())
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -106,16 +102,14 @@ class Beside:
         return torch.cat(list(parts), 0 if len(unit) > 1 else 1)
 
     def _each(self, ask: _Ask, space: SearchSpace, unit: Tensor) -> list[tuple[Any, ...]]:
-        points = cast("tuple[Tensor, ...]", unit.split(1) if len(unit) > 1 else unit.tensor_split(2, 1))
         usual = torch.get_num_threads()
         own = max(1, usual // self._threads)
-        asked = zip(self._sides, points, strict=True)
-        pieces = [_Piece(side, ask, space, some, own) for side, some in asked if some.numel()]
+        pieces = [_Piece(side, ask, space, points, own) for side, points in self._shared_out(unit)]
         if self._pool is not None:
             # Only here is it sent, and again where another search has worked there since.
             settled = self._pool.settle(self._parts)
             found = {piece.side: answer for piece, answer in self._pool.each(settled, pieces)}
-            answers = [found[side] for side in self._sides if side in found]
+            answers = [found[piece.side] for piece in pieces]
         else:
             try:
                 with ThreadPoolExecutor(self._threads, initializer=torch.set_num_threads, initargs=(own,)) as pool:
@@ -125,17 +119,25 @@ class Beside:
         self._whole.frames_evaluated += sum(frames for _, frames in answers)
         return [answer for answer, _ in answers]
 
+    def _shared_out(self, unit: Tensor) -> list[tuple[_Side, Tensor]]:
+        """The points of each side."""
+        known = self._parts.measures[self._number].groups
+        groups = [known.index(group) for group in self.groups]
+        parts = cast("tuple[Tensor, ...]", unit.split(1) if len(groups) > 1 else unit.tensor_split(2, 1))
+        sides = [(self._number, groups[k % len(groups)], k // len(groups)) for k in range(len(parts))]
+        return [(side, part) for side, part in zip(sides, parts, strict=True) if part.numel()]
+
+
+_Side: TypeAlias = tuple[int, int, int]
+"""Number of a measure, that of a group, and 1 for the second half of a group's points, else 0."""
 
 _Ask: TypeAlias = Callable[[BatchedMeasure, SearchSpace, Tensor], tuple[Any, ...]]
 
 
 class _Piece(NamedTuple):
-    """What is asked of a side, of so many points, on so many threads.
+    """What is asked of a side, of so many points, on so many threads."""
 
-    A side is the number of a measure, that of a group, and 1 for the second half of a group's points, else 0.
-    """
-
-    side: tuple[int, int, int]
+    side: _Side
     ask: _Ask
     space: SearchSpace
     points: Tensor
@@ -147,7 +149,7 @@ class _Parts:
 
     def __init__(self, measures: tuple[RecordedMeasure, ...]) -> None:
         self.measures = measures
-        self._made: dict[tuple[int, int, int], BatchedMeasure] = {}
+        self._made: dict[_Side, BatchedMeasure] = {}
 
     def __reduce__(self) -> tuple[type[_Parts], tuple[object]]:
         return _Parts, (self.measures,)
