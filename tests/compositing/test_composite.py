@@ -123,19 +123,6 @@ def test_a_compositor_paints_many_views_again_and_again():
         torch.testing.assert_close(frames, torch.cat(expected))
 
 
-def test_pieces_of_any_size_add_up_to_the_same(monkeypatch):
-    view = make_view()
-    space, unit = random_patterns(batch=(2,), figures=5)
-    results = []
-    for piece in (1 << 14, 1 << 20):
-        monkeypatch.setattr("roadproof.compositing.rectangles._PIECE", piece)
-        leaf = unit.clone().requires_grad_()
-        colours = canvas_colours(space.pattern(leaf), view)
-        results.append((colours, torch.autograd.grad(colours.square().sum(), leaf)[0]))
-    torch.testing.assert_close(results[0][0], results[1][0])
-    torch.testing.assert_close(results[0][1], results[1][1])
-
-
 def test_the_same_pattern_gives_the_same_pixels():
     view = make_view(dtype=torch.float32)
     space, unit = random_patterns(dtype=torch.float32)

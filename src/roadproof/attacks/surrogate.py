@@ -113,7 +113,7 @@ class Surrogate(BatchedMeasure):
         if self.variation is not None:
             return None
         same = copy.copy(self)
-        views = [replace(view, runs=None) for view in self.views]
+        views = [replace(view, dense=True) for view in self.views]
         vars(same).update(views=views, _kept={}, _replayed=True, frames_evaluated=0)
         return same
 

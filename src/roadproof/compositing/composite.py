@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.compositing.rectangles import PaintedRectangles
 from roadproof.compositing.variation import Looks
 from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews, fuses
 from roadproof.coverage import Shape
@@ -132,18 +131,17 @@ def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 
     only_rectangles = all(shape is Shape.RECTANGLE for shape in pattern.shapes)
     if only_rectangles and fuses(view.clean):
         # Triton may be missing.
-        from roadproof.compositing.fused import painted as painted_at_once
+        from roadproof.compositing.fused import painted as painted_on_gpu
 
-        return painted_at_once(pattern, view)
-    if view.runs is None:
+        return painted_on_gpu(pattern, view)
+    if view.dense:
         return dense_colours(pattern, view)
-    seen = view.response(pattern.colours)
-    if not only_rectangles:
-        return blend(visibilities(coverages(pattern, view.footprints)), seen, view)
-    batch, figures = pattern.boxes.shape[:-2], len(pattern.shapes)
-    boxes, seen = pattern.boxes.reshape(-1, figures, 5), seen.reshape(-1, figures, 3)
-    painted = cast("Tensor", PaintedRectangles.apply(boxes, seen, view.runs))
-    return painted[:, : view.clean.shape[-2]].view(*batch, -1, 3)
+    if only_rectangles and view.clean.dtype == torch.float32 and view.clean.device.type == "cpu":
+        # It is compiled when it is first wanted.
+        from roadproof.compositing.compiled import painted
+
+        return painted(pattern, view)
+    return blend(visibilities(coverages(pattern, view.footprints)), view.response(pattern.colours), view)
 
 
 def dense_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:

@@ -1,6 +1,6 @@
 """Painting rectangles on a GPU: one pass over the canvas' pixels to paint them, one to go back.
 
-The same values as `composite.blend` over `coverage`, from the equations of `rectangles`. Operation by operation a pixel
+The same values as `composite.blend` over `coverage`, from the equations of `compiled`. Operation by operation a pixel
 is read and written some hundred times on its way there and back, which takes a GPU longer than a small controller does.
 Here it is read once: masks are worked out anew where they are needed, and each block of pixels adds up its own share of
 the gradients, so that the same numbers are added in the same order every time.

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.compositing.runs import Runs
 from roadproof.coverage import Footprints, canvas_share
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
@@ -29,7 +28,7 @@ class CanvasPixels:
         gain: A = s·gain, (*, P, 3), with s the share of the pixel that lies on the canvas.
         bias: B = s·(offset − clean), (*, P, 3).
         response: response from painted to seen colour, before gain and bias.
-        runs: the same pixels cut into runs, for painting rectangles; None where every figure is painted in every pixel.
+        dense: whether every figure is painted in every pixel, by the same operations every time.
     """
 
     footprints: Footprints
@@ -37,7 +36,7 @@ class CanvasPixels:
     gain: Float[Tensor, "*b p 3"]
     bias: Float[Tensor, "*b p 3"]
     response: Response
-    runs: Runs | None
+    dense: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -105,7 +104,7 @@ class OwnViews(CanvasPixels):
             gain=gain,
             bias=bias,
             response=response,
-            runs=None if dense or fuses(clean) else Runs.of(footprints.features[:, 0], clean, gain, bias),
+            dense=dense,
         )
 
     def pasted(self, frames: Float[Tensor, "b 3 h w"], colours: Float[Tensor, "b p 3"]) -> Float[Tensor, "b 3 h w"]:
@@ -115,7 +114,7 @@ class OwnViews(CanvasPixels):
 
 
 def fuses(values: Tensor) -> bool:
-    """Whether `fused` paints rectangles on the device of these numbers, and in their precision; it needs no runs."""
+    """Whether `fused` paints rectangles on the device of these numbers, and in their precision."""
     return values.dtype == torch.float32 and compiles_kernels(values.device)
 
 
@@ -178,7 +177,6 @@ def view_canvas(
         gain, offset, share = maps.gain.flatten(0, 2)[own], maps.offset.flatten(0, 2)[own], maps.visible.flatten()[own]
     gain, offset, share = (part.to(device=device, dtype=dtype) for part in (gain, offset, share[:, None]))
     gain, bias = share * gain, share * (offset - clean)
-    runs = None if fuses(clean) else Runs.of(footprints.features[None], clean[None], gain[None], bias[None])
     return CanvasView(
         frames=levels,
         index=place,
@@ -187,7 +185,6 @@ def view_canvas(
         gain=gain,
         bias=bias,
         response=response_on(colour.response, device, dtype),
-        runs=runs,
     )
 
 
