@@ -15,8 +15,7 @@ along one axis at distances d = w/2 ± u from a pixel, and σ across them,
 and for the visibilities V_k = M_k T_k, with D_k = ∂L/∂V_k and what is seen through figure k, S_{k+1} = D_k M_k +
 (1 − M_k) S_k, S_0 = 0, each adjoint is ∂L/∂M_k = T_k (D_k − S_k): compositing again, from the bottom up.
 
-A figure comes as twelve numbers, as in `fused`: c, s, o_u, o_v with u = c·x + s·y + o_u, v = c·y − s·x + o_v; c², c·s,
-s²; half its width and length; red, green, blue as seen. Pixels come as their `CanvasPixels` have them, with a leading
+A figure comes as twelve numbers (`CanvasPixels.rectangles`), pixels as their `CanvasPixels` have them, with a leading
 dimension of 1, or of B where each pattern has pixels of its own.
 """
 
@@ -38,7 +37,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.view import CanvasPixels
-from roadproof.coverage import MIN_VARIANCE, axis_rows
+from roadproof.coverage import MIN_VARIANCE
 from roadproof.patterns import Pattern
 
 numba: Any = importlib.import_module("numba")
@@ -67,9 +66,7 @@ def _kernel(function: Callable[..., None]) -> Callable[..., None]:
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with rectangles painted, differentiable in their boxes and colours."""
     batch, count = pattern.boxes.shape[:-2], len(pattern.shapes)
-    boxes, seen = pattern.boxes.reshape(-1, count, 5), view.response(pattern.colours).reshape(-1, count, 3)
-    u, v, spread, _ = axis_rows(boxes).unbind(-2)
-    figures = torch.cat([u[..., :3], v[..., 2:3], spread[..., 3:], boxes[..., 2:4] / 2, seen], -1)
+    figures = view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3))
     many = view.clean.shape[-2]
     features = view.footprints.features.reshape(-1, 6, many)
     lights = (each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias))
@@ -152,29 +149,48 @@ def _mask(figures, b, k, x, y, xx, xy, yy):
     return share_u * (_tent((half_v - v) / reach_v) + _tent((half_v + v) / reach_v))
 
 
+@_inline
+@no_type_check
+def _laid(figures, b, x, y, xx, xy, yy, masks, above):
+    """Lay the figures over each other from the top: colours and share of the paint that is seen in a pixel.
+
+    What each figure covers of it, and what of that is not under others, is written down for the way back.
+    """
+    through, red, green, blue = _ONE, _ZERO, _ZERO, _ZERO
+    for k in range(len(masks) - 1, -1, -1):
+        mask = _mask(figures, b, k, x, y, xx, xy, yy)
+        masks[k], above[k] = mask, through
+        if mask != _ZERO:
+            shown = mask * through
+            red += shown * figures[b, k, 9]
+            green += shown * figures[b, k, 10]
+            blue += shown * figures[b, k, 11]
+            through *= _ONE - mask
+    return red, green, blue, _ONE - through
+
+
+@_inline
+@no_type_check
+def _composed(clean, gain, bias, w, p, red, green, blue, share):
+    """Eq. composite, not clipped yet, from colours and share of the paint that is seen."""
+    red = clean[w, p, 0] + gain[w, p, 0] * red + bias[w, p, 0] * share
+    green = clean[w, p, 1] + gain[w, p, 1] * green + bias[w, p, 1] * share
+    return red, green, clean[w, p, 2] + gain[w, p, 2] * blue + bias[w, p, 2] * share
+
+
 @_kernel
 @no_type_check
 def _paint(figures, features, clean, gain, bias, colours, block):
     """Colours of a block of pixels, clipped to [0, 1]."""
-    many = clean.shape[1]
+    many, count = clean.shape[1], figures.shape[1]
+    masks, above = np.empty(count, np.float32), np.empty(count, np.float32)
     for b in range(figures.shape[0]):
         w = b if clean.shape[0] > 1 else 0
         for p in range(block * BLOCK, min(many, (block + 1) * BLOCK)):
             x, y = features[w, 0, p], features[w, 1, p]
             xx, xy, yy = features[w, 3, p], features[w, 4, p], features[w, 5, p]
-            through, red, green, blue = _ONE, _ZERO, _ZERO, _ZERO
-            for k in range(figures.shape[1] - 1, -1, -1):
-                mask = _mask(figures, b, k, x, y, xx, xy, yy)
-                if mask != _ZERO:
-                    shown = mask * through
-                    red += shown * figures[b, k, 9]
-                    green += shown * figures[b, k, 10]
-                    blue += shown * figures[b, k, 11]
-                    through *= _ONE - mask
-            share = _ONE - through
-            red = clean[w, p, 0] + gain[w, p, 0] * red + bias[w, p, 0] * share
-            green = clean[w, p, 1] + gain[w, p, 1] * green + bias[w, p, 1] * share
-            blue = clean[w, p, 2] + gain[w, p, 2] * blue + bias[w, p, 2] * share
+            red, green, blue, share = _laid(figures, b, x, y, xx, xy, yy, masks, above)
+            red, green, blue = _composed(clean, gain, bias, w, p, red, green, blue, share)
             colours[b, p, 0] = min(_ONE, max(_ZERO, red))
             colours[b, p, 1] = min(_ONE, max(_ZERO, green))
             colours[b, p, 2] = min(_ONE, max(_ZERO, blue))
@@ -193,24 +209,12 @@ def _unpaint(figures, features, clean, gain, bias, grad, shares, block):
         for p in range(block * BLOCK, min(many, (block + 1) * BLOCK)):
             x, y = features[w, 0, p], features[w, 1, p]
             xx, xy, yy = features[w, 3, p], features[w, 4, p], features[w, 5, p]
-            through, red, green, blue = _ONE, _ZERO, _ZERO, _ZERO
-            for k in range(count - 1, -1, -1):
-                mask = _mask(figures, b, k, x, y, xx, xy, yy)
-                masks[k], above[k] = mask, through
-                if mask != _ZERO:
-                    shown = mask * through
-                    red += shown * figures[b, k, 9]
-                    green += shown * figures[b, k, 10]
-                    blue += shown * figures[b, k, 11]
-                    through *= _ONE - mask
-            share = _ONE - through
+            red, green, blue, share = _laid(figures, b, x, y, xx, xy, yy, masks, above)
             if share == _ZERO:
                 continue
             # What was clipped has no gradient.
             on_red, on_green, on_blue = grad[b, p, 0], grad[b, p, 1], grad[b, p, 2]
-            red = clean[w, p, 0] + gain[w, p, 0] * red + bias[w, p, 0] * share
-            green = clean[w, p, 1] + gain[w, p, 1] * green + bias[w, p, 1] * share
-            blue = clean[w, p, 2] + gain[w, p, 2] * blue + bias[w, p, 2] * share
+            red, green, blue = _composed(clean, gain, bias, w, p, red, green, blue, share)
             if red < _ZERO or red > _ONE:
                 on_red = _ZERO
             if green < _ZERO or green > _ONE:

@@ -7,8 +7,7 @@ the gradients, so that the same numbers are added in the same order every time.
 
 A figure comes as twelve numbers (b for its pattern, k for its place in it), a pixel as fourteen:
 
-    figures (b, k, 12)   c, s, o_u, o_v with u = c·x + s·y + o_u, v = c·y − s·x + o_v; c², c·s, s²; half its width and
-                         length; red, green, blue as seen
+    figures (b, k, 12)   as `CanvasPixels.rectangles` gives them
     pixels (v, 14, p)    x, y, and xx, 2·xy, yy of its footprint; clean colour, gain and bias, three each; v is 1, or b
                          where each pattern has pixels of its own
 """
@@ -27,7 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.view import CanvasPixels
-from roadproof.coverage import MIN_VARIANCE, axis_rows
+from roadproof.coverage import MIN_VARIANCE
 from roadproof.patterns import Pattern
 
 triton: Any = importlib.import_module("triton")
@@ -62,9 +61,7 @@ def try_out(device: torch.device) -> None:
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with rectangles painted, differentiable in their boxes and colours."""
     batch, count = pattern.boxes.shape[:-2], len(pattern.shapes)
-    boxes, seen = pattern.boxes.reshape(-1, count, 5), view.response(pattern.colours).reshape(-1, count, 3)
-    u, v, spread, _ = axis_rows(boxes).unbind(-2)
-    figures = torch.cat([u[..., :3], v[..., 2:3], spread[..., 3:], boxes[..., 2:4] / 2, seen], -1)
+    figures = view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3))
     pixels = _numbered(view)
     assert len(pixels) in (1, len(figures)), "pixels of one view, or of one for each pattern"
     colours = cast("Tensor", _Painted.apply(figures, pixels))

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.coverage import Footprints, canvas_share
+from roadproof.coverage import Footprints, axis_rows, canvas_share
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
@@ -37,6 +37,15 @@ class CanvasPixels:
     bias: Float[Tensor, "*b p 3"]
     response: Response
     dense: bool = False
+
+    def rectangles(self, boxes: Float[Tensor, "b k 5"], colours: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k 12"]:
+        """Twelve numbers of each rectangle, for kernels that paint them.
+
+        They are c, s, o_u, o_v with u = c·x + s·y + o_u, v = c·y − s·x + o_v; c², c·s, s²; half its width and length;
+        red, green, blue as seen.
+        """
+        u, v, spread, _ = axis_rows(boxes).unbind(-2)
+        return torch.cat([u[..., :3], v[..., 2:3], spread[..., 3:], boxes[..., 2:4] / 2, self.response(colours)], -1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
