@@ -250,6 +250,9 @@ def test_where_nothing_is_found_the_first_rungs_are_climbed_once_more(road, tmp_
     seen.clear()
     search(float(once.best.max()))
     assert seen == [1, 2, 3, 4, 5]
+    begun = measure.frames_evaluated
+    search(NEVER)
+    straight = measure.frames_evaluated - begun
     # The same again after an interruption in the second time.
     stopped = tmp_path / "search.safetensors"
 
@@ -259,11 +262,13 @@ def test_where_nothing_is_found_the_first_rungs_are_climbed_once_more(road, tmp_
             raise KeyboardInterrupt
 
     seen.clear()
+    begun = measure.frames_evaluated
     with pytest.raises(KeyboardInterrupt):
         search(NEVER, checkpoint=stopped, on_step=interrupt)
     seen.clear()
     gone_on = search(NEVER, checkpoint=stopped)
     assert seen == [4, 4, 5]
+    assert measure.frames_evaluated - begun == straight, "every picture counts once"
     assert torch.equal(gone_on.best_unit, found.best_unit)
     assert [each.name for each in tmp_path.iterdir()] == [stopped.name]
 

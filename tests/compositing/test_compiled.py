@@ -1,7 +1,5 @@
 """Painting in one pass on a CPU: values and gradients of plain operations, whoever computes them."""
 
-from typing import no_type_check
-
 import pytest
 import torch
 
@@ -58,20 +56,3 @@ def test_nan_is_painted_as_nan():
         painted = compiled.painted(space.pattern(unit), pixels)
         assert painted[0].isnan().all()
         assert painted[1].isfinite().all()
-
-
-def test_where_nothing_can_be_kept_kernels_are_compiled_each_time(monkeypatch):
-    usual = compiled.numba.njit
-
-    def nowhere(function, **options):
-        if options.get("cache"):
-            raise RuntimeError("cannot cache function 'twice': no locator available for file")
-        return usual(function, **options)
-
-    monkeypatch.setattr(compiled.numba, "njit", nowhere)
-    assert compiled._kernel(_twice)(2) == 4
-
-
-@no_type_check
-def _twice(x):
-    return 2 * x

@@ -18,7 +18,8 @@ from roadproof.lens import Lens
 from roadproof.patterns import Pattern
 from roadproof.photometry import PixelMaps
 from roadproof.recorded.light import Light
-from roadproof.recorded.pictures import FrameBank, Poses
+from roadproof.recorded.nearest import Poses
+from roadproof.recorded.pictures import FrameBank
 from roadproof.search_space import SearchSpace
 from scenes import PLAIN
 
@@ -106,10 +107,10 @@ def test_what_hides_the_canvas_is_measured_through_the_lens():
     shape = drive.frames.shape
     maps = PixelMaps(torch.ones(shape), torch.zeros(shape), visible)
     seen = dataclasses.replace(road, recordings=(dataclasses.replace(drive, maps=maps),))
-    free = Light(seen, torch.device("cpu"))._maps[:, 6]
+    free = Light(seen, torch.device("cpu")).values[:, 6]
     # Nothing hides it, so all of it is seen: through a pinhole, its outline would seem hidden.
     assert torch.allclose(free, torch.ones(()), atol=1e-5)
-    straight = Light(dataclasses.replace(seen, camera=CIL_CAMERA), torch.device("cpu"))._maps[:, 6]
+    straight = Light(dataclasses.replace(seen, camera=CIL_CAMERA), torch.device("cpu")).values[:, 6]
     assert straight.min() < 0.5
 
 

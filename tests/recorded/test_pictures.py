@@ -13,7 +13,8 @@ from roadproof.coverage import Shape
 from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.patterns import Pattern
-from roadproof.recorded.pictures import FrameBank, Poses
+from roadproof.recorded.nearest import Poses
+from roadproof.recorded.pictures import FrameBank
 from roadproof.recordings import RecordingSet, Side
 from roadproof.search_space import SearchSpace
 from scenes import PLAIN

@@ -5,7 +5,7 @@ import torch
 
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.photometry import AffineResponse, ColourTransform
-from roadproof.recorded.pictures import Poses
+from roadproof.recorded.nearest import Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recordings import Recording, RecordingSet, Side, Track
 

@@ -190,6 +190,11 @@ def gradopt(
     """
     climbing = measure if all_digits else _for_climbing(measure)
     views = tuple(rung.view(climbing) for rung in rungs)
+    for view in views:
+        if view is not measure:
+            # What it took to make it; from now on each counts what a rung takes.
+            measure.frames_evaluated += view.frames_evaluated
+            view.frames_evaluated = 0
     climb = _Climb(measure, climbing, views, Sides((*views, measure), running.get("pool")), space, momentum, Counter())
     state, behind = _climbed(climb, rungs, **running)
     best, last = state["best"], _of_groups(measure, behind)
@@ -230,7 +235,6 @@ def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[
     identity += "" if climbing is measure else " in few digits"
     checkpoint = Checkpoint(running.get("checkpoint"), identity, aim_of(running))
     state = checkpoint.load(measure.device)
-    resumed = state is not None
     at, behind = 0, torch.full((len(measure.groups),), torch.nan)
     again = checkpoint.path and checkpoint.path.with_suffix(f".again{checkpoint.path.suffix}")
     if state is None:
@@ -239,7 +243,7 @@ def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[
         state = state_at(_starts(measure, space, rungs[0].starts, seed, starts))
     else:
         at, behind = int(state.pop("rung")), state.pop("behind").cpu()
-        # The clean frames that measures count when they are made again are among them.
+        # What it took to make the measures is among them.
         measure.frames_evaluated = int(state.pop("frames"))
     for number in range(at, len(rungs)):
         rung, done = rungs[number], sum(before.iterations for before in rungs[:number])
@@ -254,8 +258,6 @@ def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[
         if looks_back and rung.groups_compete:
             state, behind = _without_those_behind(state, behind)
         climbed = _of_groups(climb.views[number], behind)
-        if climbed is not measure and (climbed is climbing or (resumed and number == at)):
-            climbed.frames_evaluated = 0
         beside = climb.sides.of(number, climbed)
         if number > at:
             if rung.offspring:
@@ -282,6 +284,7 @@ def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[
         del replay
         if climbed is not measure:
             measure.frames_evaluated += climbed.frames_evaluated
+            climbed.frames_evaluated = 0
     if again is not None:
         again.unlink(missing_ok=True)
     return state, behind

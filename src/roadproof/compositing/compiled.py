@@ -19,52 +19,36 @@ A figure comes as twelve numbers (`CanvasPixels.rectangles`), pixels as their `C
 dimension of 1, or of B where each pattern has pixels of its own.
 """
 
-# Numba has no type information, and reads the code of its kernels itself.
 # ruff: noqa: ANN001, ANN202
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, cast, no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from roadproof.compiling import Kernel, inline, run
 from roadproof.compositing.view import CanvasPixels
 from roadproof.coverage import MIN_VARIANCE
 from roadproof.patterns import Pattern
 
-numba: Any = importlib.import_module("numba")
-
 BLOCK = 1 << 14
 """Pixels that are taken at once."""
-
-_ROUNDED = {"nsz", "arcp", "contract", "afn", "reassoc"}
-"""What may be computed otherwise than written, but for NaN and infinity, which stay what they are."""
 
 _ZERO, _HALF, _ONE, _LEAST = np.float32(0), np.float32(0.5), np.float32(1), np.float32(MIN_VARIANCE)
 _NUMBERS = 12
 
-_inline: Any = numba.njit(inline="always", fastmath=_ROUNDED)
-
-
-def _kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """A function compiled when it is first called, and kept on the disk where there is a place for that."""
-    options = {"nogil": True, "fastmath": _ROUNDED}
-    try:
-        return numba.njit(function, cache=True, **options)
-    except RuntimeError:  # no folder that can be written
-        return numba.njit(function, **options)
-
 
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
-    """Colours of the canvas' pixels with rectangles painted, differentiable in their boxes and colours."""
+    """Colours of the canvas' pixels with rectangles painted, differentiable once in their boxes and colours.
+
+    Widths and lengths are above 0, and what is known of the pixels is finite.
+    """
     batch, count = pattern.boxes.shape[:-2], len(pattern.shapes)
     figures = view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3))
     many = view.clean.shape[-2]
@@ -78,7 +62,7 @@ class _Painted(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, figures: Tensor, *pixels: Tensor) -> Tensor:  # noqa: ANN401
         colours = figures.new_empty(len(figures), pixels[0].shape[-1], 3)
-        _in_blocks(_paint, (figures, *pixels, colours), colours.shape[1])
+        run(_paint, (figures, *pixels, colours), _blocks(colours.shape[1]))
         # Distances of figures that are not finite compare with nothing.
         nowhere = ~figures.isfinite().flatten(1).all(1)
         if bool(nowhere.any()):
@@ -87,33 +71,27 @@ class _Painted(torch.autograd.Function):
         return colours
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         figures, *pixels = ctx.saved_tensors
         many = pixels[0].shape[-1]
-        shares = torch.empty(-(-many // BLOCK), *figures.shape, dtype=torch.float64)
-        _in_blocks(_unpaint, (figures, *pixels, grad_outputs[0].contiguous(), shares), many)
+        shares = torch.empty(_blocks(many), *figures.shape, dtype=torch.float64)
+        run(_unpaint, (figures, *pixels, grad_outputs[0], shares), len(shares))
         return shares.sum(0).to(figures.dtype), None, None, None, None
 
 
-def _in_blocks(kernel: Callable[..., None], tensors: Sequence[Tensor], many: int) -> None:
-    arrays = [each.detach().contiguous().numpy() for each in tensors]
-    blocks = range(-(-many // BLOCK))
-    if (threads := min(torch.get_num_threads(), len(blocks))) > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(partial(kernel, *arrays), blocks))
-    else:
-        for block in blocks:
-            kernel(*arrays, block)
+def _blocks(many: int) -> int:
+    return -(-many // BLOCK)
 
 
-@_inline
+@inline
 @no_type_check
 def _tent(t):
     t = min(_ONE, max(-_ONE, t))
     return t * (_ONE - _HALF * abs(t))
 
 
-@_inline
+@inline
 @no_type_check
 def _slope(t):
     return max(_ONE - abs(t), _ZERO)
@@ -123,7 +101,7 @@ def _slope(t):
 # all else.
 
 
-@_inline
+@inline
 @no_type_check
 def _in_figure(figures, b, k, x, y, xx, xy, yy):
     """A pixel in a figure's axes: u, v, and σ² along them."""
@@ -133,7 +111,7 @@ def _in_figure(figures, b, k, x, y, xx, xy, yy):
     return u, v, cc * xx + cs * xy + ss * yy, ss * xx - cs * xy + cc * yy
 
 
-@_inline
+@inline
 @no_type_check
 def _mask(figures, b, k, x, y, xx, xy, yy):
     """How much of a pixel a figure covers."""
@@ -149,7 +127,7 @@ def _mask(figures, b, k, x, y, xx, xy, yy):
     return share_u * (_tent((half_v - v) / reach_v) + _tent((half_v + v) / reach_v))
 
 
-@_inline
+@inline
 @no_type_check
 def _laid(figures, b, x, y, xx, xy, yy, masks, above):
     """Lay the figures over each other from the top: colours and share of the paint that is seen in a pixel.
@@ -169,7 +147,7 @@ def _laid(figures, b, x, y, xx, xy, yy, masks, above):
     return red, green, blue, _ONE - through
 
 
-@_inline
+@inline
 @no_type_check
 def _composed(clean, gain, bias, w, p, red, green, blue, share):
     """Eq. composite, not clipped yet, from colours and share of the paint that is seen."""
@@ -178,7 +156,7 @@ def _composed(clean, gain, bias, w, p, red, green, blue, share):
     return red, green, clean[w, p, 2] + gain[w, p, 2] * blue + bias[w, p, 2] * share
 
 
-@_kernel
+@Kernel
 @no_type_check
 def _paint(figures, features, clean, gain, bias, colours, block):
     """Colours of a block of pixels, clipped to [0, 1]."""
@@ -196,7 +174,7 @@ def _paint(figures, features, clean, gain, bias, colours, block):
             colours[b, p, 2] = min(_ONE, max(_ZERO, blue))
 
 
-@_kernel
+@Kernel
 @no_type_check
 def _unpaint(figures, features, clean, gain, bias, grad, shares, block):
     """A block's share of the gradient of every number of the figures."""

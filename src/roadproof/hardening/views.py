@@ -19,7 +19,7 @@ from roadproof.controllers import Controller
 from roadproof.patterns import Pattern
 from roadproof.recorded import RecordedWorld
 from roadproof.recorded.course import Place
-from roadproof.recorded.pictures import Poses
+from roadproof.recorded.nearest import Poses
 from roadproof.recordings import RecordingSet
 
 MOVED_M, TURNED_RAD, FASTER_MPS = 0.4, 0.06, 0.7

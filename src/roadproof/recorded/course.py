@@ -26,7 +26,7 @@ from torch import Tensor
 from roadproof.driving.deviation import passage
 from roadproof.errors import RecordingError
 from roadproof.geometry import CanvasPlacement
-from roadproof.recorded.pictures import Poses
+from roadproof.recorded.nearest import Poses
 from roadproof.recorded.vehicle import curvatures
 from roadproof.recordings import Track
 

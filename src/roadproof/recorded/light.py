@@ -24,13 +24,17 @@ class Light:
     Args:
         recordings: recordings calibrated with maps of every pixel, or with one colour transform for all.
         device: torch device of the light's tensors.
+
+    Attributes:
+        values: gain, offset and unoccluded share of every pixel of every frame, or of one frame for all, (M, 7).
+        of_frames: whether every frame has pixels of its own.
     """
 
     def __init__(self, recordings: RecordingSet, device: torch.device) -> None:
-        view = self._view = recordings.view
-        self._maps = _maps(recordings, device)
-        pixels = camera_points(torch.arange(view.height_px * view.width_px), view).float()
-        self._everywhere = tuple(part.to(device) for part in recordings.colour.gain_and_offset(pixels))
+        self._view = recordings.view
+        maps = _maps(recordings)
+        self.of_frames = maps is not None
+        self.values = (_everywhere(recordings) if maps is None else maps).to(device)
 
     def at(
         self,
@@ -48,20 +52,27 @@ class Light:
             footprints: footprints of the pixels on the canvas, (R, 1, P, ...).
         """
         share = canvas_share(footprints)[:, 0]
-        if self._maps is None:
-            gain, offset = (part[pixel] for part in self._everywhere)
-            return gain, offset, share
+        if not self.of_frames:
+            light = self.values[pixel]
+            return light[..., :3], light[..., 3:6], share
         height, width = self._view.height_px, self._view.width_px
         # Light changes slowly across a frame: the nearest pixel's will do.
         x, y = source.unbind(-1)
         column = ((x + 1) * (width / 2) - 0.5).round_().clamp_(0, width - 1).long()
         row = ((y + 1) * (height / 2) - 0.5).round_().clamp_(0, height - 1).long()
         index = (frame * (height * width))[:, None] + row * width + column
-        light = self._maps.index_select(0, index.flatten()).view(*index.shape, -1)
+        light = self.values.index_select(0, index.flatten()).view(*index.shape, -1)
         return light[..., :3], light[..., 3:6], share * light[..., 6]
 
 
-def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"] | None:
+def _everywhere(recordings: RecordingSet) -> Float[Tensor, "p 7"]:
+    """Gain and offset of one colour transform in every pixel, of which nothing is hidden."""
+    view = recordings.view
+    pixels = camera_points(torch.arange(view.height_px * view.width_px), view).float()
+    return torch.cat([*recordings.colour.gain_and_offset(pixels), torch.ones(len(pixels), 1)], -1)
+
+
+def _maps(recordings: RecordingSet) -> Float[Tensor, "n 7"] | None:
     """Gain, offset and unoccluded share of every pixel of every frame; None where the set has one colour for all.
 
     Where the canvas is not seen, the mean of the frame stands: a moved picture looks a little beyond its edge.
@@ -76,7 +87,7 @@ def _maps(recordings: RecordingSet, device: torch.device) -> Float[Tensor, "n 7"
     mean = (values * known).sum((1, 2)) / known.sum((1, 2)).clamp_min(1)
     values = torch.where(known, values, mean[:, None, None])
     free = torch.where(expected > _MOSTLY_ROAD, maps.visible / expected.clamp_min(_MOSTLY_ROAD), 1.0).clamp(0.0, 1.0)
-    return torch.cat([values, free[..., None]], -1).flatten(0, 2).to(device)
+    return torch.cat([values, free[..., None]], -1).flatten(0, 2)
 
 
 def _expected_share(homographies: Homographies, view: CropResize, camera: CameraModel) -> Float[Tensor, "f h w"]:

@@ -31,74 +31,32 @@ from roadproof.errors import RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
 from roadproof.photometry.responses import response_on
 from roadproof.recorded.light import Light
+from roadproof.recorded.nearest import LOOKING_THE_SAME_WAY, NEAREST, Apart, Gap, Poses, nearest, require_on_earth
 from roadproof.recorded.packing import all_pixels, packed_pixels
 from roadproof.recordings import RecordingSet
-
-
-class Poses(NamedTuple):
-    """Where R cars are on the ground, seen from the middle of the canvas; float64.
-
-    Args:
-        x_m: world x from the canvas' middle, metres, (R,).
-        y_m: world y from the canvas' middle, metres, (R,).
-        yaw_rad: heading, radians, left positive, (R,).
-    """
-
-    x_m: Float[Tensor, " r"]
-    y_m: Float[Tensor, " r"]
-    yaw_rad: Float[Tensor, " r"]
-
-    def picked(self, index: Int[Tensor, " p"]) -> Poses:
-        """The poses with the given indices."""
-        return Poses(self.x_m[index], self.y_m[index], self.yaw_rad[index])
-
-    def detached(self) -> Poses:
-        """The same poses without a gradient."""
-        return Poses(self.x_m.detach(), self.y_m.detach(), self.yaw_rad.detach())
-
-
-class Gap(NamedTuple):
-    """How far poses are from the recorded poses whose frames show them.
-
-    Args:
-        frame: index of the recorded frame, (R,).
-        ahead_m: distance along the pose's heading, metres, positive where the pose is further on, (R,).
-        left_m: distance across the pose's heading, metres, positive where the pose is further left, (R,).
-        turned_rad: heading of the pose minus that of the recorded frame, radians, left positive, (R,).
-    """
-
-    frame: Int[Tensor, " r"]
-    ahead_m: Float[Tensor, " r"]
-    left_m: Float[Tensor, " r"]
-    turned_rad: Float[Tensor, " r"]
-
-
-class Apart(NamedTuple):
-    """How far one pose is from another.
-
-    Args:
-        ahead_m: distance along its heading, metres, positive where it is further on.
-        left_m: distance across its heading, metres, positive where it is further left.
-        turned_rad: difference of heading, radians, positive where it is turned to the left.
-    """
-
-    ahead_m: float
-    left_m: float
-    turned_rad: float
-
-
-NEAREST = Apart(1.0, 0.5, 0.1)
-"""Distances and a turn that count alike when a frame is chosen."""
-
-LOOKING_THE_SAME_WAY = Apart(4.0, 2.0, 0.02)
-"""The same where a frame is to show what the nearest one does not."""
 
 MISSED = 0.04
 """A frame is helped out by another where the picture reaches so far beyond it, in halves of its width or height."""
 
-
-_FURTHEST_M = 1e4
 _IN_FRONT = 1e-6
+
+
+class Moved(NamedTuple):
+    """Recorded frames as they are seen from R other poses; float64.
+
+    Args:
+        frame: index of each frame, (R,).
+        input_from_ground: G' of each pose, (R, 3, 3).
+        ground_from_input: its inverse, (R, 3, 3).
+        above: W above the horizon, (R, 3, 3).
+        below: W below the horizon, (R, 3, 3).
+    """
+
+    frame: Int[Tensor, " r"]
+    input_from_ground: Float[Tensor, "r 3 3"]
+    ground_from_input: Float[Tensor, "r 3 3"]
+    above: Float[Tensor, "r 3 3"]
+    below: Float[Tensor, "r 3 3"]
 
 
 class FrameBank:
@@ -139,7 +97,7 @@ class FrameBank:
         self._replayed = False
         self._set_rays()
         self.input_from_ground = self._recorded_views(recordings)
-        self._input_from_car = self.input_from_ground @ _ground_from_car(self.poses)
+        self._input_from_car = self.input_from_ground @ self.poses.ground_from_car()
 
     def _exact(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -215,15 +173,8 @@ class FrameBank:
             RecordingError: a pose is out of all bounds, or NaN.
         """
         if not self._replayed:
-            _require_on_earth(poses)
-        dx, dy = poses.x_m[:, None] - self.poses.x_m, poses.y_m[:, None] - self.poses.y_m
-        c, s = torch.cos(poses.yaw_rad)[:, None], torch.sin(poses.yaw_rad)[:, None]
-        ahead, left = c * dx + s * dy, c * dy - s * dx
-        turned = torch.remainder(poses.yaw_rad[:, None] - self.poses.yaw_rad + math.pi, 2 * math.pi) - math.pi
-        far = (ahead / alike.ahead_m).square() + (left / alike.left_m).square() + (turned / alike.turned_rad).square()
-        index = far.argmin(1)
-        at = index[:, None]
-        return Gap(index, ahead.gather(1, at)[:, 0], left.gather(1, at)[:, 0], turned.gather(1, at)[:, 0])
+            require_on_earth(poses)
+        return nearest(poses, self.poses, alike)
 
     def show(self, poses: Poses, gap: Gap, *, to_paint: bool = True) -> Views:
         """The bare pictures at some poses, and what is needed to paint them.
@@ -233,58 +184,92 @@ class FrameBank:
             gap: the recorded frames for these poses, from `nearest`.
             to_paint: False leaves out what is needed to paint them, which takes nearly as long as the pictures.
         """
-        input_from_ground, ground_from_input, source = self._sources(poses, gap)
-        shown, beyond = self._sampled(gap, source)
-        missing = beyond.flatten(1).amax(1) > MISSED
-        missed = torch.arange(len(shown), device=self.device) if self._replayed else missing.nonzero()[:, 0]
-        if len(missed):
-            turned = poses.picked(missed)
-            other = self.nearest(turned, LOOKING_THE_SAME_WAY)
-            second, further = self._sampled(other, self._sources(turned, other)[2])
-            first, short = shown.index_select(0, missed), beyond.index_select(0, missed)
-            better = (short > 0) & (further < short) & missing[missed][:, None, None]
-            shown = shown.index_copy_(0, missed, torch.where(better[:, None], second, first))
-        frames = shown.round_().div_(255)
-        if not to_paint:
-            return Views(frames, None)
-        return Views(frames, self._canvas_views(frames, input_from_ground, ground_from_input, source, gap))
+        moved = self._moved(poses, gap)
+        return self._compiled(poses, moved, to_paint) if self._compiles else self._plain(poses, moved, to_paint)
 
-    def _sources(self, poses: Poses, gap: Gap) -> tuple[Tensor, Tensor, Float[Tensor, "r 2 n"]]:
-        """G' of each pose and its inverse, (R, 3, 3), and the place in its recorded frame that every pixel comes from.
+    @property
+    def _compiles(self) -> bool:
+        """Whether kernels make these pictures."""
+        return self.device.type == "cpu" and self.camera.lens is None and not self._replayed
 
-        The place is in half widths and half heights of the frame, from its middle.
-        """
+    def _moved(self, poses: Poses, gap: Gap) -> Moved:
+        """The recorded frames as they are seen from other poses."""
         # The car has moved on the ground as a whole: the camera looks at it as it did from the recorded pose.
-        wanted = self._input_from_car[gap.frame] @ self._inverse(_ground_from_car(poses))
+        wanted = self._input_from_car[gap.frame] @ self._inverse(poses.ground_from_car())
         ground_from_input = self._inverse(wanted)
         below = self.input_from_ground[gap.frame] @ ground_from_input
         c, s, o = torch.cos(gap.turned_rad), torch.sin(gap.turned_rad), torch.zeros_like(gap.turned_rad)
         turn = torch.stack([c, o, -s, o, o + 1, o, s, o, c], -1).view(-1, 3, 3)
         above = self._input_from_level @ turn @ self._level_from_input
-        return wanted, ground_from_input, self._seen_at(above, below)
+        return Moved(gap.frame, wanted, ground_from_input, above, below)
 
-    def _seen_at(self, above: Float[Tensor, "r 3 3"], below: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r 2 n"]:
-        """The places in their recorded frames that pixels come from, by W above and below the horizon."""
+    def _compiled(self, poses: Poses, moved: Moved, to_paint: bool) -> Views:
+        # Numba compiles when it is first called, and takes its time to be imported.
+        from roadproof.recorded.compiled import draw, lit_canvas
+
+        many, view = len(moved.frame), self.view
+        drawn = torch.empty(many, 3, view.height_px, view.width_px)
+        beyond = torch.full((many, view.height_px, view.width_px), torch.inf)
+        source = self._halves(moved)
+        draw(self.levels, moved.frame, source, self.horizon_row, torch.arange(many), drawn, beyond)
+        missed = (beyond.flatten(1).amax(1) > MISSED).nonzero()[:, 0]
+        if len(missed):
+            other = self._moved(*self._looking_the_same_way(poses, missed))
+            draw(self.levels, other.frame, self._halves(other), self.horizon_row, missed, drawn, beyond)
+        frames = drawn.div_(255)
+        rows = self._canvas_rows(moved.input_from_ground) if to_paint else None
+        if rows is None:
+            return Views(frames, None)
+        canvas_from_input = self._canvas_from_ground @ moved.ground_from_input
+        of_frame = (moved.frame, source, self._light)
+        return Views(
+            frames, lit_canvas(frames, rows, canvas_from_input, *of_frame, self.view.resampling, self._response)
+        )
+
+    def _plain(self, poses: Poses, moved: Moved, to_paint: bool) -> Views:
+        source = self._seen_at(moved)
+        frames, beyond = self._sampled(moved.frame, source)
+        missing = beyond.flatten(1).amax(1) > MISSED
+        missed = torch.arange(len(frames), device=self.device) if self._replayed else missing.nonzero()[:, 0]
+        if len(missed):
+            other = self._moved(*self._looking_the_same_way(poses, missed))
+            second, further = self._sampled(other.frame, self._seen_at(other))
+            first, short = frames.index_select(0, missed), beyond.index_select(0, missed)
+            better = (short > 0) & (further < short) & missing[missed][:, None, None]
+            frames = frames.index_copy_(0, missed, torch.where(better[:, None], second, first))
+        return Views(frames, self._canvas_views(frames, moved, source) if to_paint else None)
+
+    def _looking_the_same_way(self, poses: Poses, missed: Int[Tensor, " p"]) -> tuple[Poses, Gap]:
+        """Some of the poses, and the frames that show what their nearest ones do not."""
+        turned = poses.picked(missed)
+        return turned, self.nearest(turned, LOOKING_THE_SAME_WAY)
+
+    def _halves(self, moved: Moved) -> Float[Tensor, "r 2 3 3"]:
+        """W above and below the horizon, to halves of the frame's size from its middle."""
+        return self._halves_from_px @ torch.stack([moved.above, moved.below], 1)
+
+    def _seen_at(self, moved: Moved) -> Float[Tensor, "r 2 n"]:
+        """The place in its recorded frame that every pixel comes from, in halves of its size from its middle."""
         lens = self.camera.lens
         if lens is None:
-            above, below = ((self._halves_from_px @ part).float() for part in (above, below))
+            above, below = self._halves(moved).float().unbind(1)
             mapped = torch.cat([above @ self._sky, below @ self._ground], 2)
             # What is behind the camera would come out mirrored, in the sky; it is far outside the frame.
             return mapped[:, :2] / mapped[:, 2:].clamp_min_(_IN_FRONT)
-        above, below = ((self._rays_from_input @ part).float() for part in (above, below))
+        above, below = ((self._rays_from_input @ part).float() for part in (moved.above, moved.below))
         rays = torch.where(self._is_sky, above @ self._pixels, below @ self._pixels)
         scale, middle = self._halves_from_rays.diagonal()[:2].float(), self._halves_from_rays[:2, 2].float()
         shown = torch.stack(lens.distort(rays[:, 0], rays[:, 1], rays[:, 2], torch), 1)
         return shown * scale[:, None] + middle[:, None]
 
-    def _sampled(self, gap: Gap, source: Float[Tensor, "r 2 n"]) -> tuple[Float[Tensor, "r 3 h w"], Tensor]:
-        """Frames sampled at the source places, and how far each pixel lies beyond its frame, in halves of its size."""
+    def _sampled(self, frame: Int[Tensor, " r"], source: Float[Tensor, "r 2 n"]) -> tuple[Tensor, Tensor]:
+        """Frames sampled at places, (R, 3, H, W), and how far each pixel lies beyond its frame, (R, H, W)."""
         height, width = self.view.height_px, self.view.width_px
         near = source.clamp(-3, 3)
-        levels = self.levels.index_select(0, gap.frame)
         grid = near.mT.reshape(-1, height, width, 2)
+        levels = self.levels.index_select(0, frame)
         shown = grid_sample(levels, grid, mode="bilinear", padding_mode="border", align_corners=False)
-        return shown, near.abs_().amax(1).view(-1, height, width) - 1
+        return shown.round_().div_(255), near.abs_().amax(1).view(-1, height, width) - 1
 
     def _inverse(self, matrix: Float[Tensor, "r 3 3"]) -> Float[Tensor, "r 3 3"]:
         if not self._replayed:
@@ -295,19 +280,14 @@ class FrameBank:
         return columns / (a * columns[:, :, 0]).sum(1)[:, None, None]
 
     def _canvas_views(
-        self,
-        frames: Float[Tensor, "r 3 h w"],
-        input_from_ground: Float[Tensor, "r 3 3"],
-        ground_from_input: Float[Tensor, "r 3 3"],
-        source: Float[Tensor, "r 2 n"],
-        gap: Gap,
+        self, frames: Float[Tensor, "r 3 h w"], moved: Moved, source: Float[Tensor, "r 2 n"]
     ) -> OwnViews | None:
         """The canvas' pixels of each picture with the light on them; None if no picture shows the canvas."""
         width = self.view.width_px
-        rows = self._ground_rows if self._replayed else self._canvas_rows(input_from_ground)
+        rows = self._ground_rows if self._replayed else self._canvas_rows(moved.input_from_ground)
         if rows is None:
             return None
-        canvas_from_input = (self._canvas_from_ground @ ground_from_input).float()
+        canvas_from_input = (self._canvas_from_ground @ moved.ground_from_input).float()
         first = rows.start * width
         horizon = self.horizon_row * width
         mapped = canvas_from_input @ self._ground[:, first - horizon : rows.stop * width - horizon]
@@ -329,7 +309,7 @@ class FrameBank:
         jacobian = ((by[:, :2] - at[:, :, None] * by[:, 2:]) / scale[:, None, None]).permute(0, 3, 1, 2)
         jacobian = jacobian if straight else jacobian @ self._bend[flat]
         footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
-        gain, offset, share = self._light.at(flat, picked_pixels(source, flat).mT, gap.frame, footprints)
+        gain, offset, share = self._light.at(flat, picked_pixels(source, flat).mT, moved.frame, footprints)
         share = torch.where(real, share, 0.0)[..., None]
         light = (share * gain, share, offset)
         return OwnViews.lit(frames, flat, valid, footprints, light, self._response, dense=self._replayed)
@@ -355,21 +335,6 @@ class FrameBank:
         return slice(*rows) if rows[0] < rows[1] else None
 
 
-def _require_on_earth(poses: Poses) -> None:
-    """Refuse cars that no picture can be made for, however far off.
-
-    Raises:
-        RecordingError: a car is further from the canvas than any drive goes, or nowhere.
-    """
-    furthest = float(torch.stack(poses.detached()).abs().amax())
-    if not furthest < _FURTHEST_M:
-        raise RecordingError(
-            "a car leaves all bounds in these recordings: the controller's answers and the vehicle that was identified "
-            "from the drives do not go together; give drives that steer more, a Vehicle of your own, or a controller "
-            "that drives this road"
-        )
-
-
 class Views(NamedTuple):
     """Pictures from R poses, ready to be painted.
 
@@ -380,12 +345,6 @@ class Views(NamedTuple):
 
     frames: Float[Tensor, "r 3 h w"]
     canvas: OwnViews | None
-
-
-def _ground_from_car(poses: Poses) -> Float[Tensor, "r 3 3"]:
-    """The rigid motion from a car's own axes (ahead, left) to the ground, (R, 3, 3)."""
-    c, s, o = torch.cos(poses.yaw_rad), torch.sin(poses.yaw_rad), torch.zeros_like(poses.yaw_rad)
-    return torch.stack([c, -s, poses.x_m, s, c, poses.y_m, o, o, o + 1], -1).view(-1, 3, 3)
 
 
 def _ground_from_canvas(canvas: CanvasPlacement) -> Float[np.ndarray, "3 3"]:

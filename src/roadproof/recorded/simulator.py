@@ -24,7 +24,7 @@ from roadproof.geometry import CanvasPlacement, homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import is_plain_name
 from roadproof.io.identity import digest
-from roadproof.recorded.pictures import Apart, Gap, Poses
+from roadproof.recorded.nearest import Apart, Gap, Poses
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recorded.world import BiasedStart, RecordedWorld
 from roadproof.recordings import RecordingSet

@@ -24,8 +24,9 @@ from roadproof.driving.starts import StartOffset
 from roadproof.errors import RecordingError, SimulatorError
 from roadproof.patterns import Pattern
 from roadproof.recorded.course import Course, Place
+from roadproof.recorded.nearest import Gap, Poses
 from roadproof.recorded.obstacles import Obstacles
-from roadproof.recorded.pictures import FrameBank, Gap, Poses
+from roadproof.recorded.pictures import FrameBank
 from roadproof.recorded.vehicle import Motion, Vehicle
 from roadproof.recordings import RecordingSet
 

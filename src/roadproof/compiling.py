@@ -1,0 +1,89 @@
+"""Kernels for a CPU that Numba compiles when they are first called, and how many threads run them.
+
+Numba has no type information, and reads the code of its kernels itself: modules with kernels leave their arguments
+without types.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from inspect import getsource
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from roadproof.io.identity import digest, stated
+
+_numba: Any = importlib.import_module("numba")
+
+_ROUNDED = {"nsz", "arcp", "contract", "afn", "reassoc"}
+"""What may be computed otherwise than written, but for NaN and infinity, which stay what they are."""
+
+_OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": _ROUNDED}
+
+inline: Any = _numba.njit(inline="always", fastmath=_ROUNDED)
+"""A function that kernels use, compiled as a part of them."""
+
+
+class Kernel:
+    """A function that is compiled when it is first called, and kept on the disk where there is a place for that.
+
+    What is kept has a name of its own for every source and every number, so that nothing else is taken for it. Where it
+    cannot be read or written, the function is compiled anew.
+
+    Args:
+        function: a function of a module, of which it may use other functions, and numbers that stand above it.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        try:
+            function.__qualname__ = self._name = f"{function.__qualname__}_{_told(function)[:16]}"
+            self._compiled, self._is_kept = _numba.njit(function, cache=True, **_OPTIONS), True
+        except (OSError, RuntimeError):  # no source, or no folder that can be written
+            self._compiled, self._is_kept = _numba.njit(function, **_OPTIONS), False
+
+    def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401  # as of the function
+        """What the function gives."""
+        try:
+            return self._compiled(*arguments)
+        except Exception:  # whatever a damaged file or a full disk raises, before anything is computed
+            if not self._is_kept:
+                raise
+            with suppress(OSError):
+                for file in Path(self._compiled.stats.cache_path).glob(f"*.{self._name}-*"):
+                    file.unlink()
+            self._compiled, self._is_kept = _numba.njit(self._function, **_OPTIONS), False
+            return self._compiled(*arguments)
+
+
+def _told(function: Callable[..., Any]) -> str:
+    """A digest of all that a function becomes machine code from."""
+    module = sys.modules[function.__module__]
+    numbers = sorted((k, repr(v)) for k, v in vars(module).items() if isinstance(v, int | float | np.number))
+    return digest(getsource(module), stated(numbers), stated(sorted(_ROUNDED)))
+
+
+def run(kernel: Kernel, arguments: Sequence[Tensor | float | int], parts: int) -> None:
+    """Run a kernel for each part of its work, on as many threads as torch has.
+
+    Args:
+        kernel: the kernel; its last argument is the number of the part.
+        arguments: its other arguments; tensors are given as arrays.
+        parts: number of parts, each of which writes what no other does.
+    """
+    given = [each.detach().contiguous().numpy() if isinstance(each, Tensor) else each for each in arguments]
+    if (threads := min(torch.get_num_threads(), parts)) > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(partial(kernel, *given), range(parts)))
+    else:
+        for part in range(parts):
+            kernel(*given, part)
