@@ -48,6 +48,31 @@ def test_a_process_at_work_ends_when_its_parent_is_killed(blow):
     assert not alive(child)
 
 
+KILLED_WITH_A_FILE = """
+import sys
+from contextlib import nullcontext
+from roadproof.processes import Pool
+if __name__ == "__main__":
+    with Pool(nullcontext, 2) as pool:
+        print([number for number, _ in pool.each(pool.settle(print), [1, 2])] and pool._folder.name, flush=True)
+        sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGTERM])
+def test_what_travelled_in_a_file_is_gone_when_the_parent_is_killed(blow):
+    asked = [sys.executable, "-c", KILLED_WITH_A_FILE]
+    with subprocess.Popen(asked, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
+        folder = Path(parent.stdout.readline().strip())
+        assert list(folder.iterdir())
+        parent.send_signal(blow)
+        parent.wait()
+    deadline = time.monotonic() + 20
+    while folder.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not folder.exists()
+
+
 def test_what_one_prints_is_none_of_the_results(capfd):
     with processes_beside(1) as pool:
         pool.submit(print, "loud", flush=True).result()
@@ -201,6 +226,8 @@ def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
         assert pool.settle(settled.function) is settled
         pool.settle(Tally())
         assert not settled.file.exists(), "only the last one is kept"
+        with pytest.raises(ControllerError, match="a controller that can be pickled"):
+            pool.settle(partial(sum, key=lambda: 0))
         shutil.rmtree(pool._folder.name)
         with pytest.raises(OutputError, match="TMPDIR"):
             pool.settle(Tally())

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import partial
 from inspect import getsource
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -68,7 +68,8 @@ class Kernel:
 def _told(function: Callable[..., Any]) -> str:
     """A digest of all that a function becomes machine code from."""
     module = sys.modules[function.__module__]
-    numbers = sorted((k, repr(v)) for k, v in vars(module).items() if isinstance(v, int | float | np.number))
+    kinds = (int, float, cast("type[object]", np.number))
+    numbers = sorted((name, repr(value)) for name, value in vars(module).items() if isinstance(value, kinds))
     return digest(getsource(module), stated(numbers), stated(sorted(_ROUNDED)))
 
 

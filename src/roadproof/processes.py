@@ -7,6 +7,7 @@ import io
 import multiprocessing
 import os
 import pickle
+import shutil
 import sys
 import tempfile
 import threading
@@ -30,6 +31,7 @@ from roadproof.machine import digits, keep_digits, keep_freed_memory
 DIED = "a driving process died; is there memory for all of them? try with fewer processes"
 """What is said of one that did not even raise an exception."""
 
+_PICKLED = "several processes need a controller that can be pickled: define its class in a module, or use one process"
 
 Inside = TypeVar("Inside")
 Work = TypeVar("Work")
@@ -67,9 +69,9 @@ class Pool(Generic[Inside]):
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
             self._stop = multiprocessing.get_context("spawn").Event()
             self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
+            given = (self._opens, self._stop, threads, Path(self._folder.name))
             self._beside = [
-                self._stack.enter_context(processes_beside(1, _begin_work, self._opens, self._stop, threads))
-                for _ in range(self.processes)
+                self._stack.enter_context(processes_beside(1, _begin_work, *given)) for _ in range(self.processes)
             ]
         return self
 
@@ -103,6 +105,7 @@ class Pool(Generic[Inside]):
 
         Raises:
             OutputError: the folder for temporary files cannot hold it.
+            ControllerError: something in it cannot be pickled.
         """
         if self.processes == 1:
             return Settled(function, None)
@@ -116,6 +119,8 @@ class Pool(Generic[Inside]):
                     f"cannot write what the processes of a search need to {self._folder.name}: {error.strerror}; let "
                     "TMPDIR be a folder with room for some hundred MB, or use one process"
                 ) from None
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
+                raise ControllerError(f"a search's controller cannot travel: {error}; {_PICKLED}") from None
             before, self._settled = self._settled, Settled(function, Path(name))
             if before is not None and before.file is not None:
                 before.file.unlink(missing_ok=True)
@@ -232,10 +237,7 @@ def require_picklable(driver: object) -> None:
     try:
         foreign.call("pickling the controller", pickle.dumps, driver)
     except ControllerError as error:
-        raise ControllerError(
-            f"{error}; several processes need a controller that can be pickled: define its class in a module, or "
-            "use one process"
-        ) from error.__cause__
+        raise ControllerError(f"{error}; {_PICKLED}") from error.__cause__
 
 
 class _Processor(pickle.Pickler):
@@ -266,11 +268,12 @@ def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:
 _opens: Opens[Any] | None = None
 _opened = ExitStack()
 _stop: Event | None = None
+_folder: Path | None = None
 
 
-def _begin_work(opens: Opens[Any], stop: Event, threads: int) -> None:
-    global _opens, _stop  # one of each a process, made by its initialiser
-    _opens, _stop = opens, stop
+def _begin_work(opens: Opens[Any], stop: Event, threads: int, folder: Path) -> None:
+    global _opens, _stop, _folder  # one of each a process, made by its initialiser
+    _opens, _stop, _folder = opens, stop, folder
     atexit.register(_opened.close)
     torch.set_num_threads(threads)
 
@@ -311,4 +314,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    if _folder is not None:
+        # A parent that was killed has left it.
+        shutil.rmtree(_folder, ignore_errors=True)
     os._exit(1)

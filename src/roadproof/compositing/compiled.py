@@ -72,7 +72,10 @@ class _Painted(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  # the decorator has no names for arguments
+        ctx: Any,  # noqa: ANN401
+        *grad_outputs: Tensor,
+    ) -> tuple[Tensor | None, ...]:
         figures, *pixels = ctx.saved_tensors
         many = pixels[0].shape[-1]
         shares = torch.empty(_blocks(many), *figures.shape, dtype=torch.float64)

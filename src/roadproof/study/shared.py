@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from roadproof.calibration import Calibrated
 from roadproof.controllers import Controller
 from roadproof.drives import Drives
 from roadproof.driving.drive_store import Episodes
@@ -24,7 +25,6 @@ from roadproof.io.files import write_atomically, write_folder_atomically
 from roadproof.io.identity import digest, stated
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.stage_costs import FILE, StageCost, read_cost
-from roadproof.recordings import load_recordings
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.plan import Job
 
@@ -111,7 +111,7 @@ class SharedRecordings:
         try:
             for place in self._places:
                 Drives.load(self.folder / place / "record")
-                load_recordings(self.folder / place / "recordings")
+                Calibrated.load(self.folder / place)
         except RoadproofError:
             return False
         return bool(self.cost)
@@ -120,12 +120,13 @@ class SharedRecordings:
 def bring_bare_drives(shared: Path, evaluation: Path) -> None:
     """Give an evaluation the drives over the bare road that others have made, but none that is damaged."""
     for file in shared.glob(_CLEAN):
-        if not (evaluation / "episodes" / file.name).exists():
+        if not (place := evaluation / "episodes" / file.name).exists():
             try:
                 Episode.load(file)
             except RoadproofError:
                 file.unlink(missing_ok=True)
-    _link(shared, evaluation / "episodes")
+            else:
+                _link_file(file, place)
 
 
 def keep_bare_drives(shared: Path, evaluation: Path, told: Evaluation) -> None:
@@ -150,14 +151,19 @@ def _folder(job: Job, world: Simulator, controller: Controller, work: Path, aske
 
 
 def _link(source: Path, target: Path, pattern: str = "**/*") -> None:
-    """Link to the files of a folder from another, or copy them where links cannot be made."""
+    """Link to the files of a folder from another."""
     for file in source.glob(pattern):
         place = target / file.relative_to(source)
         if file.is_file() and not place.exists():
-            place.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(file, place)
-            except FileExistsError:
-                pass
-            except OSError:
-                write_atomically(place, lambda part, file=file: shutil.copy2(file, part))
+            _link_file(file, place)
+
+
+def _link_file(file: Path, place: Path) -> None:
+    """Link to a file from another place, or copy it where links cannot be made."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(file, place)
+    except FileExistsError:
+        pass
+    except OSError:
+        write_atomically(place, lambda part: shutil.copy2(file, part))
