@@ -117,6 +117,15 @@ def control_of(
         return Control(*map(float, controller.controls(*one_frame_batch(controller, frame, speed_mps, command))[0]))
 
 
+_LUMA = (0.299, 0.587, 0.114)
+_YUV_FROM_RGB = (
+    _LUMA,
+    (-0.492 * _LUMA[0], -0.492 * _LUMA[1], 0.492 * (1 - _LUMA[2])),
+    (0.877 * (1 - _LUMA[0]), -0.877 * _LUMA[1], -0.877 * _LUMA[2]),
+)
+_YUV_OF_BLACK = (0.0, 128 / 255, 128 / 255)
+
+
 def yuv_from_rgb(frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
     """OpenCV's COLOR_RGB2YUV in [0, 1], without its rounding to 8 bits but with its saturation.
 
@@ -124,11 +133,11 @@ def yuv_from_rgb(frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         Y = 0.299 R + 0.587 G + 0.114 B, U = 0.492 (B − Y) + 128/255, V = 0.877 (R − Y) + 128/255. Saturated red or
         cyan leaves [0, 1] in V and is clipped there, as on 8-bit pictures.
     """
-    red, green, blue = frames.unbind(1)
-    luma = 0.299 * red + 0.587 * green + 0.114 * blue
-    middle = 128 / 255
-    yuv = torch.stack([luma, 0.492 * (blue - luma) + middle, 0.877 * (red - luma) + middle], dim=1)
-    return yuv.clamp(0.0, 1.0)
+    matrix, middle = constant(_YUV_FROM_RGB, frames), constant(_YUV_OF_BLACK, frames)
+    # One product reads and writes a picture once; with few digits U and V would be differences of rounded numbers.
+    with torch.autocast(frames.device.type, enabled=False):
+        yuv = torch.baddbmm(middle[:, None], matrix.expand(len(frames), 3, 3), frames.flatten(2))
+    return yuv.view_as(frames).clamp(0.0, 1.0)
 
 
 def resize_by_area(frames: Float[Tensor, "b 3 h w"], size: tuple[int, int]) -> Float[Tensor, "b 3 hn wn"]:
