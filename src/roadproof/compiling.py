@@ -78,10 +78,10 @@ def run(kernel: Kernel, arguments: Sequence[Tensor | float | int], parts: int) -
 
     Args:
         kernel: the kernel; its last argument is the number of the part.
-        arguments: its other arguments; tensors are given as arrays.
+        arguments: its other arguments; tensors are given as arrays, in the order in which their numbers lie.
         parts: number of parts, each of which writes what no other does.
     """
-    given = [each.detach().contiguous().numpy() if isinstance(each, Tensor) else each for each in arguments]
+    given = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
     if (threads := min(torch.get_num_threads(), parts)) > 1:
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(partial(kernel, *given), range(parts)))

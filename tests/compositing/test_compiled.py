@@ -5,6 +5,7 @@ import torch
 
 from pixels import both, some_pixels
 from roadproof.compositing import compiled
+from roadproof.compositing.compiled import Place
 from roadproof.search_space import SearchSpace
 
 
@@ -26,6 +27,56 @@ def test_each_pattern_may_have_pixels_of_its_own():
     (colours, gradient), (plain, expected) = both(compiled.painted, some_pixels(700, own=3), unit, space)
     torch.testing.assert_close(colours, plain, rtol=0, atol=3e-5)
     torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("channels", ["first", "last"])
+def test_pictures_are_painted_in_any_order_of_their_numbers_and_only_where_pixels_count(channels):
+    space, views = SearchSpace(figures=2), [some_pixels(90), some_pixels(60, own=2, seed=1)]
+    pictures = torch.rand(6, 3, 50, generator=torch.Generator().manual_seed(0))
+    pictures = pictures if channels == "first" else pictures.mT.contiguous().mT
+    bare = pictures.clone()
+    shuffled = torch.randperm(100, generator=torch.Generator().manual_seed(1))[:90]
+    own = torch.stack([torch.randperm(50, generator=torch.Generator().manual_seed(k)) for k in (2, 3)])
+    own = torch.cat([own, own[:, -1:].expand(-1, 10)], 1)
+    # Two patterns with two pictures each, then two with a picture and pixels of its own each, some of them copies.
+    places = [Place(shuffled[None], torch.tensor([90]), 0, 2), Place(own, torch.tensor([50, 20]), 4, 1)]
+    units = [space.random((2,), torch.Generator().manual_seed(k)).requires_grad_() for k in (4, 5)]
+    found = compiled.painted_into(pictures, [space.pattern(unit) for unit in units], views, places)
+    assert found.data_ptr() == pictures.data_ptr()
+    alone = [compiled.painted(space.pattern(unit), view) for unit, view in zip(units, views, strict=True)]
+    expected = bare.clone()
+    expected[:4] = expected[:4].view(2, 2, 3, 50).transpose(1, 2).flatten(2).index_copy(
+        2, shuffled, alone[0].detach().mT).view(2, 3, 2, 50).transpose(1, 2).flatten(0, 1)  # fmt: skip
+    for b, count in enumerate((50, 20)):
+        expected[4 + b].index_copy_(1, own[b, :count], alone[1][b, :count].detach().mT)
+    assert torch.equal(found, expected)
+    weight = torch.randn(found.shape, generator=torch.Generator().manual_seed(6))
+    weight = weight if channels == "first" else weight.mT.contiguous().mT
+    got = torch.autograd.grad((found * weight).sum(), units)
+    flat = weight[:4].view(2, 2, 3, 50).transpose(1, 2).flatten(2)[..., shuffled].mT
+    value = (alone[0] * flat).sum()
+    for b, count in enumerate((50, 20)):
+        value = value + (alone[1][b, :count] * weight[4 + b][:, own[b, :count]].mT).sum()
+    for one, other in zip(got, torch.autograd.grad(value, units), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_a_gradient_that_is_the_same_everywhere_needs_no_numbers_of_its_own():
+    space, pixels = SearchSpace(figures=2), some_pixels(40)
+    unit = space.random((2,), torch.Generator().manual_seed(0)).requires_grad_()
+    (one,) = torch.autograd.grad(compiled.painted(space.pattern(unit), pixels).sum(), unit)
+    (other,) = torch.autograd.grad((compiled.painted(space.pattern(unit), pixels) * torch.ones(2, 40, 3)).sum(), unit)
+    assert torch.equal(one, other)
+
+
+def test_what_was_painted_over_gives_no_gradient_any_more():
+    space, pixels = SearchSpace(figures=2), some_pixels(40)
+    unit = space.random((1,), torch.Generator().manual_seed(0)).requires_grad_()
+    pictures, place = torch.zeros(1, 3, 40), Place(torch.arange(40)[None], torch.tensor([40]))
+    first = compiled.painted_into(pictures, [space.pattern(unit)], [pixels], [place]).square()
+    compiled.painted_into(pictures, [space.pattern(unit)], [pixels], [place])
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        first.sum().backward()
 
 
 def test_any_number_of_threads_adds_up_to_the_same(two_threads):

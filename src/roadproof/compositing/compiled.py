@@ -24,11 +24,12 @@ dimension of 1, or of B where each pattern has pixels of its own.
 
 from __future__ import annotations
 
-from typing import Any, cast, no_type_check
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -41,34 +42,78 @@ BLOCK = 1 << 14
 """Pixels that are taken at once."""
 
 _ZERO, _HALF, _ONE, _LEAST = np.float32(0), np.float32(0.5), np.float32(1), np.float32(MIN_VARIANCE)
-_NUMBERS = 12
+_NAN, _NUMBERS = np.float32(np.nan), 12
+
+
+class Place(NamedTuple):
+    """Where the P pixels of a view lie in the pictures that are painted.
+
+    Args:
+        pixel: index of each pixel in a pattern's pictures, flattened, (1, P), or (B, P) where each of B patterns has
+            pixels of its own.
+        counted: how many pixels of each row count, (1,) or (B,); the rest fill it up.
+        first: the first of the view's pictures.
+        each: how many pictures a pattern has.
+    """
+
+    pixel: Int[Tensor, "w p"]
+    counted: Int[Tensor, " w"]
+    first: int = 0
+    each: int = 1
 
 
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
-    """Colours of the canvas' pixels with rectangles painted, differentiable once in their boxes and colours.
+    """Colours of the canvas' pixels with rectangles painted, differentiable as in `painted_into`."""
+    batch, many = pattern.boxes.shape[:-2], view.clean.shape[-2]
+    colours = view.clean.new_empty(batch.numel(), many, 3)
+    rows = view.clean.shape[:-2].numel()
+    place = Place(torch.arange(many).expand(rows, -1), torch.full((rows,), many))
+    return painted_into(colours.mT, [pattern], [view], [place]).mT.view(*batch, many, 3)
+
+
+def painted_into(
+    pictures: Float[Tensor, "n 3 q"],
+    patterns: Sequence[Pattern],
+    views: Sequence[CanvasPixels],
+    places: Sequence[Place],
+) -> Float[Tensor, "n 3 q"]:
+    """Pictures with rectangles painted in the canvas' pixels of some views, differentiable once in boxes and colours.
 
     Widths and lengths are above 0, and what is known of the pixels is finite.
+
+    Args:
+        pictures: N flattened pictures of float32; they are written to, and what is returned shares their memory.
+        patterns: a batch of patterns for each view.
+        views: what the pictures show of the canvas.
+        places: where the pixels of each view lie in the pictures.
     """
-    batch, count = pattern.boxes.shape[:-2], len(pattern.shapes)
-    figures = view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3))
-    many = view.clean.shape[-2]
-    features = view.footprints.features.reshape(-1, 6, many)
-    lights = (each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias))
-    colours = cast("Tensor", _Painted.apply(figures, features, *lights))
-    return colours.view(*batch, *colours.shape[1:])
+    figures, pixels = list[Tensor](), list[tuple[Tensor, ...]]()
+    for pattern, view in zip(patterns, views, strict=True):
+        count, many = len(pattern.shapes), view.clean.shape[-2]
+        figures.append(view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3)))
+        features = view.footprints.features.reshape(-1, 6, many)
+        pixels.append((features, *(each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias))))
+    return cast("Tensor", _Painted.apply(_Canvases(pictures, pixels, places), *figures))
+
+
+class _Canvases(NamedTuple):
+    """What is painted on, out of sight of what takes the gradients."""
+
+    pictures: Float[Tensor, "n 3 q"]
+    pixels: Sequence[tuple[Tensor, ...]]
+    places: Sequence[Place]
 
 
 class _Painted(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, figures: Tensor, *pixels: Tensor) -> Tensor:  # noqa: ANN401
-        colours = figures.new_empty(len(figures), pixels[0].shape[-1], 3)
-        run(_paint, (figures, *pixels, colours), _blocks(colours.shape[1]))
-        # Distances of figures that are not finite compare with nothing.
-        nowhere = ~figures.isfinite().flatten(1).all(1)
-        if bool(nowhere.any()):
-            colours[nowhere] = torch.nan
-        ctx.save_for_backward(figures, *pixels)
-        return colours
+    def forward(ctx: Any, on: _Canvases, *figures: Tensor) -> Tensor:  # noqa: ANN401
+        ctx.on = on
+        ctx.save_for_backward(*figures)
+        for each, pixels, place in zip(figures, on.pixels, on.places, strict=True):
+            told = _told(each, pixels, place, on.pictures)
+            run(_paint, told, _blocks(place))
+        torch.autograd.graph.increment_version(on.pictures)
+        return on.pictures.detach()
 
     @staticmethod
     @once_differentiable
@@ -76,15 +121,31 @@ class _Painted(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         *grad_outputs: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        figures, *pixels = ctx.saved_tensors
-        many = pixels[0].shape[-1]
-        shares = torch.empty(_blocks(many), *figures.shape, dtype=torch.float64)
-        run(_unpaint, (figures, *pixels, grad_outputs[0], shares), len(shares))
-        return shares.sum(0).to(figures.dtype), None, None, None, None
+        gradients = list[Tensor | None]([None])
+        for each, pixels, place in zip(ctx.saved_tensors, ctx.on.pixels, ctx.on.places, strict=True):
+            shares = torch.empty(_blocks(place), *each.shape, dtype=torch.float64)
+            run(_unpaint, (*_told(each, pixels, place, grad_outputs[0]), shares), len(shares))
+            gradients.append(shares.sum(0).to(each.dtype))
+        return tuple(gradients)
 
 
-def _blocks(many: int) -> int:
-    return -(-many // BLOCK)
+def _blocks(place: Place) -> int:
+    """How many parts the pixels of a view are taken in."""
+    return -(-place.pixel.shape[1] // BLOCK)
+
+
+def _told(
+    figures: Tensor, pixels: tuple[Tensor, ...], place: Place, pictures: Float[Tensor, "n 3 q"]
+) -> tuple[Tensor | int, ...]:
+    """What a kernel is told of a view; pictures as one row of numbers, and how far apart those of each dimension are.
+
+    A kernel is compiled once for all orders of a picture's numbers: channels first as channels last.
+    """
+    strides = pictures.stride()
+    extent = sum((size - 1) * stride for size, stride in zip(pictures.shape, strides, strict=True)) + 1
+    row = pictures.detach().as_strided((extent if pictures.numel() else 0,), (1,))
+    given = (figures, *pixels, place.pixel, place.counted)
+    return *(each.contiguous() for each in given), place.first, place.each, row, pictures.shape[2], *strides
 
 
 @inline
@@ -159,42 +220,64 @@ def _composed(clean, gain, bias, w, p, red, green, blue, share):
     return red, green, clean[w, p, 2] + gain[w, p, 2] * blue + bias[w, p, 2] * share
 
 
+@inline
+@no_type_check
+def _are_numbers(figures, b):
+    """Whether all numbers of a pattern are finite: distances of others compare with nothing."""
+    known = True
+    for k in range(figures.shape[1]):
+        for number in range(_NUMBERS):
+            known &= np.isfinite(figures[b, k, number])
+    return known
+
+
 @Kernel
 @no_type_check
-def _paint(figures, features, clean, gain, bias, colours, block):
-    """Colours of a block of pixels, clipped to [0, 1]."""
-    many, count = clean.shape[1], figures.shape[1]
-    masks, above = np.empty(count, np.float32), np.empty(count, np.float32)
+def _paint(
+    figures, features, clean, gain, bias, pixels, counted, first, each, row, size, to_next, to_channel, to_pixel, block
+):  # fmt: skip
+    """Colours of a block of pixels, clipped to [0, 1]; NaN where a figure is."""
+    masks, above = np.empty(figures.shape[1], np.float32), np.empty(figures.shape[1], np.float32)
     for b in range(figures.shape[0]):
         w = b if clean.shape[0] > 1 else 0
-        for p in range(block * BLOCK, min(many, (block + 1) * BLOCK)):
+        known = _are_numbers(figures, b)
+        for p in range(block * BLOCK, min(counted[w], (block + 1) * BLOCK)):
             x, y = features[w, 0, p], features[w, 1, p]
             xx, xy, yy = features[w, 3, p], features[w, 4, p], features[w, 5, p]
             red, green, blue, share = _laid(figures, b, x, y, xx, xy, yy, masks, above)
             red, green, blue = _composed(clean, gain, bias, w, p, red, green, blue, share)
-            colours[b, p, 0] = min(_ONE, max(_ZERO, red))
-            colours[b, p, 1] = min(_ONE, max(_ZERO, green))
-            colours[b, p, 2] = min(_ONE, max(_ZERO, blue))
+            at = np.uint32(pixels[w, p])
+            picture, pixel = at // np.uint32(size), at % np.uint32(size)
+            at = (first + b * each + np.int64(picture)) * to_next + np.int64(pixel) * to_pixel
+            row[at] = min(_ONE, max(_ZERO, red)) if known else _NAN
+            row[at + to_channel] = min(_ONE, max(_ZERO, green)) if known else _NAN
+            row[at + 2 * to_channel] = min(_ONE, max(_ZERO, blue)) if known else _NAN
 
 
 @Kernel
 @no_type_check
-def _unpaint(figures, features, clean, gain, bias, grad, shares, block):
+def _unpaint(
+    figures, features, clean, gain, bias, pixels, counted, first, each, row, size, to_next, to_channel, to_pixel,
+    shares, block,
+):  # fmt: skip
     """A block's share of the gradient of every number of the figures."""
-    many, count = clean.shape[1], figures.shape[1]
-    masks, above = np.empty(count, np.float32), np.empty(count, np.float32)
-    added = np.empty((count, _NUMBERS), np.float64)
+    many = figures.shape[1]
+    masks, above = np.empty(many, np.float32), np.empty(many, np.float32)
+    added = np.empty((many, _NUMBERS), np.float64)
     for b in range(figures.shape[0]):
         w = b if clean.shape[0] > 1 else 0
         added[:] = 0.0
-        for p in range(block * BLOCK, min(many, (block + 1) * BLOCK)):
+        for p in range(block * BLOCK, min(counted[w], (block + 1) * BLOCK)):
             x, y = features[w, 0, p], features[w, 1, p]
             xx, xy, yy = features[w, 3, p], features[w, 4, p], features[w, 5, p]
             red, green, blue, share = _laid(figures, b, x, y, xx, xy, yy, masks, above)
             if share == _ZERO:
                 continue
             # What was clipped has no gradient.
-            on_red, on_green, on_blue = grad[b, p, 0], grad[b, p, 1], grad[b, p, 2]
+            at = np.uint32(pixels[w, p])
+            picture, pixel = at // np.uint32(size), at % np.uint32(size)
+            at = (first + b * each + np.int64(picture)) * to_next + np.int64(pixel) * to_pixel
+            on_red, on_green, on_blue = row[at], row[at + to_channel], row[at + 2 * to_channel]
             red, green, blue = _composed(clean, gain, bias, w, p, red, green, blue, share)
             if red < _ZERO or red > _ONE:
                 on_red = _ZERO
@@ -205,7 +288,7 @@ def _unpaint(figures, features, clean, gain, bias, grad, shares, block):
             on_share = on_red * bias[w, p, 0] + on_green * bias[w, p, 1] + on_blue * bias[w, p, 2]
             on_red, on_green, on_blue = on_red * gain[w, p, 0], on_green * gain[w, p, 1], on_blue * gain[w, p, 2]
             below = _ZERO
-            for k in range(count):
+            for k in range(many):
                 mask = masks[k]
                 if mask == _ZERO:
                     continue
@@ -241,6 +324,6 @@ def _unpaint(figures, features, clean, gain, bias, grad, shares, block):
                 added[k, 6] += spread_u * yy + spread_v * xx
                 added[k, 7] += (on_low_u + on_high_u) * sharp_u
                 added[k, 8] += (on_low_v + on_high_v) * sharp_v
-        for k in range(count):
+        for k in range(many):
             for number in range(_NUMBERS):
                 shares[block, b, k, number] = added[k, number]

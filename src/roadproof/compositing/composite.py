@@ -65,6 +65,8 @@ class Compositor:
             patterns: one batch of `copies` patterns for each view.
             looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
         """
+        if looks is None and all(map(_compiles, patterns, self._views)):
+            return self._compiled(patterns)
         colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
         if looks is not None:
             colours = [
@@ -72,6 +74,17 @@ class Compositor:
                 for colour, view in zip(colours, self._views, strict=True)
             ]
         return cast("Tensor", _Pasted.apply(self, *colours))
+
+    def _compiled(self, patterns: Sequence[Pattern]) -> Float[Tensor, "n 3 h w"]:
+        # It is compiled when it is first wanted.
+        from roadproof.compositing.compiled import Place, painted_into
+
+        places, first = list[Place](), 0
+        for view in self._views:
+            places.append(Place(view.index[None], torch.tensor([len(view.index)]), first, len(view.frames)))
+            first += self._copies * len(view.frames)
+        painted = painted_into(self._frames.flatten(1, 2).mT, patterns, self._views, places)
+        return painted.view(*painted.shape[:2], *self._frames.shape[1:3])
 
     def slots(self, frames: Tensor) -> list[Float[Tensor, "c p 3"]]:
         """For each view the flattened pixels of its share of a batch of frames, (copies, F·H·W, 3), as a view of it."""
@@ -113,6 +126,11 @@ def composite_own(
         views: the pixels of each picture through which the canvas shows.
         looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
     """
+    if looks is None and _compiles(pattern, views):
+        from roadproof.compositing.compiled import Place, painted_into
+
+        place = Place(views.pixel, views.valid.sum(1))
+        return painted_into(frames.flatten(2).clone(), [pattern], [views], [place]).view_as(frames)
     colours = canvas_colours(pattern, views)
     if looks is not None:
         colours = _worn(colours, views.clean, looks.left(views.footprints.centre[:, 0], len(frames)))
@@ -128,20 +146,28 @@ def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
 
 def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
-    only_rectangles = all(shape is Shape.RECTANGLE for shape in pattern.shapes)
-    if only_rectangles and fuses(view.clean):
+    if _has_only_rectangles(pattern) and fuses(view.clean):
         # Triton may be missing.
         from roadproof.compositing.fused import painted as painted_on_gpu
 
         return painted_on_gpu(pattern, view)
     if view.dense:
         return dense_colours(pattern, view)
-    if only_rectangles and view.clean.dtype == torch.float32 and view.clean.device.type == "cpu":
-        # It is compiled when it is first wanted.
+    if _compiles(pattern, view):
         from roadproof.compositing.compiled import painted
 
         return painted(pattern, view)
     return blend(visibilities(coverages(pattern, view.footprints)), view.response(pattern.colours), view)
+
+
+def _has_only_rectangles(pattern: Pattern) -> bool:
+    return all(shape is Shape.RECTANGLE for shape in pattern.shapes)
+
+
+def _compiles(pattern: Pattern, view: CanvasPixels) -> bool:
+    """Whether a pass compiled for the processor paints a pattern."""
+    here = view.clean.dtype == torch.float32 and view.clean.device.type == "cpu"
+    return here and not view.dense and _has_only_rectangles(pattern)
 
 
 def dense_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:

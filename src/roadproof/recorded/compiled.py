@@ -53,7 +53,7 @@ def draw(
         beyond: how far each pixel lies beyond the frame that it was drawn from, in halves of its size, infinite where
             nothing is drawn yet; written to.
     """
-    run(_draw, (levels, frame, source.float(), horizon_row, row, drawn, beyond), len(row))
+    run(_draw, (levels, frame, source.float().contiguous(), horizon_row, row, drawn, beyond), len(row))
 
 
 def lit_canvas(
@@ -80,7 +80,7 @@ def lit_canvas(
     """
     many, width = len(frames), frames.shape[-1]
     touches = torch.zeros(many, rows.stop - rows.start, width, dtype=torch.uint8)
-    canvas = canvas_from_input.float()
+    canvas, source = canvas_from_input.float().contiguous(), source.float().contiguous()
     run(_find, (canvas, rows.start, touches), many)
     most = int(touches.sum((1, 2)).max())
     if most == 0:
@@ -92,7 +92,7 @@ def lit_canvas(
     variance = FOOTPRINT_VARIANCE[resampling]
     lit = (light.values, light.of_frames, variance)
     found = (pixel, valid, centre, jacobian, features, clean, gain, bias)
-    run(_light, (frames, canvas, rows.start, touches, frame, source.float(), *lit, *found), many)
+    run(_light, (frames, canvas, rows.start, touches, frame, source, *lit, *found), many)
     footprints = Footprints(centre, jacobian, features, variance)
     return OwnViews(
         pixel=pixel, valid=valid, footprints=footprints, clean=clean, gain=gain, bias=bias, response=response

@@ -13,6 +13,7 @@ wheels that grip turn a car further than a free body of its size.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -56,7 +57,7 @@ class Obstacles:
     ) -> None:
         rows = [(o.x_m - middle[0], o.y_m - middle[1], o.yaw_rad, o.half_length_m, o.half_width_m) for o in obstacles]
         boxes = torch.tensor(rows, dtype=torch.float64).reshape(-1, 5)
-        away = _distances(torch.tensor(path), boxes)[0].amin(0)
+        away = _seen(torch.tensor(path), boxes).away.amin(0)
         self._boxes = boxes[(away > RADIUS_M) & (away < NEAR_M)].to(device)
         self._ahead = torch.tensor(AHEAD_M, dtype=torch.float64, device=device)
 
@@ -88,7 +89,7 @@ class Obstacles:
         x, y, yaw = car.x_m, car.y_m, car.yaw_rad
         # Most of the time nothing touches: that is asked without gradients, which would cost twice as much.
         here = (each.detach() for each in (x, y, yaw))
-        if asks and not (_distances(self._circles(*here), self._boxes)[0] < RADIUS_M).any():
+        if asks and not (_seen(self._circles(*here), self._boxes).away < RADIUS_M).any():
             return car
         pushed = torch.zeros_like(x)
         for _ in range(_PUSHES):
@@ -119,20 +120,42 @@ def _rules(dt_s: float) -> dict[str, float]:
     return {"radius": RADIUS_M, "gyration": GYRATION_M, "slowed": slowed, "dt_s": dt_s, "pushes": _PUSHES}
 
 
-def _distances(
-    points: Float[Tensor, "*p 2"], boxes: Float[Tensor, "b 5"]
-) -> tuple[Float[Tensor, "*p b"], Float[Tensor, "*p b 2"]]:
-    """Distance of points from boxes, negative inside, and the unit vectors that point away from them."""
+class _Seen(NamedTuple):
+    """Points as they lie before boxes.
+
+    Args:
+        place: in the axes of each box, metres, (*p, B, 2).
+        past: how far beyond its sides, metres, (*p, B, 2).
+        away: distance from it, metres, negative inside, (*p, B).
+    """
+
+    place: Float[Tensor, "*p b 2"]
+    past: Float[Tensor, "*p b 2"]
+    away: Float[Tensor, "*p b"]
+
+
+def _seen(points: Float[Tensor, "*p 2"], boxes: Float[Tensor, "b 5"]) -> _Seen:
     x, y, yaw, half_length, half_width = boxes.unbind(1)
     c, s = torch.cos(yaw), torch.sin(yaw)
     dx, dy = points[..., None, 0] - x, points[..., None, 1] - y
     place = torch.stack([c * dx + s * dy, c * dy - s * dx], -1)
-    beyond = place.abs() - torch.stack([half_length, half_width], -1)
-    outside = beyond.clamp_min(0.0)
-    # Inside the nearest side counts; the small addition keeps the gradient finite there.
+    past = place.abs() - torch.stack([half_length, half_width], -1)
+    outside, inside = past.clamp_min(0.0), past.amax(-1)
+    # The small addition keeps the gradient finite inside.
     far = (outside.square().sum(-1) + 1e-18).sqrt()
-    inside = beyond.amax(-1)
-    side = (beyond.argmax(-1, keepdim=True) == torch.arange(2, device=points.device)).to(points)
-    normal = torch.where((inside > 0)[..., None], outside / far[..., None], side) * torch.where(place < 0, -1.0, 1.0)
+    return _Seen(place, past, torch.where(inside > 0, far, inside))
+
+
+def _distances(
+    points: Float[Tensor, "*p 2"], boxes: Float[Tensor, "b 5"]
+) -> tuple[Float[Tensor, "*p b"], Float[Tensor, "*p b 2"]]:
+    """Distance of points from boxes, negative inside, and the unit vectors that point away from them."""
+    place, past, away = _seen(points, boxes)
+    yaw = boxes[:, 2]
+    c, s = torch.cos(yaw), torch.sin(yaw)
+    # Inside the nearest side counts.
+    side = (past.argmax(-1, keepdim=True) == torch.arange(2, device=points.device)).to(points)
+    outward = torch.where((away > 0)[..., None], past.clamp_min(0.0) / away.clamp_min(1e-9)[..., None], side)
+    normal = outward * torch.where(place < 0, -1.0, 1.0)
     world = torch.stack([c * normal[..., 0] - s * normal[..., 1], s * normal[..., 0] + c * normal[..., 1]], -1)
-    return torch.where(inside > 0, far, inside), world
+    return away, world
