@@ -93,3 +93,10 @@ def test_frames_that_do_not_fit_are_refused():
         FramePreparation(rows=(15, 81))(torch.zeros(1, 3, 66, 200))
     with pytest.raises(ControllerError, match="takes 200×88"):
         FramePreparation(frame_size=(88, 200))(torch.zeros(1, 3, 66, 200))
+
+
+def test_few_digits_of_a_network_are_not_those_of_its_input():
+    frames = torch.rand(1, 3, 4, 5, generator=torch.Generator().manual_seed(0))
+    expected = yuv_from_rgb(frames)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(yuv_from_rgb(frames), expected)

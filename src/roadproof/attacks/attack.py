@@ -128,7 +128,9 @@ def attack(
     frames = measure.frames_evaluated
     if search.gave_way and isinstance(measure, BatchedMeasure):
         measure = measure.of_groups([k for k in range(len(groups)) if k not in search.gave_way])
-    beside = Sides((measure,), pool).of(0, measure) if isinstance(measure, RecordedMeasure) else None
+    beside = search.beside
+    if beside is None and isinstance(measure, RecordedMeasure):
+        beside = Sides((measure,), pool).of(0, measure)
     readings = (None, None) if beside is None else beside.readings(space, search.best_unit)
     candidates = _candidates(measure, search, space, method, readings)
     cost = Cost(

@@ -125,6 +125,7 @@ class Search:
         gave_way: best value of each group that gave its places to the others, by its number; the G groups above are
             the rest, in their order.
         steps: how steps were run on a GPU, in words; empty on a CPU.
+        beside: the measure of the G groups, side by side where they were searched so; None has nobody ready.
     """
 
     best_unit: Points
@@ -132,6 +133,7 @@ class Search:
     history: Float[Tensor, "i _ c"]
     gave_way: dict[int, float] = field(default_factory=dict[int, float])
     steps: str = ""
+    beside: Beside | RecordedMeasure | None = None
 
 
 class Running(TypedDict, total=False):
@@ -198,14 +200,15 @@ def gradopt(
     climb = _Climb(measure, climbing, views, Sides((*views, measure), running.get("pool")), space, momentum, Counter())
     state, behind = _climbed(climb, rungs, **running)
     best, last = state["best"], _of_groups(measure, behind)
+    beside = climb.sides.of(len(rungs), last)
     if isinstance(last, BatchedMeasure) and (last.variation is not None or climbing is not measure):
         # Every step had looks of its own, or fewer digits; results are compared in the same ones.
         last.redraw(FIXED)
-        best = climb.sides.of(len(rungs), last).values(space, state["best_unit"])
+        best = beside.values(space, state["best_unit"])
     gave_way = {k: value for k, value in enumerate(cast("list[float]", behind.tolist())) if not math.isnan(value)}
     kernels = measure.device.type == "cpu" or compiles_kernels(measure.device)
     steps = steps_in_words(climb.run, kernels=kernels)
-    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps)
+    return Search(state["best_unit"], best, state["history"].cpu(), gave_way, steps, beside)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

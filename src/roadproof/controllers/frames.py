@@ -6,6 +6,7 @@ Convention:
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,7 +136,8 @@ def yuv_from_rgb(frames: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
     """
     matrix, middle = constant(_YUV_FROM_RGB, frames), constant(_YUV_OF_BLACK, frames)
     # One product reads and writes a picture once; with few digits U and V would be differences of rounded numbers.
-    with torch.autocast(frames.device.type, enabled=False):
+    device = frames.device.type
+    with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
         yuv = torch.baddbmm(middle[:, None], matrix.expand(len(frames), 3, 3), frames.flatten(2))
     return yuv.view_as(frames).clamp(0.0, 1.0)
 
