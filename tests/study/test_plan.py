@@ -91,7 +91,7 @@ def test_jobs_on_a_map_of_the_users_are_known_by_what_is_in_it_wherever_it_lies(
 
 def test_the_keys_of_jobs_stay_what_they_were():
     jobs = load_study(Path(__file__).parents[2] / "studies" / "small.toml").jobs
-    assert (jobs[0].key, jobs[-1].key) == ("69869b0d41cbf22d", "bae7e71332f47d46")
+    assert (jobs[0].key, jobs[-1].key) == ("8ab07d5d14745fc2", "bae7e71332f47d46")
 
 
 @pytest.mark.parametrize(

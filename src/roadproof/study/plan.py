@@ -7,7 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from roadproof.attacks import BayesianOptimisation
+from roadproof.attacks import BayesianOptimisation, GradOpt
 from roadproof.compositing import Variation
 from roadproof.controllers.loading import files_of
 from roadproof.controllers.shipped import installed_weights, shipped_names
@@ -28,8 +28,11 @@ from roadproof.study.methods import BlackBoxPlan, MethodPlan, PublishedPlan, met
 FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
 JOB_VERSION = 3
-JOB_VERSIONS = {BayesianOptimisation.word: 4}
-"""Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
+JOB_VERSIONS = {BayesianOptimisation.word: 4, GradOpt.word: 4}
+"""Raised when a job of the same settings would come out differently: old results are then not taken for new ones.
+
+A black box that begins with GradOpt's patterns has GradOpt's.
+"""
 
 BLACK = "1-b"
 
@@ -111,7 +114,8 @@ class Job(Conditions):
     @property
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
-        version = JOB_VERSIONS.get(self.method.search, JOB_VERSION)
+        begun = isinstance(self.method, BlackBoxPlan) and self.method.start
+        version = JOB_VERSIONS.get(GradOpt.word if begun else self.method.search, JOB_VERSION)
         told: dict[str, Any] = {"job_version": version, **asdict(self), "scenario": identity(self.scenario)}
         # Jobs are older than these words; a map of the user's is known by what is in it, not by where it lies.
         tables = (
