@@ -221,10 +221,8 @@ class FrameBank:
         if rows is None:
             return Views(frames, None)
         canvas_from_input = self._canvas_from_ground @ moved.ground_from_input
-        of_frame = (moved.frame, source, self._light)
-        return Views(
-            frames, lit_canvas(frames, rows, canvas_from_input, *of_frame, self.view.resampling, self._response)
-        )
+        told = (moved.frame, source, self._light, view.resampling, self._response)
+        return Views(frames, lit_canvas(frames, rows, canvas_from_input, *told))
 
     def _plain(self, poses: Poses, moved: Moved, to_paint: bool) -> Views:
         source = self._seen_at(moved)
