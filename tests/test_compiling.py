@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import no_type_check
 
@@ -82,6 +83,32 @@ def test_what_is_damaged_of_a_kept_kernel_is_compiled_anew(scaled, which):
     assert imported()(2.0) == 6.0
     assert imported()(2.0) == 6.0
     assert len(damaged.read_bytes()) > 20
+
+
+def test_threads_may_find_the_damage_at_once(scaled):
+    imported, kept = scaled
+    imported()(2.0)
+    for file in kept():
+        file.write_bytes(b"damaged")
+    kernel, interval = imported(), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            assert list(pool.map(kernel, [2.0] * 8)) == [6.0] * 8
+    finally:
+        sys.setswitchinterval(interval)
+
+
+@Kernel
+@no_type_check
+def _over(found, number, part):
+    found[part] = number / found[part]
+
+
+def test_a_division_by_nought_is_that_of_tensors():
+    found = torch.zeros(2)
+    run(_over, (found, 1.0), 2)
+    assert found.isinf().all()
 
 
 def test_an_error_of_the_call_itself_is_raised(scaled):

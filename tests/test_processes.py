@@ -1,5 +1,6 @@
 """Processes beside this one end with it, also when it is killed; pieces of work are done once, and nobody is left."""
 
+import ctypes
 import multiprocessing
 import os
 import shutil
@@ -226,8 +227,10 @@ def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
         assert pool.settle(settled.function) is settled
         pool.settle(Tally())
         assert not settled.file.exists(), "only the last one is kept"
-        with pytest.raises(ControllerError, match="a controller that can be pickled"):
-            pool.settle(partial(sum, key=lambda: 0))
+        for cannot in (lambda: 0, ctypes.pointer(ctypes.c_int(0))):
+            with pytest.raises(ControllerError, match="a controller that can be pickled"):
+                pool.settle(partial(sum, key=cannot))
+        assert len(list(Path(pool._folder.name).iterdir())) == 1, "nothing half written"
         shutil.rmtree(pool._folder.name)
         with pytest.raises(OutputError, match="TMPDIR"):
             pool.settle(Tally())

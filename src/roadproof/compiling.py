@@ -14,6 +14,7 @@ from contextlib import suppress
 from functools import partial
 from inspect import getsource
 from pathlib import Path
+from threading import Lock
 from typing import Any, cast
 
 import numpy as np
@@ -27,9 +28,12 @@ _numba: Any = importlib.import_module("numba")
 _ROUNDED = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """What may be computed otherwise than written, but for NaN and infinity, which stay what they are."""
 
-_OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": _ROUNDED}
+_ALIKE: dict[str, Any] = {"fastmath": _ROUNDED, "error_model": "numpy"}
+"""A division by 0 gives what it gives in tensors."""
 
-inline: Any = _numba.njit(inline="always", fastmath=_ROUNDED)
+_OPTIONS = {"nogil": True} | _ALIKE
+
+inline: Any = _numba.njit(inline="always", **_ALIKE)
 """A function that kernels use, compiled as a part of them."""
 
 
@@ -44,7 +48,7 @@ class Kernel:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+        self._function, self._lock = function, Lock()
         try:
             function.__qualname__ = self._name = f"{function.__qualname__}_{_told(function)[:16]}"
             self._compiled, self._is_kept = _numba.njit(function, cache=True, **_OPTIONS), True
@@ -53,15 +57,18 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:  # noqa: ANN401  # as of the function
         """What the function gives."""
+        compiled = self._compiled
         try:
-            return self._compiled(*arguments)
+            return compiled(*arguments)
         except Exception:  # whatever a damaged file or a full disk raises, before anything is computed
-            if not self._is_kept:
-                raise
-            with suppress(OSError):
-                for file in Path(self._compiled.stats.cache_path).glob(f"*.{self._name}-*"):
-                    file.unlink()
-            self._compiled, self._is_kept = _numba.njit(self._function, **_OPTIONS), False
+            with self._lock:
+                if compiled is self._compiled:
+                    if not self._is_kept:
+                        raise
+                    with suppress(OSError):
+                        for file in Path(compiled.stats.cache_path).glob(f"*.{self._name}-*"):
+                            file.unlink()
+                    self._compiled, self._is_kept = _numba.njit(self._function, **_OPTIONS), False
             return self._compiled(*arguments)
 
 
@@ -70,7 +77,7 @@ def _told(function: Callable[..., Any]) -> str:
     module = sys.modules[function.__module__]
     kinds = (int, float, cast("type[object]", np.number))
     numbers = sorted((name, repr(value)) for name, value in vars(module).items() if isinstance(value, kinds))
-    return digest(getsource(module), stated(numbers), stated(sorted(_ROUNDED)))
+    return digest(getsource(module), stated(numbers), stated([sorted(_ROUNDED), _ALIKE["error_model"]]))
 
 
 def run(kernel: Kernel, arguments: Sequence[Tensor | float | int], parts: int) -> None:

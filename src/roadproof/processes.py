@@ -18,6 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
+from itertools import count
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar, cast
@@ -62,6 +63,7 @@ class Pool(Generic[Inside]):
         self.processes = processes
         self._opens, self._stack = opens, ExitStack()
         self._settled: Settled[Inside, Any, Any] | None = None
+        self._number = count()
 
     def __enter__(self) -> Pool[Inside]:
         if self.processes > 1:
@@ -110,18 +112,20 @@ class Pool(Generic[Inside]):
         if self.processes == 1:
             return Settled(function, None)
         if self._settled is None or self._settled.function is not function:
+            path = Path(self._folder.name) / f"settled-{next(self._number)}"
             try:
-                handle, name = tempfile.mkstemp(dir=self._folder.name)
-                with os.fdopen(handle, "wb") as file:
+                with path.open("wb") as file:
                     _Processor(file).dump(function)
             except OSError as error:
+                path.unlink(missing_ok=True)
                 raise OutputError(
                     f"cannot write what the processes of a search need to {self._folder.name}: {error.strerror}; let "
                     "TMPDIR be a folder with room for some hundred MB, or use one process"
                 ) from None
-            except (pickle.PicklingError, AttributeError, TypeError) as error:
-                raise ControllerError(f"a search's controller cannot travel: {error}; {_PICKLED}") from None
-            before, self._settled = self._settled, Settled(function, Path(name))
+            except Exception as error:  # of a user's controller
+                path.unlink(missing_ok=True)
+                raise ControllerError(f"a search's controller cannot travel: {error}; {_PICKLED}") from error
+            before, self._settled = self._settled, Settled(function, path)
             if before is not None and before.file is not None:
                 before.file.unlink(missing_ok=True)
         return self._settled

@@ -8,7 +8,7 @@ from references import approach
 from roadproof.compositing import Compositor, composite, view_canvas
 from roadproof.compositing.composite import blend, canvas_colours, dense_colours
 from roadproof.coverage import Shape
-from roadproof.errors import GeometryError
+from roadproof.errors import GeometryError, PatternError
 from roadproof.geometry import CIL_INPUT
 from roadproof.patterns import Pattern, coverages, visibilities
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
@@ -179,3 +179,22 @@ def test_visibility_of_composited_figures_is_a_partition_on_real_homographies(ca
     assert float(masks.min()) >= 0
     assert float(masks.max()) <= 1 + 1e-6
     torch.testing.assert_close(visibilities(masks).sum(-2), 1 - (1 - masks).prod(-2), atol=1e-6, rtol=0)
+
+
+def test_a_controller_may_write_into_the_frames_that_it_is_given():
+    view, space = make_view(dtype=torch.float32), SearchSpace(figures=2)
+    pattern = space.drawn(2, 0)
+    compositor = Compositor([view], copies=2)
+    expected = compositor([pattern]).clone()
+    for wants in (True, False):
+        boxes = pattern.boxes.clone().requires_grad_(wants)
+        shown = compositor([Pattern(pattern.shapes, boxes, pattern.colours)])
+        assert torch.equal(shown, expected)
+        shown.sub_(0.5)
+    assert torch.equal(compositor([pattern]), expected)
+
+
+def test_as_many_patterns_are_painted_as_there_are_copies():
+    view, space = make_view(dtype=torch.float32), SearchSpace(figures=2)
+    with pytest.raises(PatternError, match="3 patterns do not fit"):
+        Compositor([view], copies=2)([space.drawn(3, 0)])

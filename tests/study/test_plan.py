@@ -13,7 +13,7 @@ from roadproof.driving.starts import StartPlan
 from roadproof.errors import RoadproofError, StudyError
 from roadproof.scenarios import builtin_scenarios
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan
-from roadproof.study.plan import TrafficPlan, load_study
+from roadproof.study.plan import JOB_VERSIONS, TrafficPlan, load_study
 
 TEXT = """
 format = "roadproof-study"
@@ -87,6 +87,16 @@ def test_jobs_on_a_map_of_the_users_are_known_by_what_is_in_it_wherever_it_lies(
         own.write_text(content)
         keys.append(dataclasses.replace(job, scenario=dataclasses.replace(job.scenario, map_name=str(own))).key)
     assert keys[0] == keys[1] != keys[2]
+
+
+def test_a_black_box_that_begins_with_gradopts_patterns_is_told_by_how_these_are_found(tmp_path, monkeypatch):
+    job = load_study(written(tmp_path, TEXT)).jobs[0]
+    alone, begun = (
+        dataclasses.replace(job, method=BlackBoxPlan(name="BO", search="published-bo", start=start)) for start in (0, 6)
+    )
+    before = alone.key, begun.key
+    monkeypatch.setitem(JOB_VERSIONS, "gradopt", 99)
+    assert (alone.key == before[0], begun.key == before[1]) == (True, False)
 
 
 def test_the_keys_of_jobs_stay_what_they_were():

@@ -36,6 +36,7 @@ from torch.autograd.function import once_differentiable
 from roadproof.compiling import Kernel, inline, run
 from roadproof.compositing.view import CanvasPixels
 from roadproof.coverage import MIN_VARIANCE
+from roadproof.errors import PatternError
 from roadproof.patterns import Pattern
 
 BLOCK = 1 << 14
@@ -86,11 +87,18 @@ def painted_into(
         patterns: a batch of patterns for each view.
         views: what the pictures show of the canvas.
         places: where the pixels of each view lie in the pictures.
+
+    Raises:
+        PatternError: a view has another number of pictures, or of rows of pixels, than its patterns need.
     """
     figures, pixels = list[Tensor](), list[tuple[Tensor, ...]]()
-    for pattern, view in zip(patterns, views, strict=True):
+    for pattern, view, place in zip(patterns, views, places, strict=True):
         count, many = len(pattern.shapes), view.clean.shape[-2]
         figures.append(view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3)))
+        rows = view.clean.shape[:-2].numel()
+        end, room = place.first + len(figures[-1]) * place.each, len(pictures)
+        if end > room or rows not in (1, len(figures[-1])):
+            raise PatternError(f"{len(figures[-1])} patterns do not fit {room} pictures with {rows} rows of pixels")
         features = view.footprints.features.reshape(-1, 6, many)
         pixels.append((features, *(each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias))))
     return cast("Tensor", _Painted.apply(_Canvases(pictures, pixels, places), *figures))
@@ -122,7 +130,11 @@ class _Painted(torch.autograd.Function):
         *grad_outputs: Tensor,
     ) -> tuple[Tensor | None, ...]:
         gradients = list[Tensor | None]([None])
-        for each, pixels, place in zip(ctx.saved_tensors, ctx.on.pixels, ctx.on.places, strict=True):
+        wanted = ctx.needs_input_grad[1:]
+        for each, pixels, place, wants in zip(ctx.saved_tensors, ctx.on.pixels, ctx.on.places, wanted, strict=True):
+            if not wants:
+                gradients.append(None)
+                continue
             shares = torch.empty(_blocks(place), *each.shape, dtype=torch.float64)
             run(_unpaint, (*_told(each, pixels, place, grad_outputs[0]), shares), len(shares))
             gradients.append(shares.sum(0).to(each.dtype))

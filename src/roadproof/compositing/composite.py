@@ -56,7 +56,8 @@ class Compositor:
     def __init__(self, views: Sequence[CanvasView], copies: int) -> None:
         self._views = tuple(views)
         self._copies = copies
-        self._frames = torch.cat([view.frames.repeat(copies, 1, 1, 1) for view in views])
+        self._frames = self._bare()
+        self._known = self._written
 
     def __call__(self, patterns: Sequence[Pattern], looks: Looks | None = None) -> Float[Tensor, "n 3 h w"]:
         """The composited frames in [0, 1], view after view and, in each view, pattern after pattern.
@@ -65,6 +66,9 @@ class Compositor:
             patterns: one batch of `copies` patterns for each view.
             looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
         """
+        if self._written != self._known:
+            # A controller has written into the frames that it was given.
+            self._frames = self._bare()
         if looks is None and all(map(_compiles, patterns, self._views)):
             return self._compiled(patterns)
         colours = [canvas_colours(pattern, view) for pattern, view in zip(patterns, self._views, strict=True)]
@@ -75,6 +79,14 @@ class Compositor:
             ]
         return cast("Tensor", _Pasted.apply(self, *colours))
 
+    @property
+    def _written(self) -> int:
+        """How often the frames have been written to; of inference tensors nobody counts it."""
+        return 0 if self._frames.is_inference() else self._frames._version  # noqa: SLF001
+
+    def _bare(self) -> Float[Tensor, "n h w 3"]:
+        return torch.cat([view.frames.repeat(self._copies, 1, 1, 1) for view in self._views])
+
     def _compiled(self, patterns: Sequence[Pattern]) -> Float[Tensor, "n 3 h w"]:
         # It is compiled when it is first wanted.
         from roadproof.compositing.compiled import Place, painted_into
@@ -84,6 +96,7 @@ class Compositor:
             places.append(Place(view.index[None], torch.tensor([len(view.index)]), first, len(view.frames)))
             first += self._copies * len(view.frames)
         painted = painted_into(self._frames.flatten(1, 2).mT, patterns, self._views, places)
+        self._known = self._written
         return painted.view(*painted.shape[:2], *self._frames.shape[1:3])
 
     def slots(self, frames: Tensor) -> list[Float[Tensor, "c p 3"]]:
@@ -96,6 +109,7 @@ class Compositor:
         """Write the colours of the canvas' pixels, one (copies, P, 3) a view, into the frames."""
         for slot, view, colour in zip(self.slots(self._frames), self._views, colours, strict=True):
             slot.index_copy_(1, view.index, colour)
+        self._known = self._written
         return self._frames.permute(0, 3, 1, 2)
 
     def pick(self, frames: Float[Tensor, "n 3 h w"]) -> list[Tensor]:
@@ -126,7 +140,7 @@ def composite_own(
         views: the pixels of each picture through which the canvas shows.
         looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
     """
-    if looks is None and _compiles(pattern, views):
+    if looks is None and _compiles(pattern, views) and not frames.requires_grad:
         from roadproof.compositing.compiled import Place, painted_into
 
         place = Place(views.pixel, views.valid.sum(1))

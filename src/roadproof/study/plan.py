@@ -29,10 +29,7 @@ FORMAT = "roadproof-study"
 FORMAT_VERSION = 2
 JOB_VERSION = 3
 JOB_VERSIONS = {BayesianOptimisation.word: 4, GradOpt.word: 4}
-"""Raised when a job of the same settings would come out differently: old results are then not taken for new ones.
-
-A black box that begins with GradOpt's patterns has GradOpt's.
-"""
+"""Raised when a job of the same settings would come out differently: old results are then not taken for new ones."""
 
 BLACK = "1-b"
 
@@ -114,9 +111,10 @@ class Job(Conditions):
     @property
     def key(self) -> str:
         """What tells this job from every other: a hash of all it depends on."""
-        begun = isinstance(self.method, BlackBoxPlan) and self.method.start
-        version = JOB_VERSIONS.get(GradOpt.word if begun else self.method.search, JOB_VERSION)
+        version = JOB_VERSIONS.get(self.method.search, JOB_VERSION)
         told: dict[str, Any] = {"job_version": version, **asdict(self), "scenario": identity(self.scenario)}
+        if isinstance(self.method, BlackBoxPlan) and self.method.start:
+            told["begun_with"] = JOB_VERSIONS[GradOpt.word]
         # Jobs are older than these words; a map of the user's is known by what is in it, not by where it lies.
         tables = (
             (told, ("weights", "paint", "variation")),
