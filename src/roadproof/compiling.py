@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from inspect import getsource
 from pathlib import Path
 from threading import Lock
@@ -72,6 +72,11 @@ class Kernel:
             return self._compiled(*arguments)
 
 
+@cache
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count)
+
+
 def _told(function: Callable[..., Any]) -> str:
     """A digest of all that a function becomes machine code from."""
     module = sys.modules[function.__module__]
@@ -80,18 +85,18 @@ def _told(function: Callable[..., Any]) -> str:
     return digest(getsource(module), stated(numbers), stated([sorted(_ROUNDED), _ALIKE["error_model"]]))
 
 
-def run(kernel: Kernel, arguments: Sequence[Tensor | float | int], parts: int) -> None:
-    """Run a kernel for each part of its work, on as many threads as torch has.
+def run(kernel: Kernel, arguments: Sequence[Tensor | float | int], parts: int, *, worth: int = 1) -> None:
+    """Run a kernel for each part of its work, on no more threads than torch has.
 
     Args:
         kernel: the kernel; its last argument is the number of the part.
         arguments: its other arguments; tensors are given as arrays, in the order in which their numbers lie.
         parts: number of parts, each of which writes what no other does.
+        worth: how many parts are worth a thread: torch's own, which wait for more work, are in the way of others.
     """
     given = [each.detach().numpy() if isinstance(each, Tensor) else each for each in arguments]
-    if (threads := min(torch.get_num_threads(), parts)) > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(partial(kernel, *given), range(parts)))
+    if (threads := min(torch.get_num_threads(), parts // worth)) > 1:
+        list(_threads(threads).map(partial(kernel, *given), range(parts)))
     else:
         for part in range(parts):
             kernel(*given, part)

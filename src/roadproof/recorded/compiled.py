@@ -23,6 +23,9 @@ from roadproof.geometry import CANVAS_SIZE_PX, Resampling
 from roadproof.photometry import Response
 from roadproof.recorded.light import Light
 
+WORTH = 16
+"""Pictures that are worth a thread."""
+
 _ZERO, _HALF, _ONE, _TWO, _FAR = (np.float32(number) for number in (0, 0.5, 1, 2, 3))
 _IN_FRONT, _FURTHEST, _LEAST = np.float32(1e-6), np.float32(1e30), np.float32(MIN_VARIANCE)
 _Index = np.uintp
@@ -53,7 +56,7 @@ def draw(
         beyond: how far each pixel lies beyond the frame that it was drawn from, in halves of its size, infinite where
             nothing is drawn yet; written to.
     """
-    run(_draw, (levels, frame, source.float().contiguous(), horizon_row, row, drawn, beyond), len(row))
+    run(_draw, (levels, frame, source.float().contiguous(), horizon_row, row, drawn, beyond), len(row), worth=WORTH)
 
 
 def lit_canvas(
@@ -81,7 +84,7 @@ def lit_canvas(
     many, width = len(frames), frames.shape[-1]
     touches = torch.zeros(many, rows.stop - rows.start, width, dtype=torch.uint8)
     canvas, source = canvas_from_input.float().contiguous(), source.float().contiguous()
-    run(_find, (canvas, rows.start, touches), many)
+    run(_find, (canvas, rows.start, touches), many, worth=WORTH)
     most = int(touches.sum((1, 2)).max())
     if most == 0:
         return None
@@ -92,7 +95,7 @@ def lit_canvas(
     variance = FOOTPRINT_VARIANCE[resampling]
     lit = (light.values, light.of_frames, variance)
     found = (pixel, valid, centre, jacobian, features, clean, gain, bias)
-    run(_light, (frames, canvas, rows.start, touches, frame, source, *lit, *found), many)
+    run(_light, (frames, canvas, rows.start, touches, frame, source, *lit, *found), many, worth=WORTH)
     footprints = Footprints(centre, jacobian, features, variance)
     return OwnViews(
         pixel=pixel, valid=valid, footprints=footprints, clean=clean, gain=gain, bias=bias, response=response
