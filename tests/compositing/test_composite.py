@@ -196,5 +196,5 @@ def test_a_controller_may_write_into_the_frames_that_it_is_given():
 
 def test_as_many_patterns_are_painted_as_there_are_copies():
     view, space = make_view(dtype=torch.float32), SearchSpace(figures=2)
-    with pytest.raises(PatternError, match="3 patterns do not fit"):
+    with pytest.raises(PatternError, match="given 3 patterns, expected the compositor's 2"):
         Compositor([view], copies=2)([space.drawn(3, 0)])

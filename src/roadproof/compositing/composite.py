@@ -21,6 +21,7 @@ from torch import Tensor
 from roadproof.compositing.variation import Looks
 from roadproof.compositing.view import CanvasPixels, CanvasView, OwnViews, fuses
 from roadproof.coverage import Shape
+from roadproof.errors import PatternError
 from roadproof.patterns import Pattern, coverages, visibilities
 
 
@@ -65,7 +66,12 @@ class Compositor:
         Args:
             patterns: one batch of `copies` patterns for each view.
             looks: looks given to the patterns in turn, of which only the wear is used; None for fresh paint.
+
+        Raises:
+            PatternError: a batch has another number of patterns.
         """
+        if others := [len(each.boxes) for each in patterns if len(each.boxes) != self._copies]:
+            raise PatternError(f"a view is given {others[0]} patterns, expected the compositor's {self._copies}")
         if self._written != self._known:
             # A controller has written into the frames that it was given.
             self._frames = self._bare()
