@@ -44,7 +44,7 @@ class Kernel:
     cannot be read or written, the function is compiled anew.
 
     Args:
-        function: a function of a module, of which it may use other functions, and numbers that stand above it.
+        function: a function of a module; it may use functions and numbers that stand above it there.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -82,7 +82,9 @@ def _told(function: Callable[..., Any]) -> str:
     module = sys.modules[function.__module__]
     kinds = (int, float, cast("type[object]", np.number))
     numbers = sorted((name, repr(value)) for name, value in vars(module).items() if isinstance(value, kinds))
-    return digest(getsource(module), stated(numbers), stated([sorted(_ROUNDED), _ALIKE["error_model"]]))
+    used = {value.py_func.__module__ for value in vars(module).values() if hasattr(value, "py_func")}
+    sources = [getsource(sys.modules[name]) for name in sorted(used | {module.__name__})]
+    return digest(*sources, stated(numbers), stated([sorted(_ROUNDED), _ALIKE["error_model"]]))
 
 
 def run(kernel: Kernel, arguments: Sequence[Tensor | float | int], parts: int, *, worth: int = 1) -> None:

@@ -157,7 +157,8 @@ def test_jobs_share_what_they_record_and_drive_over_the_bare_road(street, tmp_pa
     assert [each.name for each in own.iterdir()] == ["record"]
     # What is damaged is made again, and shared anew.
     bare = kept.parent.glob("*/episodes/*.npz")
-    for file in (kept / "calibration" / "report.json", *bare, kept / "run.json"):
+    damaged = [*kept.glob("recordings/clean/*.npz"), kept / "calibration" / "report.json", *bare, kept / "run.json"]
+    for file in damaged:
         content = file.read_bytes()
         file.unlink()
         file.write_bytes(content[: len(content) // 2])

@@ -19,7 +19,7 @@ A figure comes as twelve numbers (`CanvasPixels.rectangles`), pixels as their `C
 dimension of 1, or of B where each pattern has pixels of its own.
 """
 
-# ruff: noqa: ANN001, ANN202
+# ruff: noqa: ANN001, ANN201, ANN202
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
 from __future__ import annotations
@@ -169,6 +169,13 @@ def _tent(t):
 
 @inline
 @no_type_check
+def interval_share(off, half, reach):
+    """Share of a tent, so far off the middle and of that half-width, that lies inside [−half, half]."""
+    return _tent((half - off) / reach) + _tent((half + off) / reach)
+
+
+@inline
+@no_type_check
 def _slope(t):
     return max(_ONE - abs(t), _ZERO)
 
@@ -199,8 +206,7 @@ def _mask(figures, b, k, x, y, xx, xy, yy):
         return _ZERO
     if deep_u >= reach_u and deep_v >= reach_v:
         return _ONE
-    share_u = _tent((half_u - u) / reach_u) + _tent((half_u + u) / reach_u)
-    return share_u * (_tent((half_v - v) / reach_v) + _tent((half_v + v) / reach_v))
+    return interval_share(u, half_u, reach_u) * interval_share(v, half_v, reach_v)
 
 
 @inline

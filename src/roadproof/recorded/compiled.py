@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from roadproof.compiling import Kernel, inline, run
+from roadproof.compositing.compiled import interval_share
 from roadproof.compositing.view import OwnViews
 from roadproof.coverage import FOOTPRINT_VARIANCE, MIN_VARIANCE, Footprints
 from roadproof.geometry import CANVAS_SIZE_PX, Resampling
@@ -198,17 +199,9 @@ def _find(canvas, top, touches, r):
 
 @inline
 @no_type_check
-def _tent(t):
-    t = min(_ONE, max(-_ONE, t))
-    return t * (_ONE - _HALF * abs(t))
-
-
-@inline
-@no_type_check
 def _share(off, variance):
     """Share of a tent that lies on the canvas, so far off its middle."""
-    sharpness = _ONE / np.sqrt(max(variance, _LEAST))
-    return _tent((_REACH - off) * sharpness) + _tent((_REACH + off) * sharpness)
+    return interval_share(off, _REACH, np.sqrt(max(variance, _LEAST)))
 
 
 @Kernel
