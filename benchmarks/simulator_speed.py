@@ -38,8 +38,8 @@ with TownSimulator(graphics=sys.argv[1]) as simulator:
 """
 
 
-def speeds(agents: int, graphics: str) -> tuple[list[float], float]:
-    """Frames per second of a drive of each scenario in this process, and its peak memory in MB."""
+def speeds(agents: int, graphics: str, frames: bool) -> tuple[list[float], float]:
+    """Steps per second of a drive of each scenario in this process, and its peak memory in MB."""
     from roadproof.scenarios import find_scenario
     from roadproof.simulators.town.simulator import TownSimulator
     from roadproof.training.expert import Expert
@@ -48,19 +48,19 @@ def speeds(agents: int, graphics: str) -> tuple[list[float], float]:
     with TownSimulator(graphics=graphics) as simulator:
         for name in ("straight-01", *SCENARIOS):  # the first only warms up
             scenario = find_scenario(name)
-            seen = simulator.reset(scenario, cars=agents, pedestrians=agents, seed=0)
-            expert, frames, began = Expert(simulator.route), 0, time.perf_counter()
+            seen = simulator.reset(scenario, cars=agents, pedestrians=agents, seed=0, frames=frames)
+            expert, steps, began = Expert(simulator.route), 0, time.perf_counter()
             while not seen.done:
                 seen = simulator.step(expert.drive(seen.state, simulator.cars, simulator.pedestrians))
-                frames += 1
-            found.append(frames / (time.perf_counter() - began))
+                steps += 1
+            found.append(steps / (time.perf_counter() - began))
     return found[1:], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def measured(processes: int, agents: int, graphics: str) -> dict[str, float]:
-    """Median frames per second of a process while as many run, and the largest peak memory."""
+def measured(processes: int, agents: int, graphics: str, *, frames: bool = True) -> dict[str, float]:
+    """Median frames per second of a process while as many run, or steps without any, and the largest peak memory."""
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        results = pool.starmap(speeds, [(agents, graphics)] * processes, chunksize=1)
+        results = pool.starmap(speeds, [(agents, graphics, frames)] * processes, chunksize=1)
     every = [fps for found, _ in results for fps in found]
     return {
         "median_fps": statistics.median(every),
@@ -94,6 +94,7 @@ def main() -> None:
         "one_process_traffic": measured(1, AGENTS, arguments.graphics),
         "two_processes_alone": measured(2, 0, arguments.graphics),
         "two_processes_traffic": measured(2, AGENTS, arguments.graphics),
+        "one_process_without_frames": measured(1, 0, arguments.graphics, frames=False),
         "start_s": start_seconds(arguments.repeats, arguments.graphics),
         "goals": GOALS,
         "graphics": arguments.graphics,

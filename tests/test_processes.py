@@ -183,6 +183,11 @@ def place(folder):
     yield folder
 
 
+def begin(folder, _):
+    (folder / f"begun-{os.getpid()}").touch()
+    raise AssertionError("not told")
+
+
 class Tally:
     """A controller that counts how often it was asked, and how often it travelled."""
 
@@ -207,11 +212,11 @@ class Lost:
 
 def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
     with Pool(partial(place, tmp_path), 2) as pool:
-        pool.begin()
+        pool.begin(begin)
         deadline = time.monotonic() + 60
-        while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+        while len(list(tmp_path.glob("begun-*"))) < 2 and time.monotonic() < deadline:
             time.sleep(0.05)
-        assert list(tmp_path.iterdir()), "opened before there is any work"
+        assert len(list(tmp_path.glob("begun-*"))) == 2, "opened before there is any work"
         first, second = ([result for _, result in pool.each(Tally(), range(8))] for _ in range(2))
         assert {process for _, process in first + second} <= {
             process.pid for process in multiprocessing.active_children()
@@ -236,7 +241,7 @@ def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):
             pool.settle(Tally())
         with pytest.raises(ControllerError, match="a controller that travelled"):
             list(pool.each(Lost(), [1]))
-    opened = {int(each.name) for each in tmp_path.iterdir()}
-    assert 1 <= len(opened) <= 2
+    opened = {int(each.name) for each in tmp_path.glob("[0-9]*")}
+    assert len(opened) == 2
     assert os.getpid() not in opened
     assert multiprocessing.active_children() == []

@@ -93,11 +93,16 @@ class Pool(Generic[Inside]):
         """What this process works in, where it is the only one."""
         return self._stack.enter_context(self._opens())
 
-    def begin(self) -> None:
-        """Let every process beside this one enter its context now, and do not wait for it."""
+    def begin(self, function: Callable[[Inside, None], object]) -> None:
+        """Let every process beside this one do something before its first work, and do not wait for it.
+
+        Args:
+            function: as of `each`; what it raises is not told.
+        """
         if self.processes > 1:
+            travelled = _pickled_for_the_processor(function)
             for process in self._beside:
-                process.submit(_inside)
+                process.submit(_call, travelled, None)
 
     def settle(self, function: Callable[[Inside, Work], Result]) -> Settled[Inside, Work, Result]:
         """The same function for `each`, which then sends it to a process once for however many rounds of work.

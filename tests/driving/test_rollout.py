@@ -12,7 +12,7 @@ from roadproof.controllers import Controller
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control, Ending, Event, EventKind, Weather
 from roadproof.driving.episode import Episode
-from roadproof.driving.rollout import replay, rollout
+from roadproof.driving.rollout import drive_again, look_again, replay, rollout
 from roadproof.errors import ControllerError, EpisodeError, OutputError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import find_scenario
@@ -156,6 +156,29 @@ def test_full_pictures_are_shown_where_they_are_asked_for(town):
     assert shown == [(600, 800, 3)] * 3
     rollout(town, expert, very_short, full_pictures=frozenset({1}), on_step=lambda seen, _: shown.append(seen.picture))
     assert [picture is not None for picture in shown[3:]] == [False, True, False]
+
+
+def test_frames_that_nobody_asks_for_are_black_and_the_others_are_the_same(town):
+    def frames_of(**asked):
+        frames, busy = [], {"cars": 5, "pedestrians": 5, "seed": 1, "weather": Weather.RAINY_NOON}
+        keep = lambda seen, _: frames.append(seen.frame)  # noqa: E731
+        rollout(town, expert, SHORT, pattern=PATTERN, on_step=keep, **busy, **asked)
+        return np.stack(frames)
+
+    whole, some, none = frames_of(), frames_of(frames=frozenset({0, 7, 30})), frames_of(frames=False)
+    assert np.flatnonzero(some.any((1, 2, 3))).tolist() == [0, 7, 30]
+    np.testing.assert_array_equal(some[[0, 7, 30]], whole[[0, 7, 30]])
+    assert not none.any()
+
+
+def test_a_drive_is_looked_at_again_only_where_it_is_asked_for(town):
+    episode, frames = rollout(town, expert, SHORT), []
+    seen = look_again(town, episode, SHORT, (3, 9), lambda seen: (seen.frame.any(), seen.picture is None))
+    assert seen == {3: (True, True), 9: (True, True)}
+    seen = look_again(town, episode, SHORT, (3,), lambda seen: seen.shown.shape, full_pictures=True)
+    assert seen == {3: (600, 800, 3)}
+    drive_again(town, episode, SHORT, steps=5, on_step=lambda seen, _: frames.append(seen.frame.any()))
+    assert frames == [False] * 5
 
 
 def test_what_a_driver_gets_wrong_is_named(town):

@@ -158,6 +158,14 @@ def test_the_gap_is_that_to_a_recorded_pose(world, recordings):
     assert min(np.abs(np.array(told) - gap).max(1)) < 1e-9
 
 
+def test_frames_that_nobody_asks_for_are_black(world):
+    first = world.reset(world.scenario, frames=frozenset({1}), full_pictures=frozenset({2}))
+    second, third = world.step(Control(0.0)), world.step(Control(0.0))
+    assert [seen.frame.any() for seen in (first, second, third)] == [False, True, True]
+    world.reset(world.scenario)
+    np.testing.assert_array_equal(world.step(Control(0.0)).frame, second.frame)
+
+
 def test_full_pictures_are_the_frame_in_its_place(world):
     seen = world.reset(world.scenario, full_pictures=frozenset({1}))
     assert seen.picture is None

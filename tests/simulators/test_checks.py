@@ -99,6 +99,18 @@ class StartsElsewhere(Altered):
         return super().reset(dataclasses.replace(scenario, start=moved), **options)
 
 
+class ShowsTheFrameBefore(Altered):
+    """Where not all frames are asked for, each comes a step late."""
+
+    def reset(self, scenario, **options):
+        self.is_late, self.before = options.get("frames", True) is not True, None
+        return super().reset(scenario, **options)
+
+    def altered(self, seen):
+        before, self.before = self.before, seen.frame
+        return dataclasses.replace(seen, frame=before) if self.is_late and before is not None else seen
+
+
 class Crashes(Altered):
     def step(self, control):
         raise RuntimeError("lost the connection")
@@ -108,7 +120,7 @@ def test_the_town_passes(town):
     report = check_simulator(town, SCENARIO, steps=10)
     assert report.passed, str(report)
     assert str(report).endswith("all checks passed")
-    assert len({check.name for check in report.checks}) == len(report.checks) == 13
+    assert len({check.name for check in report.checks}) == len(report.checks) == 14
 
 
 @pytest.mark.parametrize(
@@ -124,6 +136,7 @@ def test_the_town_passes(town):
         (HasAnotherPixelCentre, "homography"),
         (ShowsGamma, "colours"),
         (StartsElsewhere, "start"),
+        (ShowsTheFrameBefore, "frames"),
         (Crashes, "clock"),
     ],
     ids=lambda value: getattr(value, "__name__", value),

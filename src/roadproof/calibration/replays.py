@@ -91,6 +91,7 @@ class Replays:
 
     def _drive_again(self, drive: Drive, target: Target) -> dict[str, np.ndarray]:
         wanted = dict(zip(drive.frame_number.tolist(), drive.states, strict=True))
+        shown, unseen = frozenset(wanted), frozenset[int]()
         seen_there: list[np.ndarray] = []
         stated: list[np.ndarray] = []
         step, last = 0, int(drive.frame_number[-1])
@@ -110,7 +111,8 @@ class Replays:
             settings.scenario,
             pattern=target.paint,
             steps=last + 1,
-            full_pictures=frozenset(wanted) if target.full_pictures else False,
+            frames=unseen if target.full_pictures else shown,
+            full_pictures=shown if target.full_pictures else unseen,
             on_step=keep,
         )
         if len(seen_there) != len(wanted):

@@ -66,7 +66,7 @@ def record(
         seed: seed of the perturbations.
         driver_name: name of the driver in words, for the record; empty by default.
         folder: folder that keeps every finished drive; those it holds already are not driven again. None keeps nothing.
-        pool: processes that are open already and make the perturbed drives instead; the driver must be picklable.
+        pool: processes that are open already and drive instead; the driver must be picklable.
         on_drive: called with the number of finished drives, at first 0.
 
     Raises:
@@ -102,16 +102,16 @@ def record(
     for plan in plans:
         if folder is not None and (kept := read_drive(plan.name, folder)) is not None:
             keep(kept, made=False)
-    if plans[0].name not in done:
+    with open_or_here(pool, simulator) as driving:
         try:
-            keep(_clean(simulator, driver, settings), made=True)
+            for _, drive in driving.each(partial(_clean, driver, settings), plans[: plans[0].name not in done]):
+                keep(drive, made=True)
         except RoadproofError:
             if began and folder is not None:
                 # A scenario that the simulator refuses can be mended, and recorded here.
                 forget_settings(folder)
             raise
-    astray = partial(_perturbed, driver, settings, done[plans[0].name])
-    with open_or_here(pool, simulator) as driving:
+        astray = partial(_perturbed, driver, settings, done[plans[0].name])
         for _, drive in driving.each(astray, [plan for plan in plans if plan.name not in done]):
             keep(drive, made=True)
     return Drives(settings=settings, drives=tuple(done[plan.name] for plan in plans))
@@ -201,14 +201,16 @@ class _Film:
             self.states.append(seen.state)
 
 
-def _clean(simulator: SimulatorT, driver: Controller | Driver[SimulatorT], settings: Settings) -> Drive:
+def _clean(
+    driver: Controller | Driver[SimulatorT], settings: Settings, simulator: SimulatorT, plan: DrivePlan
+) -> Drive:
     film = _Film(settings.scenario, settings.window)
     episode = rollout(simulator, driver, settings.scenario, weather=settings.weather, on_step=film)
     chosen = _chosen(film, settings, "clean")
     last_s = float(episode.time_s[chosen[0][-1]])
     harm = [event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= last_s]
     note = f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas" if harm else ""
-    return _drive(settings.trajectories.plans()[0], episode, chosen, episode.steer, note=note)
+    return _drive(plan, episode, chosen, episode.steer, note=note)
 
 
 def _perturbed(

@@ -46,6 +46,7 @@ def rollout(
     cars: int = 0,
     pedestrians: int = 0,
     seed: int = 0,
+    frames: Pictures = True,
     full_pictures: Pictures = False,
     on_step: OnStep | None = None,
     until: Callable[[Observation], bool] | None = None,
@@ -62,6 +63,7 @@ def rollout(
         cars: number of other cars on the road.
         pedestrians: number of pedestrians.
         seed: seed of cars and pedestrians.
+        frames: which observations show the controller's frame to driver and `on_step`, all by default.
         full_pictures: which observations show the full camera picture to driver and `on_step`.
         on_step: called after each step; the simulator is then still at the state of the observation.
         until: condition that ends the drive at the first observation for which it is true; None for none.
@@ -84,6 +86,7 @@ def rollout(
         cars=cars,
         pedestrians=pedestrians,
         seed=seed,
+        frames=frames,
         full_pictures=full_pictures,
     )
     rows, controls, events = [_row(seen)], list[Control](), list(seen.events)
@@ -152,6 +155,7 @@ def drive_again(
     *,
     pattern: Pattern | PatternImage | None = None,
     steps: int,
+    frames: Pictures = False,
     full_pictures: Pictures = False,
     on_step: OnStep | None = None,
 ) -> Episode:
@@ -163,6 +167,7 @@ def drive_again(
         scenario: scenario of the episode, from the start that it had.
         pattern: pattern painted on the canvas, or a picture of the canvas; None leaves the road bare.
         steps: number of observations after which the drive ends, at least 1.
+        frames: which observations show the controller's frame, by default none: nobody drives by it.
         full_pictures: which observations show the full camera picture.
         on_step: called after each step, as by `rollout`.
 
@@ -179,6 +184,7 @@ def drive_again(
         cars=episode.cars,
         pedestrians=episode.pedestrians,
         seed=episode.seed,
+        frames=frames,
         full_pictures=full_pictures,
         on_step=on_step,
         until=lambda _: next(seen) >= steps,
@@ -197,7 +203,8 @@ def look_again(
 ) -> dict[int, Seen]:
     """Drive an episode again as far as it is looked at, and keep what `look` makes of its observations at some steps.
 
-    Steps count from 0; at them there are full pictures, where these are asked for. All else is as in `drive_again`.
+    Steps count from 0. At them there are the controller's frames or, where these are asked for, full pictures; nothing
+    else is drawn. All else is as in `drive_again`.
 
     Returns:
         What was kept, by the step; only of steps that came before the drive ended.
@@ -209,9 +216,16 @@ def look_again(
         if (number := next(numbers)) in wanted:
             kept[number] = look(seen)
 
-    pictures = wanted if full_pictures else False
+    frames, pictures = (frozenset[int](), wanted) if full_pictures else (wanted, frozenset[int]())
     drive_again(
-        simulator, episode, scenario, pattern=pattern, steps=max(wanted) + 1, full_pictures=pictures, on_step=keep
+        simulator,
+        episode,
+        scenario,
+        pattern=pattern,
+        steps=max(wanted) + 1,
+        frames=frames,
+        full_pictures=pictures,
+        on_step=keep,
     )
     return kept
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -150,9 +151,15 @@ def film_drives(
     if not can_film():
         return False
     for quality in QUALITIES:
-        with film_file(folder / FILM, poster.size, each * clean.dt_s, quality=quality) as add:
+        film = film_file(folder / FILM, poster.size, each * clean.dt_s, quality=quality)
+        with film as add, ThreadPoolExecutor(1) as encoding:
+            added = encoding.submit(lambda: None)
             for step in range(0, max(side.shown for side in sides), each):
-                add(np.asarray(_page(sides, beside_m, step)))
+                page = np.asarray(_page(sides, beside_m, step))
+                # One image is drawn while the one before is encoded.
+                added.result()
+                added = encoding.submit(add, page)
+            added.result()
         if (folder / FILM).stat().st_size <= MOST_BYTES:
             break
     return True
@@ -185,7 +192,7 @@ def _filmed(start: Scenario, strip: Sequence[int], simulator: Simulator, take: _
 
 def _as_jpeg(seen: Observation) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.LANCZOS).save(file, format="JPEG", quality=92)
+    Image.fromarray(seen.shown).resize(VIEW, Image.Resampling.BILINEAR).save(file, format="JPEG", quality=92)
     return file.getvalue()
 
 

@@ -20,6 +20,7 @@ weather but the first in RUN/WEATHER/, as those of the first are in RUN.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from roadproof.attacks import AttackResult, Cheapest, PathDeviation, SpeedChange
 from roadproof.attacks.cheapest import check_wanted
@@ -185,9 +186,14 @@ def stress_test(
         require_pedals(controller)
     with working_in(folder), stages.pool as pool:
         if not (folder / "recordings").exists():
-            # They open their simulators while this one records.
-            pool.begin()
+            # All of them together, while this one reads; it draws nothing itself.
+            pool.begin(partial(_reset, scenario))
         return _all_of(stages, film=film, cheapest_m=cheapest_m)
+
+
+def _reset(scenario: Scenario, simulator: Simulator, _: None) -> None:
+    """Let a simulator build what it drives in."""
+    simulator.reset(scenario)
 
 
 def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:

@@ -188,7 +188,8 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     def _observe(self, drive: _Drive) -> Observation:
         course, poses = self._world.course, Poses(*drive.car[:3])
         nearest = self._world.bank.nearest(poses)
-        frame = self._frame(poses, nearest, drive.pattern)
+        shown = drive.shows_frame or drive.shows_picture
+        frame = self._frame(poses, nearest, drive.pattern) if shown else self._black
         ending = None
         if not _can_be_shown(float(nearest.left_m), float(nearest.turned_rad)):
             ending = Ending.LEFT_RECORDED

@@ -73,6 +73,7 @@ def check_simulator(
         ("refusals", kit.refusals),
         ("determinism", kit.determinism),
         ("reset", kit.reset_is_complete),
+        ("frames", kit.frames),
         ("homography", kit.homography),
         ("paint", kit.paint),
         ("transparency", kit.transparency),
@@ -183,6 +184,13 @@ class _Kit:
         )
         _same(fresh, self._drive(AHEAD), "a drive before and after another one")
         return "nothing of another drive is left"
+
+    def frames(self) -> str:
+        """What is asked for is seen, whatever else is."""
+        asked = frozenset({0, self._steps})
+        whole, some = self._drive(AHEAD), self._drive(AHEAD, frames=asked)
+        _same([whole[k] for k in sorted(asked)], [some[k] for k in sorted(asked)], "a drive with two frames")
+        return "those asked for are the same, whatever else is seen"
 
     def homography(self) -> str:
         seen = self._at_canvas(None)

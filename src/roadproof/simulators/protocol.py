@@ -50,7 +50,7 @@ class PaintKind(StrEnum):
 
 
 Pictures: TypeAlias = bool | frozenset[int]
-"""Which observations of a drive have the full camera picture: all, none, or those after so many steps."""
+"""Which observations of a drive have a picture: all, none, or those after so many steps."""
 
 PaintChoice: TypeAlias = Literal["inject", "native", "auto"]
 """How a CARLA server may be asked to paint; "auto" is "native" where that works, else "inject"."""
@@ -99,6 +99,7 @@ class Simulator(Protocol):
         cars: int = 0,
         pedestrians: int = 0,
         seed: int = 0,
+        frames: Pictures = True,
         full_pictures: Pictures = False,
     ) -> Observation:
         """Begin a drive: nothing of the one before is left.
@@ -110,6 +111,8 @@ class Simulator(Protocol):
             cars: how many other cars are on the road.
             pedestrians: how many people are about.
             seed: the seed of the other cars and the people.
+            frames: which observations have the controller's frame; the others may have it too, or a black one, which
+                costs nothing.
             full_pictures: which observations have the full camera picture too; where steps are given, others may have
                 it as well.
 

@@ -57,7 +57,7 @@ def test_it_keeps_what_a_simulator_promises(port):
     with CarlaSimulator(port=port, camera=CAMERA, input=INPUT) as simulator:
         report = check_simulator(simulator, STREET, steps=12)
     assert report.passed, str(report)
-    assert len(report.checks) == 13
+    assert len(report.checks) == 14
 
 
 def test_a_drive_is_that_of_the_town_driven_directly(simulator, street):

@@ -18,8 +18,8 @@ FRAME = np.zeros((2, 3, 3), np.uint8)
 DT_S = 0.1
 
 
-def request(scenario=SCENARIO, full_pictures=False, **others):
-    return Request(scenario, Weather.CLEAR_NOON, None, others.get("cars", 0), 0, 0, full_pictures)
+def request(scenario=SCENARIO, *, cars=0, frames=True, full_pictures=False):
+    return Request(scenario, Weather.CLEAR_NOON, None, cars, 0, 0, frames, full_pictures)
 
 
 def driven(drive, arclength_m, contacts=()):
@@ -58,9 +58,11 @@ def test_time_is_counted_in_steps_and_up_at_the_limit():
 
 
 @pytest.mark.parametrize(("asked", "shown"), [(True, [0, 1, 2]), (False, []), (frozenset({1}), [1]), (frozenset(), [])])
-def test_full_pictures_are_shown_at_the_steps_asked_for(asked, shown):
+def test_frames_and_full_pictures_are_shown_at_the_steps_asked_for(asked, shown):
     drive = DriveTracker(request(full_pictures=asked), DT_S)
     assert [drive.steps for drive.steps in range(3) if drive.shows_picture] == shown
+    drive = DriveTracker(request(frames=asked), DT_S)
+    assert [drive.steps for drive.steps in range(3) if drive.shows_frame] == shown
 
 
 def test_a_crowd_that_cannot_be_is_refused():

@@ -152,9 +152,10 @@ class TownSimulator(RouteSimulator[_Drive]):
 
     def _observe(self, drive: _Drive) -> Observation:
         assert self._town is not None
-        frame = self._town.renderer.frame(drive.state, drive.steps)
-        # It takes several times as long as the frame.
-        picture = self._town.renderer.picture(drive.state, drive.steps) if drive.shows_picture else None
+        renderer = self._town.renderer
+        # They take most of a step's time, a full picture several times as long as a frame.
+        frame = renderer.frame(drive.state, drive.steps) if drive.shows_frame else self._black
+        picture = renderer.picture(drive.state, drive.steps) if drive.shows_picture else None
         return drive.judged(frame, picture, drive.physics.contacts())
 
     def _town_of(self, map_name: str) -> _Town:

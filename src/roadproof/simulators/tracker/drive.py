@@ -29,6 +29,7 @@ class Request(NamedTuple):
     cars: int
     pedestrians: int
     seed: int
+    frames: Pictures
     full_pictures: Pictures
 
 
@@ -47,7 +48,7 @@ class DriveTracker:
 
     def __init__(self, request: Request, dt_s: float) -> None:
         self.scenario, self.state, self.dt_s, self.steps = request.scenario, request.scenario.start, dt_s, 0
-        self._full_pictures = request.full_pictures
+        self._frames, self._full_pictures = request.frames, request.full_pictures
 
     @property
     def time_s(self) -> float:
@@ -60,9 +61,16 @@ class DriveTracker:
         return time_is_up(self.time_s, self.scenario.time_limit_s)
 
     @property
+    def shows_frame(self) -> bool:
+        """Whether the controller's frame is asked for at this step."""
+        return self._among(self._frames)
+
+    @property
     def shows_picture(self) -> bool:
-        """Whether the observation of this step has the full camera picture."""
-        wanted = self._full_pictures
+        """Whether the full camera picture is asked for at this step."""
+        return self._among(self._full_pictures)
+
+    def _among(self, wanted: Pictures) -> bool:
         return wanted if isinstance(wanted, bool) else self.steps in wanted
 
     def observation(

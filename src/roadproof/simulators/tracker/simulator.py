@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
@@ -81,6 +83,7 @@ class TrackedSimulator(ABC, Generic[DriveT]):
         cars: int = 0,
         pedestrians: int = 0,
         seed: int = 0,
+        frames: Pictures = True,
         full_pictures: Pictures = False,
     ) -> Observation:
         """Begin a drive; see `roadproof.simulators.protocol.Simulator.reset`.
@@ -96,7 +99,7 @@ class TrackedSimulator(ABC, Generic[DriveT]):
             raise SimulatorError(
                 f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {shape} (RGBA)"
             )
-        request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, full_pictures)
+        request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, frames, full_pictures)
         self._drive = self._begin(request)
         return self._observe(self._drive)
 
@@ -110,6 +113,11 @@ class TrackedSimulator(ABC, Generic[DriveT]):
         self._advance(drive, control.clipped())
         drive.steps += 1
         return self._observe(drive)
+
+    @cached_property
+    def _black(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The frame of observations of which no frame is asked for."""
+        return np.broadcast_to(np.uint8(0), (self.input.height_px, self.input.width_px, 3))
 
     def _running(self) -> DriveT:
         if self._drive is None:
