@@ -227,6 +227,7 @@ class Stages:
             weather=self.budget.recorded_in[0],
             folder=folder / "selection",
             clean=drives.drives[0].episode,
+            pool=self.pool,
             on_drive=lambda _done, _best: self.on_progress("Looking for less paint", total, total, ""),
         )
         return less, driven
