@@ -7,7 +7,8 @@ import pytest
 
 from lenses import LENSES, behind
 from references import approach
-from roadproof.calibration.outline import GREY, SQUARES, fit_outline, moved, outline_errors_px
+from roadproof.calibration.compiled import GREY, SQUARES
+from roadproof.calibration.outline import fit_outline, moved, outline_errors_px
 from roadproof.calibration.published import RUNS, calibration_points, homographies_from_points
 from roadproof.calibration.replays import Replays
 from roadproof.calibration.report import stated_errors_px

@@ -7,7 +7,8 @@ import pytest
 
 from references import approach
 from roadproof.calibration import outline
-from roadproof.calibration.outline import GREY, SQUARES, fit_outline, moved, outline_errors_px, predicted_contrast
+from roadproof.calibration.compiled import GREY, SQUARES
+from roadproof.calibration.outline import fit_outline, moved, outline_errors_px, predicted_contrast
 from roadproof.calibration.report import Spread, stated_errors_px
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
@@ -132,3 +133,17 @@ def test_no_pixel_that_sees_the_canvas_is_left_out(camera, monkeypatch):
     monkeypatch.setattr(outline, "_may_see_canvas", everywhere)
     for few, full in zip(found, predicted_contrast(homographies, CIL_INPUT, camera), strict=True):
         assert np.array_equal(few, full)
+
+
+def test_the_predicted_contrast_is_what_points_counted_in_every_pixel_give(scene):
+    truth, visible, view = scene
+    share, contrast = predicted_contrast(truth, view, CIL_CAMERA)
+    assert share.min() >= 0.0
+    assert share.max() == pytest.approx(1.0)
+    off = np.abs(contrast - visible)
+    assert off[visible > 0].mean() < 0.02
+    assert off.max() < 0.25
+    assert not contrast[share == 0.0].any()
+    canvas = CanvasPlacement(x_m=0.0, y_m=0.0, width_m=7.6, length_m=9.5)
+    behind = homography_from_pose(CIL_CAMERA, VehicleState(x_m=40.0, y_m=0.0), canvas)
+    assert predicted_contrast(behind[None], view, CIL_CAMERA)[0].max() < 0.01

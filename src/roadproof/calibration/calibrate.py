@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
+from itertools import repeat
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +23,11 @@ from roadproof.calibration.published import (
 )
 from roadproof.calibration.replays import Replays, Wanted, replay_in, told_apart
 from roadproof.calibration.report import CalibrationReport, DriveReport, Geometry, Spread, stated_errors_px
-from roadproof.calibration.two_paint import TARGETS, Fitted, fit_paints, look_at_paints
+from roadproof.calibration.two_paint import TARGETS, look_at_paints
 from roadproof.datatypes import Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
-from roadproof.geometry import homography_from_pose
+from roadproof.geometry import CameraModel, homography_from_pose
 from roadproof.homographies import Homographies
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import table
@@ -189,45 +191,38 @@ def calibrate(
         )
     on_call(0)
     began = time.perf_counter()
-    fitted: dict[str, Fitted] = {}
+    wanted, beside = _wanted(drives, method), None
     if pool is not None and pool.processes > 1 and folder is not None:
-        replay_in(pool, drives, folder, _wanted(drives, method), on_call)
-        replays = Replays(simulator, drives, folder)
-        if method is CalibrationMethod.TWO_PAINT:
-            fitted = dict(pool.each(partial(_fit_beside, drives, folder), [drive.name for drive in drives.drives]))
+        replay_in(pool, drives, folder, wanted, on_call)
+        replays, beside = Replays(simulator, drives, folder), pool
     else:
         replays = Replays(simulator, drives, folder, on_call)
     if method is CalibrationMethod.PUBLISHED:
         geometry = [homographies_from_points(replays, drive, settings.camera) for drive in drives.drives]
-        maps: Sequence[PixelMaps | None] = [None] * len(geometry)
+        looks = [_Look(each, None, replays.stated(drive)) for drive, each in zip(drives.drives, geometry, strict=True)]
         colour, residual = colours_from_paints(replays, drives, drives.drives[0], geometry[0].found)
     else:
-        camera, view, refine = settings.camera, settings.view, method is CalibrationMethod.TWO_PAINT
-        looks = [
-            look_at_paints(
-                replays, drive, _poses(drives, drive), camera, view, refine=refine, fitted=fitted.get(drive.name)
-            )
-            for drive in drives.drives
-        ]
-        geometry, maps = [found for found, _ in looks], [shading for _, shading in looks]
+        if beside is None or folder is None:
+            looks = [_look(replays, drives, method, drive) for drive in drives.drives]
+        else:
+            names = [drive.name for drive in drives.drives]
+            found = dict(beside.each(partial(_look_beside, drives, folder, method), names))
+            looks = [found[name] for name in names]
         colour, residual = ColourTransform(AffineResponse.identity()), None
-    for drive, found in zip(drives.drives, geometry, strict=True):
-        _check(drive, found)
+    for drive, look in zip(drives.drives, looks, strict=True):
+        _check(drive, look.geometry)
     report = CalibrationReport(
         method=str(method),
-        drives=tuple(_report(replays, drives, drive, g) for drive, g in zip(drives.drives, geometry, strict=True)),
+        drives=tuple(map(_report, drives.drives, looks, repeat(settings.camera))),
         colour_residual=residual,
-        calls=drives.calls + replays.calls,
+        calls=drives.calls + len(wanted),
         seconds=time.perf_counter() - began,
     )
     recordings = RecordingSet(
         camera=settings.camera,
         view=settings.view,
         colour=colour,
-        recordings=tuple(
-            _recording(drive, g, shading, settings.weather)
-            for drive, g, shading in zip(drives.drives, geometry, maps, strict=True)
-        ),
+        recordings=tuple(map(_recording, drives.drives, looks, repeat(settings.weather))),
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
         canvas=settings.scenario.canvas,
         marks=marks_of(simulator, settings.scenario),
@@ -242,11 +237,25 @@ def _poses(drives: Drives, drive: Drive) -> Homographies:
     return np.stack([homography_from_pose(camera, state, canvas) for state in drive.states])
 
 
-def _fit_beside(drives: Drives, folder: Path, simulator: Simulator, name: str) -> Fitted:
-    """What replays in a folder say of one drive's homographies."""
-    drive, settings = next(each for each in drives.drives if each.name == name), drives.settings
-    replays = Replays(simulator, drives, folder)
-    return fit_paints(replays, drive, _poses(drives, drive), settings.camera, settings.view)
+class _Look(NamedTuple):
+    """What replays say of one drive, and the homographies that the simulator states."""
+
+    geometry: Geometry
+    maps: PixelMaps | None
+    stated: Homographies | None
+
+
+def _look(replays: Replays, drives: Drives, method: CalibrationMethod, drive: Drive) -> _Look:
+    prior, camera, view = _poses(drives, drive), drives.settings.camera, drives.settings.view
+    refine = method is CalibrationMethod.TWO_PAINT
+    geometry, maps = look_at_paints(replays, drive, prior, camera, view, refine=refine)
+    return _Look(geometry, maps, replays.stated(drive))
+
+
+def _look_beside(drives: Drives, folder: Path, method: CalibrationMethod, simulator: Simulator, name: str) -> _Look:
+    """The same from the replays in a folder."""
+    drive = next(each for each in drives.drives if each.name == name)
+    return _look(Replays(simulator, drives, folder), drives, method, drive)
 
 
 def _check(drive: Drive, geometry: Geometry) -> None:
@@ -266,8 +275,8 @@ def _check(drive: Drive, geometry: Geometry) -> None:
         )
 
 
-def _report(replays: Replays, drives: Drives, drive: Drive, geometry: Geometry) -> DriveReport:
-    stated = replays.stated(drive)
+def _report(drive: Drive, look: _Look, camera: CameraModel) -> DriveReport:
+    geometry, stated = look.geometry, look.stated
     kept = list(geometry.found)
     homographies = np.stack(list(geometry.found.values()))
     return DriveReport(
@@ -275,25 +284,23 @@ def _report(replays: Replays, drives: Drives, drive: Drive, geometry: Geometry) 
         frames=len(kept),
         dropped=tuple((int(drive.frame_number[k]), reason) for k, reason in geometry.dropped.items()),
         residual_px=Spread.of(geometry.residuals_px),
-        stated_px=None
-        if stated is None
-        else Spread.of(stated_errors_px(homographies, stated[kept], drives.settings.camera)),
+        stated_px=None if stated is None else Spread.of(stated_errors_px(homographies, stated[kept], camera)),
     )
 
 
-def _recording(drive: Drive, geometry: Geometry, maps: PixelMaps | None, weather: Weather) -> Recording:
-    kept = list(geometry.found)
+def _recording(drive: Drive, look: _Look, weather: Weather) -> Recording:
+    kept = list(look.geometry.found)
     steps = drive.frame_number[kept]
     return Recording(
         name=drive.name,
         side=drive.side,
         frames=drive.frames[kept],
         frame_number=steps,
-        image_from_canvas=np.stack(list(geometry.found.values())),
+        image_from_canvas=np.stack(list(look.geometry.found.values())),
         speed_mps=drive.episode.speed_mps[steps],
         command=drive.episode.command[steps],
         steer=drive.steer[kept],
-        maps=maps,
+        maps=look.maps,
         track=drive.track,
         weather=str(weather),
     )

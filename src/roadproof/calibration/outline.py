@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from roadproof.calibration.compiled import canvas_shares
 from roadproof.coverage import FOOTPRINT_VARIANCE
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
@@ -33,10 +34,6 @@ from roadproof.homographies import Homographies
 Pictures = Float[np.ndarray, "f h w"]
 """A number of every pixel of F pictures."""
 
-SQUARES = 4
-"""Along each side of the canvas in the dark frames."""
-GREY = 128 / 255
-"""Of the squares."""
 _BLURS_PX = (6, 3, 0)
 _STEPS = (4, 4, 5)
 # Of a pixel's share. Pixels along an edge err together, so this is more than one of them errs: measured in the town,
@@ -100,9 +97,8 @@ def predicted_contrast(
     frame, pixel = np.nonzero(near if camera.lens is None else np.ones_like(near))
     variance = FOOTPRINT_VARIANCE[view.resampling]
     whole = np.zeros((2, *shape))
-    whole.reshape(2, shape[0], -1)[:, frame, pixel] = _canvas_shares(
-        canvas_from_input[frame], through.T[pixel], bend[pixel], variance
-    )
+    shares = canvas_shares(canvas_from_input, frame, through.T[pixel], bend[pixel], variance)
+    whole.reshape(2, shape[0], -1)[:, frame, pixel] = shares
     return whole[0], whole[1]
 
 
@@ -158,21 +154,19 @@ class _Outline:
         pixel = row * view.width_px + column
         self._pixel, self._bend = through.T[pixel], bend[pixel]
         self._measured = blurred[self._frame, row, column]
+        self._first = np.searchsorted(self._frame, np.arange(len(prior) + 1))
 
     def step(
         self, moves: Float[np.ndarray, "f 6"], common: Float[np.ndarray, "6 6"], own: Float[np.ndarray, "6 6"]
     ) -> Float[np.ndarray, "f 6"]:
         """One damped Gauss-Newton step of all frames together."""
-        frames = len(moves)
         here = self._predicted(moves)
         slopes = np.stack([(self._predicted(moves + _DELTA * axis) - here) / _DELTA for axis in np.eye(6)], -1)
         error = (here - self._measured) / _NOISE
         # Huber's weights: an occluder at the edge of the canvas is not the edge of the canvas.
         weight = np.minimum(1.0, _ROBUST / np.maximum(np.abs(error), 1e-9)) / _NOISE
-        normal, slope = np.zeros((frames, 6, 6)), np.zeros((frames, 6))
-        np.add.at(normal, self._frame, (weight / _NOISE)[:, None, None] * slopes[:, :, None] * slopes[:, None, :])
-        np.add.at(slope, self._frame, (weight * error)[:, None] * slopes)
-        return _arrow_step(moves, normal, slope, common, own)
+        normal = self._of_frames((weight / _NOISE)[:, None, None] * slopes[:, :, None] * slopes[:, None, :])
+        return _arrow_step(moves, normal, self._of_frames((weight * error)[:, None] * slopes), common, own)
 
     def outline_px(self, moves: Float[np.ndarray, "f 6"]) -> Float[np.ndarray, " f"]:
         """Mean distance of predicted from measured edges per frame, camera px: wrong shares over the edges' length."""
@@ -192,34 +186,14 @@ class _Outline:
         return self._shares(np.linalg.inv(self._view.input_from_camera @ image_from_canvas), self._pixel)
 
     def _shares(self, canvas_from_input: Homographies, pixel: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
-        """Share of each footprint that lies on the canvas (`coverage`, for one rectangle that is not turned)."""
-        return _canvas_shares(canvas_from_input[self._frame], pixel, self._bend, self._variance)[1]
+        return canvas_shares(canvas_from_input, self._frame, pixel, self._bend, self._variance)[1]
 
-
-def _canvas_shares(
-    canvas_from_input: Float[np.ndarray, "p 3 3"],
-    pixel: Float[np.ndarray, "p 3"],
-    bend: Float[np.ndarray, "p 3 2"],
-    variance: float,
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Share of each footprint on the canvas, and the predicted contrast p.
-
-    Along either axis a checkerboard is a square wave, and it is their product: squares are where it is positive.
-    """
-    mapped = np.einsum("pij,pj->pi", canvas_from_input, pixel)
-    ahead = mapped[:, 2] > 1e-9
-    depth = np.where(ahead, mapped[:, 2], 1.0)[:, None]
-    at = mapped[:, :2] / depth
-    jacobian = (canvas_from_input[:, :2] - at[:, :, None] * canvas_from_input[:, 2:]) @ bend / depth[..., None]
-    # Two numbers are added and multiplied by hand: numpy takes ten times as long along so short an axis.
-    reach = np.sqrt(variance * (np.square(jacobian[..., 0]) + np.square(jacobian[..., 1])) + 1e-9)
-    edges = np.linspace(-0.5, CANVAS_SIZE_PX - 0.5, SQUARES + 1)
-    steps = [_tent((at - edge) / reach) for edge in edges]
-    along = steps[0] - steps[-1]
-    waves = cast("Any", sum((-1.0) ** k * (steps[k] - steps[k + 1]) for k in range(SQUARES)))
-    share, wave = along[:, 0] * along[:, 1], waves[:, 0] * waves[:, 1]
-    grey = 0.5 * (share + wave)
-    return np.where(ahead, share, 0.0), np.where(ahead, share - GREY * grey, 0.0)
+    def _of_frames(self, values: Float[np.ndarray, "p ..."]) -> Float[np.ndarray, "f ..."]:
+        """The sum over the pixels of each frame, of which there may be none; they lie one frame after another."""
+        padded = np.concatenate([values, np.zeros((1, *values.shape[1:]))])
+        totals = np.add.reduceat(padded, self._first[:-1])
+        totals[np.diff(self._first) == 0] = 0.0
+        return totals
 
 
 def _over_gain(contrast: Pictures, expected: Pictures) -> Pictures:
@@ -230,12 +204,6 @@ def _over_gain(contrast: Pictures, expected: Pictures) -> Pictures:
 
 
 _SIDES = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
-
-
-def _tent(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Share of a tent of half-width 1 between its middle and t."""
-    t = np.clip(t, -1.0, 1.0)
-    return t * (1.0 - 0.5 * np.abs(t))
 
 
 def _blurred(contrast: Pictures, blur_px: int) -> tuple[Pictures, Bool[np.ndarray, "f h w"]]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
 
-from roadproof.calibration.outline import GREY, SQUARES, fit_outline, outline_errors_px, predicted_contrast
+from roadproof.calibration.compiled import GREY, SQUARES
+from roadproof.calibration.outline import fit_outline, outline_errors_px, predicted_contrast
 from roadproof.calibration.replays import Replays, Target
 from roadproof.calibration.report import Geometry
 from roadproof.drives import Drive
@@ -29,16 +27,7 @@ def dark_target() -> PatternImage:
     return target
 
 
-Fitted: TypeAlias = tuple[Homographies, Float[np.ndarray, " f"]]
-"""Homographies of a drive's frames, and by how much they miss what each shows, camera px."""
-
 TARGETS = Target("light", uniform(255, 255, 255)), Target("dark", dark_target())
-
-
-def fit_paints(replays: Replays, drive: Drive, prior: Homographies, camera: CameraModel, view: CropResize) -> Fitted:
-    """Homographies corrected by what a light and a dark canvas show, and by how much they miss it: `fit_outline`."""
-    light, dark = (replays.look(drive, target) for target in TARGETS)
-    return fit_outline(prior, _contrast(light, dark), camera, view)
 
 
 def look_at_paints(
@@ -49,7 +38,6 @@ def look_at_paints(
     view: CropResize,
     *,
     refine: bool,
-    fitted: Fitted | None = None,
 ) -> tuple[Geometry, PixelMaps]:
     """Where the frames of a drive see the canvas, and how paint looks there, from a light and a dark canvas.
 
@@ -59,22 +47,18 @@ def look_at_paints(
         prior: homographies from the drive's poses, canvas px to camera px, (F, 3, 3).
         camera: camera on the car.
         view: crop and resize that make the controller's input from the camera picture.
-        refine: whether the homographies are corrected by what the frames show, where `fitted` is None.
-        fitted: what `fit_paints` gave; None where that is not done yet.
+        refine: whether the homographies are corrected by what the frames show.
 
     Raises:
         CalibrationError: the two paints look alike or saturate, or a replay goes astray.
     """
     light, dark = (replays.look(drive, target) for target in TARGETS)
     difference = light.astype(np.float64) - dark
-    contrast = _contrast(light, dark)
-    if fitted is None:
-        fitted = (
-            fit_outline(prior, contrast, camera, view)
-            if refine
-            else (prior, outline_errors_px(prior, contrast, camera, view))
-        )
-    homographies, errors = fitted
+    contrast = difference.mean(-1) / 255
+    if refine:
+        homographies, errors = fit_outline(prior, contrast, camera, view)
+    else:
+        homographies, errors = prior, outline_errors_px(prior, contrast, camera, view)
     # What the dark frame would be without its squares: they took the known share 1 − p / s of the difference.
     share, expected = predicted_contrast(homographies, view, camera)
     whole = np.where(share > 0.01, share / np.maximum(expected, 1e-6), 1.0).clip(1.0, 1.0 / (1.0 - GREY))
@@ -93,7 +77,3 @@ def look_at_paints(
     kept = list(found)
     residuals_px = errors[kept]
     return Geometry(found, dropped, residuals_px[np.isfinite(residuals_px)]), maps.at(kept)
-
-
-def _contrast(light: UInt8[np.ndarray, "f h w 3"], dark: UInt8[np.ndarray, "f h w 3"]) -> Float[np.ndarray, "f h w"]:
-    return (light.astype(np.float64) - dark).mean(-1) / 255
