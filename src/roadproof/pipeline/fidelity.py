@@ -76,7 +76,9 @@ class Fidelity(Saved):
     agreement: Agreement
 
 
-Fidelity.FILE = RecordFile(kind=Fidelity, name="roadproof-fidelity", error=EpisodeError, remedy="evaluate again")
+Fidelity.FILE = RecordFile(
+    kind=Fidelity, name="roadproof-fidelity", error=EpisodeError, remedy="evaluate again", level=1
+)
 
 
 def measure_fidelity(

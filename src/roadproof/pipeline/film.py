@@ -74,7 +74,7 @@ class Strip(Saved):
             raise EpisodeError("the strip has not one picture of each drive at each time")
 
 
-Strip.FILE = RecordFile(kind=Strip, header=None, error=EpisodeError, remedy="evaluate again")
+Strip.FILE = RecordFile(kind=Strip, header=None, error=EpisodeError, remedy="evaluate again", level=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
