@@ -119,6 +119,7 @@ def sizes() -> Iterable[tuple[str, dict[str, int]]]:
 def draw(records: list[Record], path: Path) -> None:
     """One panel for each question, logarithmic both ways."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     panels = [*SIZES, "drives", "processes", "trials", "estimate"]
     figure = Figure(figsize=(14, 6.5), layout="constrained")
@@ -138,6 +139,12 @@ def draw(records: list[Record], path: Path) -> None:
                 axes.plot([e[against] for e in of], [e["took_s"] for e in of], "o-", label=name)
         unit = "estimated s" if against == "estimate" else "ms a step" if against in SIZES else "s"
         axes.set(xscale="log", yscale="log", xlabel="took s" if against == "estimate" else against, ylabel=unit)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+        if against != "estimate":
+            axes.set_xticks(sorted({each[against] for each in mine}))
+        axes.minorticks_off()
         if against == "estimate":
             axes.axline((1, 1), (10, 10), color="0.7", linewidth=1)
         if mine:

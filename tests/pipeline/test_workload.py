@@ -5,10 +5,10 @@ import time
 import pytest
 import torch
 
-from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
+from roadproof.attacks import TPE, BayesianOptimisation, GradOpt, PathDeviation, SteeringShift
 from roadproof.compositing import Variation
 from roadproof.pipeline import workload
-from roadproof.pipeline.workload import frame_seconds, of_search
+from roadproof.pipeline.workload import frame_seconds, of_proposals, of_search
 
 
 class Waits(torch.nn.Module):
@@ -47,3 +47,11 @@ def test_a_search_over_looks_shows_every_frame_in_each(monkeypatch, objective):
         for variation in (None, Variation(draws=4))
     )
     assert four == pytest.approx(4 * one)
+
+
+def test_a_guided_proposal_takes_the_longer_the_more_was_tried():
+    few, many = (of_proposals(BayesianOptimisation(calls=calls, random_calls=56)).seconds for calls in (140, 1000))
+    assert few == pytest.approx(sum(workload.PROPOSED_S + workload.LATER_S * n**2 for n in range(56, 140)), rel=0.02)
+    assert many > 20 * few
+    assert not of_proposals(BayesianOptimisation(calls=40)).seconds
+    assert not of_proposals(TPE(calls=1000)).seconds

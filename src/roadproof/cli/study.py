@@ -68,7 +68,10 @@ def run(
 
 def _workload(study: Study, who: Controller, workers: int) -> Workload:
     """All jobs, also of those that are done already; what they share is made once for each scenario and seed."""
-    from roadproof.pipeline.workload import Workload, of_drives, of_finding, of_recording
+    import torch
+
+    from roadproof.machine import threads
+    from roadproof.pipeline.workload import Workload, of_drives, of_finding, of_proposals, of_recording
     from roadproof.study.methods import BlackBoxPlan, budget_of
     from roadproof.study.shared import recorded_by
 
@@ -78,11 +81,13 @@ def _workload(study: Study, who: Controller, workers: int) -> Workload:
     own, recordings = Workload(), dict[str, Workload]()
     for method in study.methods:
         own += judging
+        budget = budget_of(method, study.weathers[0])
         if isinstance(method, BlackBoxPlan) and method.where == "simulator":
-            own += of_drives(method.calls + 1)
+            own += of_drives(method.calls + 1) + of_proposals(budget.method)
         else:
-            budget = budget_of(method, study.weathers[0])
-            own += of_finding(budget, who)
+            # Jobs side by side share out the cores.
+            with threads(max(1, torch.get_num_threads() // workers)):
+                own += of_finding(budget, who)
             recordings[recorded_by(budget)] = of_recording(budget)
     shared = sum(recordings.values(), judging)
     places = len(study.scenarios) * len(study.seeds)
