@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 import torch
 
 from roadproof.errors import ControllerError, OutputError, TrainingError
-from roadproof.processes import Pool, processes_beside, spread, stopping
+from roadproof.processes import Pool, _Left, processes_beside, spread, stopping
 
 SCRIPT = """
 import os, time
@@ -181,6 +182,23 @@ def place(folder):
     """A simulator that takes note of who opens it."""
     (folder / f"{os.getpid()}").touch()
     yield folder
+
+
+def test_a_process_goes_on_with_the_kind_of_work_that_it_had():
+    one, other = ProcessPoolExecutor(1), ProcessPoolExecutor(1)
+
+    def taken(left, *processes):
+        return [piece for _, piece in left.taken_by(processes)]
+
+    left = _Left(["a1", "a2", "b1", "b2", "a3", "b3", "c1"], alike=lambda piece: piece[0])
+    assert taken(left, one, other) == ["a1", "b1"]
+    assert taken(left, other) == ["b2"]
+    assert taken(left, one, other) == ["a2", "b3"]
+    assert taken(left, other) == ["c1"], "of a kind that none has"
+    assert taken(left, other) == ["a3"], "or else the first"
+    assert taken(left, one, other) == []
+    left = _Left([3, 1, 2], alike=lambda _: None)
+    assert taken(left, one, other) + taken(left, other) == [3, 1, 2]
 
 
 def begin(folder, _):

@@ -11,9 +11,8 @@ import shutil
 import sys
 import tempfile
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
@@ -86,6 +85,10 @@ class Pool(Generic[Inside]):
             for process in self._beside:
                 process.shutdown(wait=False, cancel_futures=True)
             return
+        if self.processes > 1:
+            # All of them end together; one after another takes half a second each.
+            with ThreadPoolExecutor(self.processes) as waiting:
+                list(waiting.map(ProcessPoolExecutor.shutdown, self._beside))
         self._stack.close()
 
     @cached_property
@@ -136,7 +139,11 @@ class Pool(Generic[Inside]):
         return self._settled
 
     def each(
-        self, function: Callable[[Inside, Work], Result] | Settled[Inside, Work, Result], works: Sequence[Work]
+        self,
+        function: Callable[[Inside, Work], Result] | Settled[Inside, Work, Result],
+        works: Sequence[Work],
+        *,
+        alike: Callable[[Work], object] = lambda _: None,
     ) -> Iterator[tuple[Work, Result]]:
         """Call a function for every piece of work.
 
@@ -146,6 +153,7 @@ class Pool(Generic[Inside]):
                 whether they are `stopping`. What it holds on a GPU is on the processor there: many processes with a
                 picture at a time would wait for each other at one GPU.
             works: the pieces; they travel between processes.
+            alike: tells kinds of pieces; a process goes on with the kind that it has, where it is dear to change.
 
         Yields:
             Each piece of work with its result, in the order in which they are finished.
@@ -161,15 +169,15 @@ class Pool(Generic[Inside]):
                 yield work, asked(self._here, work)
             return
         call = partial(_call, file or _pickled_for_the_processor(asked))
-        left = deque(works)
+        left = _Left(works, alike)
         try:
             free = self._beside if file is None else self._beside * -(-len(works) // self.processes)
-            waiting = {process.submit(call, work): (process, work) for process, work in _paired(free, left)}
+            waiting = {process.submit(call, work): (process, work) for process, work in left.taken_by(free)}
             while waiting:
                 done, _ = wait(waiting, return_when=FIRST_COMPLETED)
                 finished = {future: waiting.pop(future) for future in done}
                 free = [process for process, _ in finished.values()]
-                waiting |= {process.submit(call, work): (process, work) for process, work in _paired(free, left)}
+                waiting |= {process.submit(call, work): (process, work) for process, work in left.taken_by(free)}
                 for future, (_, work) in finished.items():
                     yield work, cast("Result", future.result())
         except BrokenProcessPool:
@@ -263,9 +271,26 @@ class _Processor(pickle.Pickler):
         return cast("Any", here).__reduce_ex__(2)
 
 
-def _paired(processes: Sequence[ProcessPoolExecutor], works: deque[Work]) -> list[tuple[ProcessPoolExecutor, Work]]:
-    """Processes with a piece of work each, taken from those that are left."""
-    return [(process, works.popleft()) for process in processes[: len(works)]]
+class _Left(Generic[Work]):
+    """Pieces of work that nobody has taken yet, in their order."""
+
+    def __init__(self, works: Sequence[Work], alike: Callable[[Work], object]) -> None:
+        self._works, self._alike = list(works), alike
+        self._last: dict[ProcessPoolExecutor, object] = {}
+
+    def taken_by(self, processes: Sequence[ProcessPoolExecutor]) -> list[tuple[ProcessPoolExecutor, Work]]:
+        """Processes with a piece of work each, as far as there are some left."""
+        return [(process, self._taken(process)) for process in processes[: len(self._works)]]
+
+    def _taken(self, process: ProcessPoolExecutor) -> Work:
+        """The first piece of the kind that the process had, else of a kind that none has, else the first."""
+        kinds = [self._alike(work) for work in self._works]
+        others = list(self._last.values())
+        fresh = next((k for k, kind in enumerate(kinds) if kind not in others), 0)
+        last = self._last.get(process, self)
+        chosen = kinds.index(last) if last in kinds else fresh
+        self._last[process] = kinds[chosen]
+        return self._works.pop(chosen)
 
 
 def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:

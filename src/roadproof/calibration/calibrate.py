@@ -24,7 +24,7 @@ from roadproof.calibration.published import (
 from roadproof.calibration.replays import Replays, Wanted, replay_in, told_apart
 from roadproof.calibration.report import CalibrationReport, DriveReport, Geometry, Spread, stated_errors_px
 from roadproof.calibration.two_paint import TARGETS, look_at_paints
-from roadproof.datatypes import Weather
+from roadproof.datatypes import Obstacle, Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
 from roadproof.geometry import CameraModel, homography_from_pose
@@ -33,9 +33,10 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import table
 from roadproof.io.identity import digest, require_same
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
-from roadproof.processes import Pool
+from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
-from roadproof.roads.marks import marks_of
+from roadproof.roads.marks import LaneMark, marks_of
+from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import Simulator, obstacles_of
 
 WORST_PX = 3.0
@@ -218,6 +219,8 @@ def calibrate(
         calls=drives.calls + len(wanted),
         seconds=time.perf_counter() - began,
     )
+    with open_or_here(beside, simulator) as there:
+        ((_, (marks, obstacles)),) = there.each(_roadside, [settings.scenario])
     recordings = RecordingSet(
         camera=settings.camera,
         view=settings.view,
@@ -225,8 +228,8 @@ def calibrate(
         recordings=tuple(map(_recording, drives.drives, looks, repeat(settings.weather))),
         origin=f"{settings.scenario.name}, {settings.weather}, driven by {settings.driver or 'a driver'}, {method}",
         canvas=settings.scenario.canvas,
-        marks=marks_of(simulator, settings.scenario),
-        obstacles=obstacles_of(simulator, settings.scenario),
+        marks=marks,
+        obstacles=obstacles,
     )
     return Calibrated(recordings, report, _parts(drives, method))
 
@@ -235,6 +238,13 @@ def _poses(drives: Drives, drive: Drive) -> Homographies:
     """The homographies of a drive's poses, canvas px to camera px."""
     camera, canvas = drives.settings.camera, drives.settings.scenario.canvas
     return np.stack([homography_from_pose(camera, state, canvas) for state in drive.states])
+
+
+def _roadside(
+    simulator: Simulator, scenario: Scenario
+) -> tuple[tuple[LaneMark, ...] | None, tuple[Obstacle, ...] | None]:
+    """What lies and stands beside a canvas; one that has drawn the road has its plan at hand."""
+    return marks_of(simulator, scenario), obstacles_of(simulator, scenario)
 
 
 class _Look(NamedTuple):

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -186,7 +187,9 @@ def make_missing(
     missing = [drive for drive in drives if not episodes.has(drive)]
     made = len(drives) - len(missing)
     on_done(made)
-    for done, _ in enumerate(pool.each(partial(_make, episodes), missing), made + 1):
+    # A simulator lights all it has anew for another weather.
+    drives_made = pool.each(partial(_make, episodes), missing, alike=attrgetter("weather"))
+    for done, _ in enumerate(drives_made, made + 1):
         on_done(done)
 
 

@@ -49,7 +49,8 @@ def film_file(
     with writing(path):
         container = av.open(str(part), "w", format="mp4", options={"movflags": "+faststart"})
     try:
-        options = {"crf": str(quality), "threads": "1", "preset": "veryfast"}
+        # On any machine as many, so that the film is the same.
+        options = {"crf": str(quality), "threads": "2", "preset": "veryfast"}
         stream = container.add_stream("libx264", rate=Fraction(1 / dt_s).limit_denominator(1000), options=options)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"

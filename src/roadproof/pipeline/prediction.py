@@ -15,7 +15,7 @@ from roadproof.driving.speed import speed_difference
 from roadproof.errors import EpisodeError
 from roadproof.io.records import RecordFile, Saved
 from roadproof.patterns import Pattern
-from roadproof.recorded.world import UNSURE, RecordedWorld
+from roadproof.recorded.world import UNSURE, BiasedStart, RecordedWorld
 from roadproof.recordings import RecordingSet
 
 
@@ -100,10 +100,10 @@ def predict(
     world.fit(controller)
     on_device = pattern[None].mapped(lambda part: part.to(device))
     with torch.no_grad():
-        rolled = world.roll(controller, on_device)
-    found = world.predict(controller, on_device, UNSURE)
+        bare, rolled = (world.roll(controller, paint, starts=UNSURE) for paint in (None, on_device))
+    found, usual = world.compared(bare, rolled), UNSURE.index(BiasedStart())
     deviations, changes = found.deviation_m, found.speed_change_mps
-    predicted, canvas = world.whole_path(rolled, 0), world.course.canvas
+    predicted, canvas = world.whole_path(rolled, usual), world.course.canvas
     seen = passage(path_of(clean), canvas)
     driven = path_of(painted)[seen]
     both = min(len(driven), len(predicted))
@@ -113,8 +113,8 @@ def predict(
         most_m=float(deviations.max()),
         driven_m=passage_deviation_m(clean, painted, canvas),
         path_error_m=float(np.hypot(*(predicted[:both] - driven[:both]).T).mean()) if both else 0.0,
-        gap_m=float(rolled.left_m.abs().max()),
-        gap_rad=float(rolled.turned_rad.abs().max()),
+        gap_m=float(rolled.left_m[usual].abs().max()),
+        gap_rad=float(rolled.turned_rad[usual].abs().max()),
         clean_xy=path_of(clean)[seen],
         predicted_xy=predicted,
         driven_xy=driven,

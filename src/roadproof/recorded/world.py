@@ -324,20 +324,29 @@ class RecordedWorld:
             bare: what `roll` gave for the bare road from these starts in these looks; None drives there now.
         """
         at_once = max(1, AT_ONCE[self.device.type] // len(starts))
-        # Before the first recorded frame the two drives are one.
-        share = self.course.count / (self.course.seen.stop - self.course.seen.start)
-        deviations: list[float] = []
-        changes: list[Tensor] = []
         with torch.no_grad():
             bare = bare or self.roll(controller, starts=starts, looks=looks)
-            paths = [self.whole_path(bare, k) for k in range(len(starts))]
-            for first in range(0, len(patterns.boxes), at_once):
-                rolled = self.roll(controller, patterns[first : first + at_once], starts=starts, looks=looks)
-                count = len(rolled.x_m)
-                deviations += [deviation_m(paths[k % len(starts)], self.whole_path(rolled, k)) for k in range(count)]
-                change = rolled.speed_mps - bare.speed_mps.repeat(count // len(starts), 1)
-                changes.append(share * change.mean(1).view(-1, len(starts)))
-        return Predicted(np.array(deviations).reshape(-1, len(starts)), torch.cat(changes).cpu().numpy())
+            each = [
+                self.compared(
+                    bare, self.roll(controller, patterns[first : first + at_once], starts=starts, looks=looks)
+                )
+                for first in range(0, len(patterns.boxes), at_once)
+            ]
+        return Predicted(
+            np.concatenate([found.deviation_m for found in each]),
+            np.concatenate([found.speed_change_mps for found in each]),
+        )
+
+    def compared(self, bare: Rolled, painted: Rolled) -> Predicted:
+        """What R patterns do, from S drives over the bare road and R·S over the patterns from the same starts."""
+        count, starts = len(painted.x_m), len(bare.x_m)
+        paths = [self.whole_path(bare, k) for k in range(starts)]
+        deviations = [deviation_m(paths[k % starts], self.whole_path(painted, k)) for k in range(count)]
+        change = painted.speed_mps - bare.speed_mps.repeat(count // starts, 1)
+        # Before the first recorded frame the two drives are one.
+        share = self.course.count / (self.course.seen.stop - self.course.seen.start)
+        changes = share * change.mean(1).view(-1, starts)
+        return Predicted(np.array(deviations).reshape(-1, starts), changes.cpu().numpy())
 
     def begin(self, starts: tuple[BiasedStart, ...] = (BiasedStart(),), repeats: int = 1) -> Motion:
         """Cars at the first recorded frame of the clean drive, one for each start, repeated `repeats` times."""
