@@ -177,6 +177,22 @@ def test_what_a_piece_raises_comes_through_and_ends_the_others():
     assert time.monotonic() < begun + 45
 
 
+def large_tensor(inside, number):
+    del inside
+    return torch.full((number,), 1.0)
+
+
+def test_results_are_not_in_shared_memory_of_which_a_container_may_have_little():
+    before = shutil.disk_usage("/dev/shm").used
+    ((_, found),) = list(spread(large_tensor, [5_000_000], nullcontext, processes=2))
+    ((_, other),) = list(Pool(nullcontext, 1).each(large_tensor, [5_000_000]))
+    assert torch.equal(found, other)
+    with Pool(nullcontext, 2) as pool:
+        kept = [result for _, result in pool.each(large_tensor, [5_000_000, 5_000_000])]
+        assert len(kept) == 2
+        assert shutil.disk_usage("/dev/shm").used < before + 10_000_000
+
+
 @contextmanager
 def place(folder):
     """A simulator that takes note of who opens it."""

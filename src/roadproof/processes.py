@@ -179,7 +179,7 @@ class Pool(Generic[Inside]):
                 free = [process for process, _ in finished.values()]
                 waiting |= {process.submit(call, work): (process, work) for process, work in left.taken_by(free)}
                 for future, (_, work) in finished.items():
-                    yield work, cast("Result", future.result())
+                    yield work, cast("Result", pickle.loads(future.result()))  # noqa: S301  # of a process of ours
         except BrokenProcessPool:
             raise SimulatorError(DIED) from None
 
@@ -293,9 +293,9 @@ class _Left(Generic[Work]):
         return self._works.pop(chosen)
 
 
-def _pickled_for_the_processor(function: Callable[..., object]) -> bytes:
+def _pickled_for_the_processor(thing: object) -> bytes:
     with io.BytesIO() as file:
-        _Processor(file).dump(function)
+        _Processor(file).dump(thing)
         return file.getvalue()
 
 
@@ -318,8 +318,9 @@ def _inside() -> Any:  # noqa: ANN401  # whatever the process works in
     return _opened.enter_context(_opens())
 
 
-def _call(travelled: bytes | Path, work: object) -> object:
-    return _function(travelled)(_inside(), work)
+def _call(travelled: bytes | Path, work: object) -> bytes:
+    """What the function gives, as bytes: torch would have shared memory hold it, of which containers have little."""
+    return _pickled_for_the_processor(_function(travelled)(_inside(), work))
 
 
 @lru_cache(maxsize=1)
