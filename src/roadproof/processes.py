@@ -71,25 +71,23 @@ class Pool(Generic[Inside]):
             self._stop = multiprocessing.get_context("spawn").Event()
             self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
             given = (self._opens, self._stop, threads, Path(self._folder.name))
-            self._beside = [
-                self._stack.enter_context(processes_beside(1, _begin_work, *given)) for _ in range(self.processes)
-            ]
+            self._beside = [processes_beside(1, _begin_work, *given) for _ in range(self.processes)]
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self.processes > 1:
-            self._folder.cleanup()
-        if kind is not None and self.processes > 1:
+        self._stack.close()
+        if self.processes == 1:
+            return
+        self._folder.cleanup()
+        if kind is not None:
             self._stop.set()
             # Not where all went well: processes that are not waited for may complain when Python ends.
             for process in self._beside:
                 process.shutdown(wait=False, cancel_futures=True)
             return
-        if self.processes > 1:
-            # All of them end together; one after another takes half a second each.
-            with ThreadPoolExecutor(self.processes) as waiting:
-                list(waiting.map(ProcessPoolExecutor.shutdown, self._beside))
-        self._stack.close()
+        # All of them end together; one after another takes half a second each.
+        with ThreadPoolExecutor(self.processes) as waiting:
+            list(waiting.map(ProcessPoolExecutor.shutdown, self._beside))
 
     @cached_property
     def _here(self) -> Inside:

@@ -177,7 +177,8 @@ def test_a_drive_is_looked_at_again_only_where_it_is_asked_for(town):
     assert seen == {3: (True, True), 9: (True, True)}
     seen = look_again(town, episode, SHORT, (3,), lambda seen: seen.shown.shape, full_pictures=True)
     assert seen == {3: (600, 800, 3)}
-    drive_again(town, episode, SHORT, steps=5, on_step=lambda seen, _: frames.append(seen.frame.any()))
+    four = {"looked_at": frozenset({4}), "full_pictures": True}
+    drive_again(town, episode, SHORT, **four, on_step=lambda seen, _: frames.append(seen.frame.any()))
     assert frames == [False] * 5
 
 

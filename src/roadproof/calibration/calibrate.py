@@ -192,9 +192,9 @@ def calibrate(
         )
     on_call(0)
     began = time.perf_counter()
-    wanted, beside = _wanted(drives, method), None
+    beside = None
     if pool is not None and pool.processes > 1 and folder is not None:
-        replay_in(pool, drives, folder, wanted, on_call)
+        replay_in(pool, drives, folder, _wanted(drives, method), on_call)
         replays, beside = Replays(simulator, drives, folder), pool
     else:
         replays = Replays(simulator, drives, folder, on_call)
@@ -216,7 +216,7 @@ def calibrate(
         method=str(method),
         drives=tuple(map(_report, drives.drives, looks, repeat(settings.camera))),
         colour_residual=residual,
-        calls=drives.calls + len(wanted),
+        calls=drives.calls + replays_needed(len(drives.drives), method),
         seconds=time.perf_counter() - began,
     )
     with open_or_here(beside, simulator) as there:

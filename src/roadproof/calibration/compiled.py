@@ -1,7 +1,7 @@
 """What footprints share with the canvas and its squares, in one pass that Numba compiles.
 
-Along either axis the share is that of a tent (`coverage`, for one rectangle that is not turned), and a checkerboard is
-a square wave: squares are where the product of both waves is positive.
+Along either axis the share is that of a tent, as in painting, and a checkerboard is a square wave: squares are where
+the product of both waves is positive.
 """
 
 # ruff: noqa: ANN001, ANN202
@@ -15,7 +15,8 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float, Int
 
-from roadproof.compiling import Kernel, inline
+from roadproof.compiling import Kernel
+from roadproof.compositing.compiled import interval_share
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.homographies import Homographies
 
@@ -50,14 +51,6 @@ def canvas_shares(
     return found
 
 
-@inline
-@no_type_check
-def _tent(t):
-    """Share of a tent of half-width 1 between its middle and t."""
-    t = min(max(t, -1.0), 1.0)
-    return t * (1.0 - 0.5 * abs(t))
-
-
 @Kernel
 @no_type_check
 def _share(canvas_from_input, frame, pixel, bend, variance, found):
@@ -79,13 +72,13 @@ def _share(canvas_from_input, frame, pixel, bend, variance, found):
                     slope += (sees[axis, k] - at * sees[2, k]) * bend[p, k, side] / depth
                 across += variance * slope * slope
             reach = math.sqrt(across)
-            first = before = _tent((at + 0.5) / reach)
-            wave, sign = 0.0, 1.0
+            along, wave, sign = 0.0, 0.0, 1.0
             for square in range(SQUARES):
-                after = _tent((at + 0.5 - (square + 1) * _SQUARE_PX) / reach)
-                wave += sign * (before - after)
-                before, sign = after, -sign
-            share *= first - before
+                part = interval_share(at + 0.5 - (square + 0.5) * _SQUARE_PX, 0.5 * _SQUARE_PX, reach)
+                along += part
+                wave += sign * part
+                sign = -sign
+            share *= along
             both_waves *= wave
         found[0, p] = share
         found[1, p] = share - GREY * 0.5 * (share + both_waves)

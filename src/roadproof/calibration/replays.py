@@ -91,7 +91,6 @@ class Replays:
 
     def _drive_again(self, drive: Drive, target: Target) -> dict[str, np.ndarray]:
         wanted = dict(zip(drive.frame_number.tolist(), drive.states, strict=True))
-        shown, unseen = frozenset(wanted), frozenset[int]()
         seen_there: list[np.ndarray] = []
         stated: list[np.ndarray] = []
         step, last = 0, int(drive.frame_number[-1])
@@ -110,9 +109,8 @@ class Replays:
             drive.episode,
             settings.scenario,
             pattern=target.paint,
-            steps=last + 1,
-            frames=unseen if target.full_pictures else shown,
-            full_pictures=shown if target.full_pictures else unseen,
+            looked_at=frozenset(wanted),
+            full_pictures=target.full_pictures,
             on_step=keep,
         )
         if len(seen_there) != len(wanted):

@@ -154,27 +154,27 @@ def drive_again(
     scenario: Scenario,
     *,
     pattern: Pattern | PatternImage | None = None,
-    steps: int,
-    frames: Pictures = False,
-    full_pictures: Pictures = False,
+    looked_at: frozenset[int],
+    full_pictures: bool = False,
     on_step: OnStep | None = None,
 ) -> Episode:
     """Drive an episode again from its controls, in its weather and traffic, over other paint: the states are the same.
+
+    It is driven as far as it is looked at. There is the controller's frame or the full picture; nothing else is drawn.
 
     Args:
         simulator: an open simulator of the kind that the episode was driven in.
         episode: episode whose controls are given again.
         scenario: scenario of the episode, from the start that it had.
         pattern: pattern painted on the canvas, or a picture of the canvas; None leaves the road bare.
-        steps: number of observations after which the drive ends, at least 1.
-        frames: which observations show the controller's frame, by default none: nobody drives by it.
-        full_pictures: which observations show the full camera picture.
+        looked_at: the steps that are looked at, counted from 0; one at the least.
+        full_pictures: whether full camera pictures are looked at, and not the controller's frames.
         on_step: called after each step, as by `rollout`.
 
     Raises:
         SimulatorError, ScenarioError, PatternError: as `rollout` does.
     """
-    seen = count(1)
+    seen, last, unseen = count(), max(looked_at), frozenset[int]()
     return rollout(
         simulator,
         replay(episode),
@@ -184,10 +184,10 @@ def drive_again(
         cars=episode.cars,
         pedestrians=episode.pedestrians,
         seed=episode.seed,
-        frames=frames,
-        full_pictures=full_pictures,
+        frames=unseen if full_pictures else looked_at,
+        full_pictures=looked_at if full_pictures else unseen,
         on_step=on_step,
-        until=lambda _: next(seen) >= steps,
+        until=lambda _: next(seen) >= last,
     )
 
 
@@ -203,8 +203,7 @@ def look_again(
 ) -> dict[int, Seen]:
     """Drive an episode again as far as it is looked at, and keep what `look` makes of its observations at some steps.
 
-    Steps count from 0. At them there are the controller's frames or, where these are asked for, full pictures; nothing
-    else is drawn. All else is as in `drive_again`.
+    All else is as in `drive_again`.
 
     Returns:
         What was kept, by the step; only of steps that came before the drive ended.
@@ -216,16 +215,8 @@ def look_again(
         if (number := next(numbers)) in wanted:
             kept[number] = look(seen)
 
-    frames, pictures = (frozenset[int](), wanted) if full_pictures else (wanted, frozenset[int]())
     drive_again(
-        simulator,
-        episode,
-        scenario,
-        pattern=pattern,
-        steps=max(wanted) + 1,
-        frames=frames,
-        full_pictures=pictures,
-        on_step=keep,
+        simulator, episode, scenario, pattern=pattern, looked_at=wanted, full_pictures=full_pictures, on_step=keep
     )
     return kept
 
