@@ -39,8 +39,8 @@ def test_the_overall_table_has_the_papers_layout(records):
 def test_types_weathers_and_static_only_have_tables_of_their_own(records):
     tables = tables_of(records)
     assert list(tables) == [
-        "methods", "overall-bo", "paired-bo", "type-penalty-bo", "type-static-bo", "type-deviation-bo", "weathers-bo",
-        "rainy-noon-alone-bo",
+        "methods", "scenarios", "overall-bo", "paired-bo", "type-penalty-bo", "type-static-bo", "type-deviation-bo",
+        "weathers-bo", "rainy-noon-alone-bo",
     ]  # fmt: skip
     assert rows_of(tables["type-deviation-bo"])[0] == (
         "1", "0.50", "1.00", "100%", "2.25", "1.75", "50%", "1.00", "3.00", "100%",
@@ -65,6 +65,33 @@ def test_cost_stands_beside_what_was_found(records):
     table = tables_of(records)["methods"]
     assert rows_of(table)[0] == ("1", "GradOpt", "4", "61", "30", "1.88", "5.25", "1.75 (1.38 to 2.25)", "100%")
     assert rows_of(table)[1] == ("", "BO", "4", "1000", "30", "1.50", "4.50", "1.50 (0.88 to 2.12)", "100%")
+
+
+def test_scenario_by_scenario_medians_stand_with_their_range_and_what_left_the_lane(records):
+    uneven = [row("left-01", deviation_m=d, left_lane=d > 1, points=d) for d in (0.5, 1.5, 4.0)] + [
+        row("left-01", method="BO", deviation_m=2.0),
+        row("left-02", method="BO", deviation_m=9.0),
+    ]
+    table = tables_of(uneven)["scenarios"]
+    assert rows_of(table) == [
+        ("1", "left-01", "GradOpt", "61", "30", "1.50", "2 of 3", "1.5"),
+        ("", "", "BO", "1000", "30", "2.00", "1 of 1", "2"),
+        ("1", "left-02", "GradOpt", "–", "–", "–", "–", "–"),
+        ("", "", "BO", "1000", "30", "9.00", "1 of 1", "2"),
+    ]
+    assert table.rows[0][5].interval == ("0.50", "4.00")
+    assert [cells[5].best for cells in table.rows[:2]] == [False, True]
+    # left-02 has nothing to be compared with.
+    assert "in so many of 1 cases of scenario, K and weather: GradOpt 0, BO 1." in table.note
+    assert "left-02, K = 1, GradOpt, seed 0" in table.note
+
+    whole = tables_of(records)["scenarios"]
+    # Alone on the road, one drive in each of two weathers: medians are the deviations, and their means stand last.
+    assert rows_of(whole)[8:10] == [
+        ("1", "mean of 4", "GradOpt", "61", "30", "1.88", "1.62", "8 of 8", "3.5"),
+        ("", "", "BO", "1000", "30", "1.50", "1.25", "8 of 8", "3"),
+    ]
+    assert "of 16 cases of scenario, K and weather: GradOpt 12, BO 8." in whole.note  # left-01 is a tie
 
 
 def test_the_ablation_compares_variants_over_what_all_have():
@@ -148,9 +175,10 @@ def test_methods_that_have_no_case_in_common_are_not_averaged():
 
 def test_one_method_one_k_one_weather_give_what_makes_sense():
     alone = tables_of([row("left-01"), row("left-02")])
-    assert list(alone) == ["methods"]
+    assert list(alone) == ["methods", "scenarios"]
+    assert "Highest" not in alone["scenarios"].note
     both = tables_of([row("left-01"), row("left-01", method="BO")])
-    assert list(both) == ["methods", "overall-bo", "paired-bo"]
+    assert list(both) == ["methods", "scenarios", "overall-bo", "paired-bo"]
     assert [each[:2] for each in rows_of(both["paired-bo"])] == [("Deviation", "1"), ("Infraction penalty", "1")]
     assert "one scenario has no interval" in both["overall-bo"].note
     assert "alone on the road" in both["overall-bo"].note

@@ -7,16 +7,15 @@ out. In every row that compares two methods both means are over the cases that b
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
-from roadproof.driving.intervals import Estimate
 from roadproof.report.formatting import MISSING, in_words
 from roadproof.scenarios import KINDS
 from roadproof.study.kept_jobs import StatedMethod
-from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, PENALTY, Block, Metric, Results
+from roadproof.study.method_tables import methods_table, scenarios_table
+from roadproof.study.results import DEVIATION, PENALTY, Block, Metric, Results
 from roadproof.study.rows import JobId
-from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios, paired, wilcoxon_p
-from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
+from roadproof.study.statistics import mean_over_scenarios, paired, wilcoxon_p
+from roadproof.study.table import Cell, Heading, Number, Table, headings, marked, share_of, slug
 from roadproof.study.table_notes import table_note
 
 SCHEMES = {"group": "Group", "group-all": "Group-All", "random": "Random"}
@@ -28,7 +27,7 @@ GAPS = "missing"
 
 def paper_tables(results: Results) -> tuple[Table, ...]:
     """Every table that makes sense for a study, in the paper's order; what failed comes last."""
-    tables = [methods_table(results)]
+    tables = [methods_table(results), scenarios_table(results)]
     gradopt = [method for method in results.methods if method.search == "gradopt" and method.scheme]
     if len(gradopt) > 1:
         tables += [ablation_table(results, gradopt, metric) for metric in (DEVIATION, PENALTY)]
@@ -91,7 +90,7 @@ def _compare_table(results: Results, ours: str, theirs: str, blocks: Sequence[Bl
         cells: list[Cell] = [figures]
         for block in blocks:
             found = paired(results.values(block, ours, figures), results.values(block, theirs, figures))
-            cells += [*_row_of([found.theirs, found.ours]), _share(found.at_least)] if found else [MISSING] * 3
+            cells += [*marked([found.theirs, found.ours]), share_of(found.at_least)] if found else [MISSING] * 3
         rows.append(tuple(cells))
     said = f"% ≥: cases (scenario and seed) in which {ours} is at least {theirs}, of those that both have."
     return Table(
@@ -153,7 +152,7 @@ def ablation_table(results: Results, variants: Sequence[StatedMethod], metric: M
         common = values[0].index
         for own in values[1:]:
             common = common.intersection(own.index, sort=False)
-        rows.append((figures, *_row_of([mean_over_scenarios(own.loc[common]) for own in values])))
+        rows.append((figures, *marked([mean_over_scenarios(own.loc[common]) for own in values])))
     spans = {scheme: sum(method.scheme == scheme for method in ordered) for scheme in SCHEMES}
     return Table(
         name=f"ablation-{slug(metric.title)}",
@@ -167,47 +166,6 @@ def ablation_table(results: Results, variants: Sequence[StatedMethod], metric: M
     )
 
 
-def methods_table(results: Results) -> Table:
-    """What every method found, and what finding it took: simulator calls and seconds of the search."""
-    blocks = results.overall
-    lane = replace(blocks[0], metric=LEFT_LANE)
-    names = [method.name for method in results.methods]
-    rows: list[tuple[Cell, ...]] = []
-    for figures in results.figures:
-        shown = [
-            _row_of([mean_over_scenarios(results.values(block, name, figures)) for name in names]) for block in blocks
-        ]
-        for number, name in enumerate(names):
-            searches = results.drives[(results.drives["method"] == name) & (results.drives["figures"] == figures)]
-            costs = searches.drop_duplicates(JOB)
-            rows.append((
-                figures if number == 0 else "",
-                name,
-                str(len(costs)),
-                _rounded(costs["search_calls"]),
-                _rounded(costs["search_seconds"]),
-                *(column[number] for column in shown),
-                _spread(results.drives_of(blocks[0], [name], figures)["deviation_m"]),
-                _share(mean_over_scenarios(results.values(lane, name, figures))),
-            ))  # fmt: skip
-    said = (
-        "Simulator calls and seconds: mean of one search, without judging its pattern. Median "
-        "and quartiles: over all drives, each from a start of its own. Leave the lane: share of those drives."
-    )
-    columns = ("patterns", "simulator calls", "seconds", "deviation", "penalty", "median", "leave the lane")
-    return Table(
-        name="methods",
-        title=f"What each method found and what it cost, {in_words(results.home)}",
-        note=table_note(results, blocks, names, said, compared=False),
-        header=(
-            (*headings("", "", ""), Heading("Search", 2), Heading("Found", 4)),
-            headings("K", "method", *columns),
-        ),
-        rows=tuple(rows),
-        left=2,
-    )
-
-
 def _gaps_table(results: Results, gaps: Mapping[JobId, str]) -> Table:
     """Every job that failed or is not complete, and why."""
     return Table(
@@ -218,28 +176,3 @@ def _gaps_table(results: Results, gaps: Mapping[JobId, str]) -> Table:
         rows=tuple((*map(str, job), reason) for job, reason in gaps.items()),
         left=5,
     )
-
-
-def _row_of(means: Sequence[Estimate | None]) -> list[Cell]:
-    """Means side by side, the highest marked; equal ones all, unless all are equal."""
-    values = [mean.value for mean in means if mean is not None]
-    top = max(values, default=0.0)
-    one = min(values, default=0.0) < top - EQUAL
-    return [MISSING if mean is None else Number(mean, best=one and mean.value >= top - EQUAL) for mean in means]
-
-
-def _spread(values: Values) -> str:
-    """Median and quartiles."""
-    if values.empty:
-        return MISSING
-    low, middle, high = values.quantile([0.25, 0.5, 0.75])
-    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
-
-
-def _share(mean: Estimate | None) -> str:
-    return MISSING if mean is None else f"{mean.value:.0%}"
-
-
-def _rounded(values: Values) -> str:
-    mean = values.mean()
-    return MISSING if values.empty else f"{mean:.0f}" if mean >= 10 or mean == int(mean) else f"{mean:.1f}"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TypeAlias
 
 from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
+from roadproof.report.formatting import MISSING
+from roadproof.study.statistics import EQUAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,19 @@ class Number:
 
 
 Cell: TypeAlias = str | Number
+
+
+def marked(numbers: Sequence[Estimate | None]) -> list[Cell]:
+    """Numbers that are compared, the highest marked; equal ones all, unless all are equal."""
+    values = [number.value for number in numbers if number is not None]
+    top = max(values, default=0.0)
+    one = min(values, default=0.0) < top - EQUAL
+    return [MISSING if each is None else Number(each, best=one and each.value >= top - EQUAL) for each in numbers]
+
+
+def share_of(mean: Estimate | None) -> str:
+    """The mean of what is 0 or 1, in percent."""
+    return MISSING if mean is None else f"{mean.value:.0%}"
 
 
 @dataclass(frozen=True, slots=True)

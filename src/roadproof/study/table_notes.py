@@ -32,7 +32,7 @@ def table_note(
         for block in blocks
     )
     cases = [_cases(results, block, methods, compared=compared) for block in blocks]
-    told = [_averaged(cases), said, *_bare_road(blocks, cases), *_missing(results, blocks, methods)]
+    told = [_averaged(cases), said, *_bare_road(blocks, cases), *missing(results, blocks, methods)]
     return " ".join([f"{'; '.join(measured)}; all of it driven.", *told])
 
 
@@ -72,7 +72,8 @@ def _bare_road(blocks: Sequence[Block], cases: Sequence[Frame]) -> list[str]:
     return [f"Penalty of the same drives on the bare road: {', '.join(said)}."] if said else []
 
 
-def _missing(results: Results, blocks: Sequence[Block], methods: Sequence[str]) -> list[str]:
+def missing(results: Results, blocks: Sequence[Block], methods: Sequence[str]) -> list[str]:
+    """Which drives of some blocks and methods are not there, in a sentence; none where all are."""
     gaps = results.gaps(methods, {(block.weather, block.traffic) for block in blocks})
     if not gaps:
         return []
