@@ -11,9 +11,10 @@ inputs: every option of every command with every odd value of its kind, and dama
 recordings and weights. Expected of each: exit code 2 and one line on standard error, which names the option where a
 number is out of its range. What is damaged and still makes sense may be taken.
 
-kills: demo, attack, check, study with two workers, training and hardening, tiny, each killed at a random time by
-SIGKILL, SIGTERM or SIGINT; half the times the file written last loses its end. The same command is given again, where
-need be after the file that it names was removed. Expected: all files as without a kill, byte for byte but for times.
+kills: demo, alone and with two processes, attack, check, study with two workers, training and hardening, tiny, each
+killed at a random time by SIGKILL, SIGTERM or SIGINT; half the times the file written last loses its end. The same
+command is given again, where need be after the file that it names was removed. Expected: all files as without a kill,
+byte for byte but for times.
 
 memory: what the process holds after each tenth of 50 evaluations and of 200 searches in the recorded world; wrong is
 more in the second half than in the first, by more than two parts of a hundred (medians).

@@ -6,7 +6,11 @@ import json
 import os
 import random
 import shutil
+import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,3 +148,25 @@ def test_a_study_names_a_damaged_file_and_goes_on_without_it(start, tmp_path):
             assert "remove a file first that is called damaged" in log.read_text()
             lost.unlink()
     assert differences(straight, damaged) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of_all", [False, True], ids=["the command", "its group"])
+@pytest.mark.parametrize("after_s", [0.0, 1.0, 3.0])
+def test_ctrl_c_ends_a_run_with_processes_in_a_line(tmp_path, of_all, after_s):
+    """At any time, also while the processes are still beginning, whether or not they get the signal too."""
+    asked = [sys.executable, "-m", "roadproof", "demo", "--processes", "2", "--out", str(tmp_path / "demo")]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with subprocess.Popen(asked, **pipes, text=True, start_new_session=True) as run:
+        until = time.monotonic() + PATIENCE_S
+        while len(Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()) < 3:  # with what tracks them
+            assert run.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.002)
+        time.sleep(after_s)
+        (os.killpg if of_all else os.kill)(run.pid, signal.SIGINT)
+        _, said = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 130
+    assert said.splitlines()[-1] == "roadproof: interrupted; give the same command again to go on"
+    assert "Traceback" not in said
+    assert "leaked" not in said

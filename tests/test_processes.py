@@ -75,6 +75,50 @@ def test_what_travelled_in_a_file_is_gone_when_the_parent_is_killed(blow):
     assert not folder.exists()
 
 
+ENDED_AT_ONCE = """
+import operator
+from contextlib import nullcontext
+from roadproof.processes import Pool
+if __name__ == "__main__":
+    try:
+        with Pool(nullcontext, 2) as pool:
+            pool.begin(operator.is_)
+            raise ValueError("refused")
+    except ValueError:
+        pass
+"""
+
+
+def test_processes_that_have_only_just_begun_have_nothing_to_say_when_all_is_refused():
+    ended = subprocess.run([sys.executable, "-c", ENDED_AT_ONCE], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+INTERRUPTED = """
+import signal, sys
+from contextlib import nullcontext
+from roadproof.processes import processes_beside
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, lambda *_: None)  # a parent that is not interrupted itself
+    with processes_beside(1) as pool:
+        work = pool.submit(sum, [1, 2])
+        print("begins", flush=True)
+        print(work.result(), flush=True)
+        print(pool.submit(signal.getsignal, signal.SIGINT).result() is signal.default_int_handler, flush=True)
+"""
+
+
+def test_ctrl_c_in_a_terminal_reaches_the_parent_alone():
+    asked = [sys.executable, "-c", INTERRUPTED]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(asked, **pipes, text=True, start_new_session=True) as parent:
+        assert parent.stdout.readline() == "begins\n"
+        for _ in range(20):
+            os.killpg(parent.pid, signal.SIGINT)
+            time.sleep(0.05)
+        assert parent.communicate() == ("3\nTrue\n", "")
+
+
 def test_what_one_prints_is_none_of_the_results(capfd):
     with processes_beside(1) as pool:
         pool.submit(print, "loud", flush=True).result()

@@ -8,16 +8,18 @@ import multiprocessing
 import os
 import pickle
 import shutil
+import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
 from itertools import count
+from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar, cast
@@ -68,7 +70,7 @@ class Pool(Generic[Inside]):
         if self.processes > 1:
             # Never more than here: a controller's last digits depend on how many threads compute them.
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
-            self._stop = multiprocessing.get_context("spawn").Event()
+            self._stop = _Fresh().Event()
             self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
             given = (self._opens, self._stop, threads, Path(self._folder.name))
             self._beside = [processes_beside(1, _begin_work, *given) for _ in range(self.processes)]
@@ -81,13 +83,14 @@ class Pool(Generic[Inside]):
         self._folder.cleanup()
         if kind is not None:
             self._stop.set()
-            # Not where all went well: processes that are not waited for may complain when Python ends.
-            for process in self._beside:
-                process.shutdown(wait=False, cancel_futures=True)
-            return
-        # All of them end together; one after another takes half a second each.
-        with ThreadPoolExecutor(self.processes) as waiting:
-            list(waiting.map(ProcessPoolExecutor.shutdown, self._beside))
+        # All of them together: one after another takes half a second each.
+        ends = [threading.Thread(target=_end, args=(each, self._stop), daemon=True) for each in self._beside]
+        for end in ends:
+            end.start()
+        if kind is None:
+            # Not waited for they may complain when Python ends.
+            for end in ends:
+                end.join()
 
     @cached_property
     def _here(self) -> Inside:
@@ -219,16 +222,16 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
 
     Fresh, since graphics and torch's threads do not survive a fork. One that outlived its parent would go on writing to
     the folder in which the next run goes on. As in `load_controller` the current directory is importable, for
-    controllers that travel; foreign calls end, and a GPU multiplies, as in this process.
+    controllers that travel; foreign calls end, and a GPU multiplies, as in this process. Ctrl-C in a terminal reaches
+    the parent alone.
 
     Args:
         count: number of processes, at least 1.
         begin: function of a module that each process calls before its first work; None for none.
         arguments: arguments of `begin`.
     """
-    context = multiprocessing.get_context("spawn")
     given = (foreign.limit_s(), digits(), begin, arguments)
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=given)
+    return ProcessPoolExecutor(count, mp_context=_Fresh(), initializer=_begin, initargs=given)
 
 
 def require_opened(processes: int, opens: object | None) -> None:
@@ -253,6 +256,45 @@ def require_picklable(driver: object) -> None:
         foreign.call("pickling the controller", pickle.dumps, driver)
     except ControllerError as error:
         raise ControllerError(f"{error}; {_PICKLED}") from error.__cause__
+
+
+class _FreshProcess(SpawnProcess):
+    """A process to which a terminal's Ctrl-C does not come: it ends with its parent, and has nothing to say itself.
+
+    Its handler stays, so that a foreign call that does not come back can be ended by it.
+    """
+
+    def start(self) -> None:
+        """Begin; what is blocked here meanwhile stays so there, from its first import on."""
+        with _ctrl_c_later():
+            super().start()
+
+
+@contextmanager
+def _ctrl_c_later() -> Generator[None]:
+    """Block this thread's SIGINT, and let one that comes to the process meanwhile interrupt it at the end.
+
+    A process whose beginning is interrupted half way would complain of it.
+    """
+    came, handler = list[int](), signal.getsignal(signal.SIGINT)
+    defers = callable(handler) and threading.current_thread() is threading.main_thread()
+    masks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set[Any]()
+    if defers:
+        signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        if defers:
+            signal.signal(signal.SIGINT, handler)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
+class _Fresh(SpawnContext):
+    Process = _FreshProcess  # pyright: ignore[reportAssignmentType]  # as the standard library's contexts have theirs
 
 
 class _Processor(pickle.Pickler):
@@ -289,6 +331,11 @@ class _Left(Generic[Work]):
         chosen = kinds.index(last) if last in kinds else fresh
         self._last[process] = kinds[chosen]
         return self._works.pop(chosen)
+
+
+def _end(process: ProcessPoolExecutor, _: Event) -> None:
+    """End a process, and keep its event until then: one that has only just begun complains where it is gone."""
+    process.shutdown(cancel_futures=True)
 
 
 def _pickled_for_the_processor(thing: object) -> bytes:

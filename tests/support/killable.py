@@ -84,6 +84,10 @@ def demo(given: Path) -> list[str]:
     return ["demo", *where, "--controller", "pilotnet", "--rounds", "1", "--figures", "1"]
 
 
+def beside(given: Path) -> list[str]:
+    return [*demo(given), "--processes", "2"]
+
+
 def attack(given: Path) -> list[str]:
     if not (given / "set").exists():
         whole = drivable_set()
@@ -129,7 +133,7 @@ def harden(given: Path) -> list[str]:
 
 
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
-    each.__name__: each for each in (demo, attack, check, study, train, harden)
+    each.__name__: each for each in (demo, beside, attack, check, study, train, harden)
 }
 EXPECTED = {name: 1 if name == "check" else 0 for name in COMMANDS}
 """How each ends: the team's controller fails its check."""

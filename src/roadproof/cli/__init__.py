@@ -10,10 +10,13 @@ from __future__ import annotations
 import atexit
 import io
 import math
+import multiprocessing
 import os
 import signal
 import sys
+import threading
 import traceback
+from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -103,6 +106,8 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 def main() -> None:
     """Entry point of the `roadproof` command."""
     try:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         keep_freed_memory()
         sleep_while_waiting()
         for stream in (sys.stdout, sys.stderr):
@@ -132,10 +137,26 @@ def main() -> None:
         code = _INTERRUPTED
     if code == _INTERRUPTED:
         _complain("interrupted; give the same command again to go on")
-        # At once: what works beside this process ends with it, and would be waited for.
-        sys.stdout.flush()
-        os._exit(code)
+        _end_soon(code)
     sys.exit(code)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Interrupt the command, and end what works beside it at once.
+
+    Its processes have nothing to save, and one that has only just begun would complain that what it waits for is gone.
+    """
+    for process in multiprocessing.active_children():
+        process.kill()
+    signal.default_int_handler(number, frame)
+
+
+def _end_soon(code: int) -> None:
+    """Let this process end in two seconds, whatever it would wait for."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    late = threading.Timer(2.0, os._exit, (code,))
+    late.daemon = True
+    late.start()
 
 
 def _fail(message: str) -> NoReturn:

@@ -184,10 +184,7 @@ def stress_test(
     require_usable(controller, size=(view.height_px, view.width_px), device=device, gradients=budget.method.by_gradient)
     if isinstance(budget.objective, SpeedChange):
         require_pedals(controller)
-    with working_in(folder), stages.pool as pool:
-        if not (folder / "recordings").exists():
-            # All of them together, while this one reads; it draws nothing itself.
-            pool.begin(partial(_reset, scenario))
+    with working_in(folder), stages.pool:
         return _all_of(stages, film=film, cheapest_m=cheapest_m)
 
 
@@ -200,6 +197,9 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
     """Run all stages, one after another."""
     budget, on_progress = run.budget, run.on_progress
     ledger = Ledger(run.folder, run.made_of, STAGES)
+    if not (run.folder / "recordings").exists():
+        # All of them together, while this one reads; it draws nothing itself.
+        run.pool.begin(partial(_reset, run.scenario))
 
     def note_progress(stage: str, done: int, total: int, word: str) -> None:
         ledger.step()
