@@ -2,10 +2,12 @@
 
 import pytest
 
+from roadproof.driving.starts import StartOffset
 from roadproof.hardening.judgement import BareDrives, JudgedAttack, Judgement
 
 
-def judged(scenario, kind, before, after):
+def judged(scenario, kind, before, after, starts=((), ())):
+    """A kind of attack on a street; each drive has a start of its own, or those of before and after are given."""
     return [
         JudgedAttack(
             scenario=scenario,
@@ -13,6 +15,7 @@ def judged(scenario, kind, before, after):
             after=bool(number),
             deviation_m=tuple(values),
             left_lane=tuple(value > 1.0 for value in values),
+            starts=tuple(StartOffset(right_m=k / 10) for k in (starts[number] or range(len(values)))),
             simulator_calls=2 * len(values),
         )
         for number, values in enumerate((before, after))
@@ -59,9 +62,27 @@ def test_what_streets_disagree_on_is_not_shown_and_what_got_worse_is_said():
     assert verdict(("a", "k", [1.0], [1.9]), ("b", "k", [1.0], [2.0])).outcome == "did not help"
 
 
-def test_one_street_has_an_interval_over_its_drives_and_one_drive_has_none():
+def test_one_street_has_an_interval_over_its_starts_and_one_start_has_none():
     told = verdict(("a", "k", [1.0, 1.2, 1.1], [0.1, 0.2, 0.2]))
-    assert (told.outcome, told.over, told.change_m.count) == ("helped", "drives", 3)
+    assert (told.outcome, told.over, told.change_m.count) == ("helped", "starts", 3)
     alone = verdict(("a", "k", [1.0], [0.1]))
     assert (alone.outcome, alone.change_m.low) == ("not shown", None)
     assert "95 %" not in alone.sentence
+
+
+def test_drives_from_one_start_in_several_weathers_are_not_independent():
+    # Two starts, four weathers: eight drives, two of them independent.
+    before, after = [1.0, 1.0] * 4, [0.5, 0.95] * 4
+    told = verdict(("a", "k", before, after, ([0, 1] * 4, [0, 1] * 4)))
+    assert told.change_m.count == 2
+    assert told.change_m.value == pytest.approx(-0.275)
+    assert told.outcome == "not shown"
+
+
+def test_starts_that_were_left_out_on_one_side_are_not_compared():
+    told = verdict(("a", "k", [1.0, 1.4, 1.6, 9.0], [0.2, 0.3, 0.5], ([0, 1, 2, 3], [2, 1, 0])))
+    assert told.change_m.count == 3
+    assert told.change_m.value == pytest.approx(((0.5 - 1.0) + (0.3 - 1.4) + (0.2 - 1.6)) / 3)
+    none = verdict(("a", "k", [1.0, 1.4], [0.2], ([0, 1], [2])))
+    assert (none.outcome, none.change_m.low) == ("not shown", None)
+    assert none.change_m.value == pytest.approx(-1.0)

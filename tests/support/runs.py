@@ -17,6 +17,7 @@ from roadproof.drives import Drive, Trajectories, Window
 from roadproof.drives.folder import Settings, write_drive, write_settings
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
+from roadproof.driving.starts import StartOffset
 from roadproof.driving.trial import judge
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.hardening.judgement import BareDrives, JudgedAttack, Judgement
@@ -239,6 +240,7 @@ def hardened():
             after=after,
             deviation_m=(metres, metres),
             left_lane=(metres > 1, False),
+            starts=(StartOffset(right_m=0.1), StartOffset(right_m=-0.2)),
             simulator_calls=4,
         )
         for kind in ("by gradient", "random")

@@ -25,6 +25,7 @@ from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.infractions import counted
 from roadproof.driving.intervals import Estimate, mean_95
+from roadproof.driving.starts import StartOffset
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.stress_test import OnProgress
@@ -46,6 +47,7 @@ class JudgedAttack:
         after: whether the controller is the hardened one, not the one before hardening.
         deviation_m: deviation of each drive over the pattern, metres.
         left_lane: whether each drive over the pattern left its lane.
+        starts: where each drive began; of drives in several weathers the same again.
         simulator_calls: number of simulator drives that the attack and these drives took.
     """
 
@@ -54,12 +56,20 @@ class JudgedAttack:
     after: bool
     deviation_m: tuple[float, ...]
     left_lane: tuple[bool, ...]
+    starts: tuple[StartOffset, ...]
     simulator_calls: int
 
     @property
     def mean_m(self) -> float:
         """The mean deviation over the drives, metres."""
         return float(np.mean(self.deviation_m))
+
+    def by_start(self) -> dict[StartOffset, float]:
+        """The deviation from each start, metres: drives in several weathers are not independent, and are averaged."""
+        runs: dict[StartOffset, list[float]] = {}
+        for start, metres in zip(self.starts, self.deviation_m, strict=True):
+            runs.setdefault(start, []).append(metres)
+        return {start: float(np.mean(each)) for start, each in runs.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +94,7 @@ class HardeningVerdict:
     Args:
         outcome: "helped", "did not help" or "not shown".
         change_m: deviation after less before, metres, of the strongest attack on each street: mean with 95 % interval.
-        over: what the interval is over: "streets", or with one street alone its "drives".
+        over: what the interval is over: "streets", or with one street alone the "starts" of its drives.
         before_m: median over streets of the strongest attack's mean deviation before hardening, metres.
         after_m: median over streets of the strongest attack's mean deviation after hardening, metres.
         left_lane_before: share of the strongest attacks' drives that leave the lane before hardening, 0 to 1.
@@ -136,8 +146,10 @@ class Judgement:
         if len(names) > 1:
             changes, over = [b.mean_m - a.mean_m for a, b in zip(before, after, strict=True)], "streets"
         else:
-            pairs = zip(before[0].deviation_m, after[0].deviation_m, strict=True)
-            changes, over = [b - a for a, b in pairs], "drives"
+            # Drives may have been left out on one side alone.
+            first, then = before[0].by_start(), after[0].by_start()
+            common = [then[start] - first[start] for start in first if start in then]
+            changes, over = common or [after[0].mean_m - before[0].mean_m], "starts"
         change = mean_95(changes)
         worse = self.clean[1].clean < self.clean[0].clean
         low, high = change.low, change.high
@@ -238,6 +250,7 @@ class StreetJudge:
             after=self.number > 0,
             deviation_m=tuple(trial.deviation_m for trial in trials),
             left_lane=tuple(trial.leaves_lane for trial in trials),
+            starts=tuple(trial.start for trial in trials),
             simulator_calls=calls,
         )
 
