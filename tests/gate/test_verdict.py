@@ -91,6 +91,45 @@ def test_a_change_fails_where_it_exceeds_both(before, now, fails):
     assert "nothing judges it" in reasons[0]
 
 
+def shares(before, now, count):
+    return {"left_lane": share_95(before, count)}, {"left_lane": share_95(now, count)}
+
+
+@pytest.mark.parametrize("count", [10, 12, 20, 30])
+@pytest.mark.parametrize("more", [1, 2, 3])
+def test_a_change_of_exactly_the_limit_passes_and_a_drive_more_fails(count, more):
+    absolute = {"left_lane": Change(absolute=more / count, relative=0.0)}
+    for yes in range(count - more):
+        before, now = shares(yes, yes + more, count)
+        assert judge(now, {}, absolute, before)[0] is Status.PASSED
+        assert judge(shares(yes, yes + more + 1, count)[1], {}, absolute, before)[0] is Status.FAILED
+        if yes:
+            relative = {"left_lane": Change(absolute=0.0, relative=more / yes)}
+            assert judge(now, {}, relative, before)[0] is Status.PASSED
+
+
+def test_a_median_of_exactly_the_limit_passes():
+    # (0.1 + 0.2) / 2 is 0.15 and a bit.
+    measures = {"deviation_m": median_95([0.1, 0.2] * 10)}
+    assert measures["deviation_m"].value > 0.15
+    _, reasons = judge(measures, {"deviation_m": 0.15}, {}, None)
+    assert "does not exceed the limit of 0.15 m" in reasons[0]
+    ends = Estimate(0.15, 0.1, 0.1 + 0.2, 20)
+    assert judge({"deviation_m": ends}, {"deviation_m": 0.3}, {}, None)[0] is Status.PASSED
+
+
+def test_numbers_that_differ_read_differently():
+    (reason,) = judge({"left_lane": share_95(1, 300)}, {"left_lane": 0.0}, {}, None)[1]
+    assert reason == "share of drives that leave their lane 0.3% (0.0% to 1.8%) is above the limit of 0.0%"
+    (reason,) = judge({"deviation_m": Estimate(0.5004, 0.1, 0.9, 20)}, {"deviation_m": 0.5}, {}, None)[1]
+    assert reason == "median deviation 0.5004 m (0.1000 m to 0.9000 m) is above the limit of 0.5000 m"
+    before, now = shares(60, 64, 300)
+    changes = {"left_lane": Change(absolute=0.01, relative=0.025)}
+    (reason,) = judge(now, {}, changes, before)[1]
+    assert "21.3% (16.8% to 26.4%) was 20.0% in the reference" in reason
+    assert reason.endswith("worse by more than 1.0% and by more than 2.5%")
+
+
 def test_a_case_without_drives_does_not_pass():
     assert judge({}, {}, {}, None)[0] is Status.TOO_FEW
 

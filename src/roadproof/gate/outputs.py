@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from roadproof.gate.result import Case, CheckResult
-from roadproof.gate.verdict import Status
+from roadproof.gate.verdict import Status, digits_apart
 from roadproof.io.files import write_atomically, write_text
 from roadproof.pipeline.film import Strip
 from roadproof.recordings import evenly
@@ -42,7 +42,9 @@ def rows_of(result: CheckResult) -> tuple[tuple[str, ...], ...]:
 def _cell(case: Case, measure: str) -> str:
     if (found := case.measures.get(measure)) is None:
         return MISSING
-    scale, digits = (1, 2) if measure == "deviation_m" else (100, 0)
+    scale, ends = (1, ()) if measure == "deviation_m" else (100, (0.0, 1.0))
+    # 1 of 300 drives is more than none.
+    digits = digits_apart(measure, found.value, *ends)
     told = [f"{scale * each:.{digits}f}" for each in (found.value, found.low, found.high) if each is not None]
     percent = "%" if scale == 100 else ""
     return f"{told[0]}{percent} ({'–'.join(told[1:])})" if len(told) > 1 else f"{told[0]}{percent}"

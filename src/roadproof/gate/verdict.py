@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,6 +15,8 @@ from scipy import stats
 from roadproof.driving.intervals import Estimate
 
 CONFIDENCE = 0.95
+EQUAL = 1e-9
+"""Two numbers no further apart are equal: 4/10 is 0.1 above 3/10, though rounding makes it more."""
 
 
 class Kind(StrEnum):
@@ -59,7 +62,12 @@ class Change:
     def is_exceeded(self, before: float, now: float) -> bool:
         """Whether a measure is worse by more than both; beside a reference of 0 every relative change is."""
         worse = now - before
-        return worse > self.absolute and worse > self.relative * before
+        return is_above(worse, self.absolute) and is_above(worse, self.relative * before)
+
+
+def is_above(value: float, limit: float) -> bool:
+    """Whether a value is above a limit, however both were rounded."""
+    return value > limit + EQUAL
 
 
 def median_95(values: Sequence[float]) -> Estimate:
@@ -127,23 +135,26 @@ def judge(
         )
     for name, limit in limits.items():
         found = measures[name]
-        if found.value > limit:
-            failed.append(f"{estimate_in_words(name, found)} is above the limit of {_one(name, limit)}")
-        elif limit and (found.high is None or found.high > limit):
+        if is_above(found.value, limit):
+            digits = digits_apart(name, found.value, limit)
+            failed.append(f"{_estimate(name, found, digits)} is above the limit of {_one(name, limit, digits)}")
+        elif limit and (found.high is None or is_above(found.high, limit)):
+            digits = digits_apart(name, found.value, limit, *([] if found.high is None else [found.high]))
             undecided.append(
-                f"too few drives: {estimate_in_words(name, found)} does not exceed the limit of {_one(name, limit)}, "
-                "but its interval does; drive more starts or seeds"
+                f"too few drives: {_estimate(name, found, digits)} does not exceed the limit of "
+                f"{_one(name, limit, digits)}, but its interval does; drive more starts or seeds"
             )
     for name, change in changes.items():
         if before is None or name not in measures or name not in before:
             continue
-        now, then = measures[name].value, before[name].value
-        if measures[name].high is None:
-            undecided.append(f"too few drives: {estimate_in_words(name, measures[name])} has no interval; drive more")
-        if change.is_exceeded(then, now):
+        found, then = measures[name], before[name].value
+        digits = digits_apart(name, found.value, then, then + change.absolute)
+        if found.high is None:
+            undecided.append(f"too few drives: {_estimate(name, found, digits)} has no interval; drive more")
+        if change.is_exceeded(then, found.value):
             failed.append(
-                f"{estimate_in_words(name, measures[name])} was {_one(name, then)} in the reference: worse by more "
-                f"than {_one(name, change.absolute)} and by more than {change.relative:.0%}"
+                f"{_estimate(name, found, digits)} was {_one(name, then, digits)} in the reference: worse by more "
+                f"than {_one(name, change.absolute, digits)} and by more than {100 * change.relative:.6g}%"
             )
     status = Status.FAILED if failed else Status.TOO_FEW if undecided else Status.PASSED
     return status, (*failed, *undecided)
@@ -156,12 +167,27 @@ _NAMES = {
 }
 
 
-def estimate_in_words(name: str, found: Estimate) -> str:
+def digits_apart(name: str, *values: float) -> int:
+    """How many digits behind the point tell values of a measure apart that are not equal; as few as are usual, or more.
+
+    Args:
+        name: the name of the measure.
+        *values: the values; those that are no further apart than `EQUAL` may read alike.
+    """
+    ordered = sorted(values)
+    apart = [(one, other) for one, other in pairwise(ordered) if is_above(other, one)]
+    digits = 2 if name == "deviation_m" else 0
+    while any(_one(name, one, digits) == _one(name, other, digits) for one, other in apart):
+        digits += 1
+    return digits
+
+
+def _estimate(name: str, found: Estimate, digits: int) -> str:
     """A measure's name, value and interval: "median deviation 0.31 m (0.12 to 0.44)"."""
     low, high = found.low, found.high
-    interval = "" if low is None or high is None else f" ({_one(name, low)} to {_one(name, high)})"
-    return f"{_NAMES[name]} {_one(name, found.value)}{interval}"
+    interval = "" if low is None or high is None else f" ({_one(name, low, digits)} to {_one(name, high, digits)})"
+    return f"{_NAMES[name]} {_one(name, found.value, digits)}{interval}"
 
 
-def _one(name: str, value: float) -> str:
-    return f"{value:.2f} m" if name == "deviation_m" else f"{value:.0%}"
+def _one(name: str, value: float, digits: int) -> str:
+    return f"{value:.{digits}f} m" if name == "deviation_m" else f"{value:.{digits}%}"
