@@ -106,7 +106,8 @@ def test_the_same_seed_gives_the_same_bytes_and_drives_nothing_twice(failed, tea
 
 def test_an_interrupted_check_keeps_its_drives_and_leaves_no_verdict(failed, team, tmp_path, monkeypatch):
     out, result = failed
-    shutil.copy(out / "check.json", tmp_path / "check.json")
+    for name in ("check.json", "summary.md"):
+        shutil.copy(out / name, tmp_path / name)
     shutil.copytree(out / "drives", tmp_path / "drives")
     kept = sorted((tmp_path / "drives/test-road/episodes").iterdir())
     for path in kept[4:]:
@@ -306,6 +307,17 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
         code, said = invoke("check", plan, "--trust", "--out", "kept/smoke")
         assert code == 2
         assert "kept/smoke/check.json is a reference of the plan; choose another folder for the results" in said.err
+        assert (team / "kept/smoke/check.json").exists()
+    # Nor where the plan cannot say what it is: mistyped, unreadable, not there.
+    (team / "typo.toml").write_text(loose.replace("[change]", "[chnage]"))
+    (team / "broken.toml").write_text(loose.replace("version = 1", "version ="))
+    for name, message in (
+        ("typo.toml", "kept/smoke/check.json is no check's own, without summary.md beside it"),
+        ("broken.toml", "not valid TOML"),
+        ("gone.toml", "gone.toml"),
+    ):
+        code, said = invoke("check", name, "--trust", "--out", "kept/smoke")
+        assert (code, message in said.err) == (2, True), said.err
         assert (team / "kept/smoke/check.json").exists()
     with pytest.raises(CheckError, match="is a reference of the plan"):
         run_check(load_check("loose.toml", trust=True), magenta_shy(), "kept/smoke")

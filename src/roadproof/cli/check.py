@@ -46,9 +46,10 @@ def check(
     from roadproof.gate.verdict import Status
     from roadproof.io.locks import hold
 
+    references = references_of(plan)
     if not is_dry_run():
         hold(out)
-        clear(out, references_of(plan))
+        clear(out, references)
     asked = None if budget is None else choice(budget, "budget", BUDGETS)
     chosen = load_check(plan, budget=asked, trust=trust)
     if accept and chosen.reference is None:

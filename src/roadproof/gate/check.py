@@ -49,7 +49,8 @@ from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, begun_in
 
-OUTPUTS = (FILE, "junit.xml", "summary.md", WORST)
+SUMMARY = "summary.md"
+OUTPUTS = (FILE, "junit.xml", SUMMARY, WORST)
 
 
 def run_check(
@@ -101,7 +102,7 @@ def run_check(
         )
         pictured = run.film(places, cases)
         write_junit(result, time.perf_counter() - begun, folder / "junit.xml")
-        write_summary(result, pictured, folder / "summary.md")
+        write_summary(result, pictured, folder / SUMMARY)
         result.save(folder / FILE)
     return result
 
@@ -114,10 +115,13 @@ def clear(folder: Path, references: Path | None) -> None:
         references: the folder in which the plan keeps its references; None where it names none.
 
     Raises:
-        CheckError: the results would take the place of a reference.
+        CheckError: the results would take the place of a reference, or of a result that no check left there.
     """
-    if references is not None and folder.resolve().parent == references.resolve() and (folder / FILE).is_file():
-        raise CheckError(f"{folder / FILE} is a reference of the plan; choose another folder for the results")
+    named = references is not None and folder.resolve().parent == references.resolve()
+    # A check leaves its result beside its summary; a result alone is one that somebody keeps, whatever a plan says.
+    if (folder / FILE).is_file() and (named or not (folder / SUMMARY).is_file()):
+        whose = "a reference of the plan" if named else f"no check's own, without {SUMMARY} beside it"
+        raise CheckError(f"{folder / FILE} is {whose}; choose another folder for the results")
     for name in OUTPUTS:
         (folder / name).unlink(missing_ok=True)
 

@@ -148,12 +148,13 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
 
 
 def references_of(path: AnyPath) -> Path | None:
-    """The folder in which a plan keeps its references, whatever else is wrong with it; None where it names none."""
+    """The folder in which a plan keeps its references, whatever else is wrong with it; None where it names none.
+
+    Raises:
+        CheckError: the file is missing, or not TOML, so that nobody knows where its references are.
+    """
     path = as_path(path)
-    try:
-        change = read_toml(path, CheckError).get("change")
-    except CheckError:
-        return None
+    change = read_toml(path, CheckError).get("change")
     named = cast("dict[str, object]", change).get("reference") if isinstance(change, dict) else None
     return path.parent / named if isinstance(named, str) else None
 
