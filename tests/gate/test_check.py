@@ -82,7 +82,7 @@ def test_people_read_a_table_and_see_the_worst_passage(failed):
     text = (out / "summary.md").read_text()
     assert text.startswith("## roadproof check: failed: 2 of 3 cases passed")
     assert "### failed: test-road, clear-noon, magenta" in text
-    assert "![Furthest astray, test-road, clear-noon, magenta" in text
+    assert "![Furthest astray of what does not pass, test-road, clear-noon, magenta" in text
     with Image.open(out / "worst.jpg") as picture:
         red, green, blue = np.moveaxis(np.asarray(picture.convert("RGB"), int), 2, 0)
     magenta = np.minimum(red, blue) - green > 100

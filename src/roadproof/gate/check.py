@@ -2,7 +2,7 @@
 
     OUT/check.json      verdict, and every case with its drives (`gate.result`)
     OUT/junit.xml       a test case each, for a CI to read
-    OUT/summary.md      for people, with worst.jpg: the worst drive beside the same drive without paint
+    OUT/summary.md      for people, with worst.jpg: the worst drive of what does not pass, beside the same without paint
     OUT/drives/         every drive by scenario; what is there is not driven again
     OUT/patterns/       the random and the fresh patterns, by scenario
     OUT/fresh/          the attacks of a full check
@@ -236,7 +236,10 @@ class _Check:
         return Paint(name, Kind.FRESH, FRESH, found.pattern, path, drives)
 
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
-        """Leave a picture, and say which case it shows: of those that do not pass, if any, the one furthest astray."""
+        """Leave a picture, and say which case it shows.
+
+        It is the one with the drive furthest astray of the painted cases that do not pass, or else of all that do.
+        """
         painted = [(case, worst) for case in cases if case.kind is not Kind.BARE and (worst := worst_of(case.drives))]
         wrong = [each for each in painted if each[0].status is not Status.PASSED]
         if not painted:
