@@ -20,7 +20,7 @@ from roadproof.driving.evaluate import evaluate, random_patterns
 from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.infractions import infraction_points
 from roadproof.driving.rollout import rollout
-from roadproof.driving.starts import StartRange
+from roadproof.driving.starts import StartPlan, StartRange
 from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import find_scenario, identity
@@ -278,6 +278,17 @@ def test_starts_off_the_lane_are_refused(wrong):
     name, value = next(iter(wrong.items()))
     with pytest.raises(EpisodeError, match=f"{name} of the starts is {value}, expected 0 to"):
         StartRange(**wrong)
+
+
+def test_starts_that_are_drawn_twice_or_choose_patterns_are_refused():
+    StartPlan().check_drawn(range(20))
+    with pytest.raises(EpisodeError, match="starts has 5 that differ among the 10 drawn, expected all to"):
+        StartPlan().check_drawn([3, 3])
+    rounded = StartPlan(count=1, right_m=0.00004, turned_rad=0.00004, faster_mps=0.00004)
+    (start,) = rounded.range.draw(1, 0)
+    assert math.copysign(1.0, min(start.right_m, start.turned_rad)) == -1.0, "so that this is about −0.0"
+    with pytest.raises(EpisodeError, match="the scenario's own"):
+        rounded.check_drawn([0])
 
 
 def test_a_controller_that_cannot_travel_is_refused_before_anything_is_driven(street, tmp_path):

@@ -54,6 +54,8 @@ def test_a_full_check_needs_no_recordings_and_adds_an_attack(team):
 
 LIMITS = "stored = { deviation_m = 0.2, left_lane = 0.0 }"
 CHANGE = '\n[change]\nreference = "reference"\n'
+RANGE = "right_m = 0.05\nturned_rad = 0.004\nfaster_mps = 0.5"
+SEEDED = "seeds = [0, 1]\n\n[starts]\ncount = 3\n"
 MISTAKES = {
     "no header": (('format = "roadproof-check"', ""), 'expected format = "roadproof-check"'),
     "version": (("version = 1", "version = 3"), "version is 3, expected 1"),
@@ -77,9 +79,14 @@ MISTAKES = {
     ),
     "too few for a median": (("count = 3", "count = 2"), "too few drives: 4 a case (starts × seeds) can never show"),
     "too few for a share": ((LIMITS, "stored = { left_lane = 0.05 }"), "left_lane at most 0.05 for stored"),
-    "equal starts": (
-        ("right_m = 0.05\nturned_rad = 0.004\nfaster_mps = 0.5", "right_m = 0.0\nturned_rad = 0.0\nfaster_mps = 0.0"),
-        "starts are all the same",
+    "equal starts": ((RANGE, "right_m = 0.0\nturned_rad = 0.0\nfaster_mps = 0.0"), "starts has the scenario's own"),
+    "starts equal but for rounding": (
+        (RANGE, "right_m = 0.00001\nturned_rad = 0.0\nfaster_mps = 0.0"),
+        "starts has the scenario's own",
+    ),
+    "two seeds with an equal start": (
+        (SEEDED + RANGE, SEEDED.replace("1", "6") + "right_m = 0.001\nturned_rad = 0.0\nfaster_mps = 0.0"),
+        "starts has 5 that differ among the 6 drawn",
     ),
     "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m of the starts is 3.0, expected 0 to 1"),
     "seed": (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds is -1, expected 0 to"),

@@ -213,6 +213,9 @@ def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, mon
     assert keys[0] != keys[1] == keys[2]
 
 
+ASIDE = "[starts]\nturned_rad = 0.0\nfaster_mps = 0.0\nright_m = "
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
@@ -267,6 +270,8 @@ def test_a_function_whose_source_has_changed_is_another_controller(tmp_path, mon
         ("[traffic]", "[traffic", "not valid TOML"),
         ('controller = "cil"\n', "", "lacks controller"),
         ("seeds = [0, 1]", 'scenario_file = "../own.toml"', "leaves the study's folder"),
+        ("[traffic]", f"{ASIDE}0.0\n\n[traffic]", "starts has the scenario's own among those drawn"),
+        ("[traffic]", f"{ASIDE}0.00001\n\n[traffic]", "starts has the scenario's own among those drawn"),
     ],
 )
 def test_mistakes_are_named(tmp_path, before, after, message):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -101,6 +102,24 @@ class StartPlan(StartRange):
     def range(self) -> StartRange:
         """The range that the starts are drawn from, without how many there are."""
         return StartRange(right_m=self.right_m, turned_rad=self.turned_rad, faster_mps=self.faster_mps)
+
+    def check_drawn(self, seeds: Iterable[int]) -> None:
+        """See that the starts drawn for all of some seeds differ from each other and from the scenario's own.
+
+        An equal start is the same drive, which counts once; from the scenario's own, patterns are chosen.
+
+        Raises:
+            EpisodeError: two starts are equal, or one is the scenario's own.
+        """
+        drawn = [start for seed in seeds for start in self.range.draw(self.count, seed)]
+        wider = "make right_m, turned_rad or faster_mps larger"
+        # −0.0 equals 0.0, and is the same member of a set.
+        if NOMINAL in drawn:
+            raise EpisodeError(
+                f"starts has the scenario's own among those drawn, from which patterns are chosen; {wider}"
+            )
+        if (apart := len(set(drawn))) < len(drawn):
+            raise EpisodeError(f"starts has {apart} that differ among the {len(drawn)} drawn, expected all to; {wider}")
 
 
 USUAL_STARTS = StartRange()

@@ -238,10 +238,8 @@ def _change(stated: dict[str, str | dict[str, Any]], folder: Path) -> tuple[dict
 
 def _check_drives(plan: CheckPlan) -> None:
     """See that every kind of paint is judged, by enough drives for what is asked of it."""
-    starts = plan.starts
-    if not any((starts.right_m, starts.turned_rad, starts.faster_mps)):
-        raise CheckError("starts are all the same, with right_m, turned_rad and faster_mps 0; then one is as many")
-    each = starts.count * len(plan.seeds)
+    plan.starts.check_drawn(plan.seeds)
+    each = plan.starts.count * len(plan.seeds)
     drives = {Kind.BARE: each}
     if any(plan.stored.values()):
         drives[Kind.STORED] = each

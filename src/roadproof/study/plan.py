@@ -141,6 +141,7 @@ class Study(Conditions):
 
     Raises:
         StudyError: a list is empty, something stands in it twice, or a value makes no sense.
+        EpisodeError: the starts of a seed are not all different, or one is a scenario's own.
         SimulatorError: no simulator has this name.
     """
 
@@ -167,6 +168,7 @@ class Study(Conditions):
                 )
         for seed in self.seeds:
             check_range(seed, "seeds", 0, MAX_SEED, StudyError)
+            self.starts.check_drawn([seed])
         check_spec(self.simulator)
         self._check_paint()
 
