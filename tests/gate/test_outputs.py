@@ -1,8 +1,12 @@
 """What a check leaves for others, whatever names are in it."""
 
+import xml.etree.ElementTree as ET
+
+import pytest
+
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import NOMINAL
-from roadproof.gate.outputs import rows_of
+from roadproof.gate.outputs import rows_of, write_junit, write_summary
 from roadproof.gate.result import Case, CheckResult, JudgedDrive
 from roadproof.gate.verdict import Kind, Status, share_95
 
@@ -31,3 +35,31 @@ def test_one_drive_of_many_does_not_read_as_none():
     assert rows_of(result(yes=1, count=300))[0][4] == "0.3% (0.0–1.8)"
     assert rows_of(result(yes=299, count=300))[0][4] == "99.7% (98.2–100.0)"
     assert rows_of(result(yes=0, count=6))[0][4] == "0% (0–46)"
+
+
+@pytest.mark.parametrize(
+    ("controller", "name", "in_text"),
+    [
+        ("w/<img src=x onerror=alert(1)>.safetensors", "[x](y)", r"\[x\](y)"),
+        ("a|b&amp;*c*", "`x`\n```\n# y", r"\`x\`\\n\`\`\`\\n\# y"),
+        ("bell\x07", "one\x01", r"one\\x01"),
+        ("other\udcff", "half\ud800", r"half\\ud800"),
+    ],
+)
+def test_names_are_shown_as_they_are_whatever_is_in_them(tmp_path, controller, name, in_text):
+    told = result(controller=controller, name=name)
+    write_summary(told, told.cases[0], tmp_path / "summary.md")
+    text = (tmp_path / "summary.md").read_text(encoding="utf-8")
+    shown, _, rest = text.partition("```sh\n")
+    command, _, caption = rest.partition("\n```\n")
+    assert command.startswith("roadproof evaluate ") and command.isprintable(), "the block ends where it should"
+    for each in (shown, caption):
+        assert in_text in each
+        assert "<" not in each
+    assert f"| {in_text} |" in shown
+    assert f"### failed: left-03, clear-noon, {in_text}" in shown
+    write_junit(told, 1.0, tmp_path / "junit.xml")
+    suite = ET.parse(tmp_path / "junit.xml").getroot().find("testsuite")
+    plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in name)
+    assert suite.find("testcase").get("name") == f"clear-noon, {plain}"
+    assert f"see it: roadproof evaluate {plain}.json" in suite.find("testcase/failure").text

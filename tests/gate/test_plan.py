@@ -1,5 +1,6 @@
 """A check's plan: every mistake is told before work begins."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from roadproof.errors import CheckError
 from roadproof.gate.plan import load_check
 from roadproof.gate.verdict import Kind
 from roadproof.patterns import save_pattern
-from team_folder import BAR, PLAN
+from team_folder import BAR, PLAN, write_team
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "check" / "check.toml"
 
@@ -135,6 +136,16 @@ def test_a_mistake_is_named(team, name):
     assert str(told.value).startswith(str(path))
     assert message in str(told.value)
     assert "\n" not in str(told.value)
+
+
+def test_a_plan_in_a_folder_that_no_file_could_name_is_refused(tmp_path):
+    folder = tmp_path / os.fsdecode(b"t\xe9am")
+    try:
+        write_team(folder)
+    except OSError:
+        pytest.skip("file names are UTF-8 here")
+    with pytest.raises(CheckError, match="its path is not UTF-8"):
+        load_check(folder / "check.toml", trust=True)
 
 
 def test_code_and_other_machines_need_trust(team):

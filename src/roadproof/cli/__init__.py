@@ -47,6 +47,7 @@ from roadproof.cli.train import train
 from roadproof.cli.verbs import verb
 from roadproof.errors import RoadproofError
 from roadproof.foreign import LIMIT_S, end_calls_after
+from roadproof.io.files import printable
 from roadproof.machine import keep_freed_memory, sleep_while_waiting
 
 app = Verbs("Find the paint on a road that makes a camera-driven controller leave its lane, in simulation.")
@@ -169,5 +170,4 @@ def _fail(message: str) -> NoReturn:
 
 def _complain(message: str) -> None:
     """One line on standard error; what a message quotes may be long, or hold line ends and a terminal's commands."""
-    plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in message)
-    tell(f"roadproof: {plain:.1000}")
+    tell(f"roadproof: {printable(message):.1000}")

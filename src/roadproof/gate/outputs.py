@@ -11,10 +11,11 @@ from PIL import Image
 
 from roadproof.gate.result import Case, CheckResult
 from roadproof.gate.verdict import Status, digits_apart
-from roadproof.io.files import write_atomically, write_text
+from roadproof.io.files import printable, write_atomically, write_text
 from roadproof.pipeline.film import Strip
 from roadproof.recordings import evenly
 from roadproof.report.formatting import MISSING, in_words
+from roadproof.study.table import markdown_text
 
 WORST = "worst.jpg"
 SHOWN_PX, BLACK = 1500, 12
@@ -81,16 +82,17 @@ def write_junit(result: CheckResult, seconds: float, path: Path) -> None:
     counts["time"] = f"{seconds:.3f}"
     drive_s = seconds / sum(len(case.drives) for case in result.cases)
     root = ET.Element("testsuites", counts)
-    suite = ET.SubElement(root, "testsuite", {"name": f"roadproof check {result.controller}", **counts})
-    told = ET.SubElement(suite, "properties")
+    suite = ET.SubElement(root, "testsuite", {"name": printable(f"roadproof check {result.controller}"), **counts})
+    properties = ET.SubElement(suite, "properties")
     for name in ("roadproof", "controller", "architecture", "budget"):
-        ET.SubElement(told, "property", {"name": name, "value": str(getattr(result, name))})
+        ET.SubElement(properties, "property", {"name": name, "value": printable(str(getattr(result, name)))})
     for case in result.cases:
-        name = {"classname": f"roadproof.{case.scenario}", "name": f"{case.weather}, {case.name}"}
+        name = {"classname": printable(f"roadproof.{case.scenario}"), "name": printable(f"{case.weather}, {case.name}")}
         test = ET.SubElement(suite, "testcase", name, time=f"{drive_s * len(case.drives):.3f}")
         if case.status is not Status.PASSED:
-            message = {"type": str(case.status), "message": "; ".join(case.reasons)}
-            ET.SubElement(test, "failure", message).text = "\n".join((*why(case), f"see it: {case.command}"))
+            message = {"type": str(case.status), "message": printable("; ".join(case.reasons))}
+            told = map(printable, (*why(case), f"see it: {case.command}"))
+            ET.SubElement(test, "failure", message).text = "\n".join(told)
     ET.indent(root)
     content: bytes = ET.tostring(root, "utf-8", xml_declaration=True)
     write_atomically(path, lambda part: part.write_bytes(content + b"\n"))
@@ -107,22 +109,27 @@ def write_summary(result: CheckResult, pictured: Case | None, path: Path) -> Non
     Raises:
         OutputError: the file cannot be written.
     """
-    lines = [f"## roadproof check: {heading(result)}", ""]
+    lines = [f"## roadproof check: {_shown(heading(result))}", ""]
     lines += [_row(COLUMNS), _row(["---"] * len(COLUMNS)), *map(_row, rows_of(result))]
     lines += ["", LEGEND]
     for case in result.not_passed:
-        lines += ["", f"### {case.status}: {case}", "", *(f"- {reason}" for reason in why(case))]
-        lines += ["", "```sh", case.command, "```"]
+        lines += ["", f"### {_shown(f'{case.status}: {case}')}", "", *(f"- {_shown(reason)}" for reason in why(case))]
+        lines += ["", "```sh", printable(case.command), "```"]
     if pictured is not None:
         # A case that passes may go further: deviations up to its limit are let pass.
         among = "Furthest astray" if pictured.status is Status.PASSED else "Furthest astray of what does not pass"
-        about = f"{among}, {pictured}: above without paint, below with it, at the same instants"
+        about = _shown(f"{among}, {pictured}: above without paint, below with it, at the same instants")
         lines += ["", f"![{about}]({WORST})", "", f"*{about} (`{WORST}`).*"]
     write_text(path, "\n".join(lines) + "\n")
 
 
 def _row(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    return f"| {' | '.join(map(_shown, cells))} |"
+
+
+def _shown(text: str) -> str:
+    """A text with anyone's names in it, which Markdown shows as it is."""
+    return markdown_text(printable(text))
 
 
 def write_worst(strip: Path, path: Path) -> None:

@@ -138,6 +138,9 @@ def load_check(path: AnyPath, *, budget: str | None = None, trust: bool = False)
     path = as_path(path)
     content = read_toml(path, CheckError)
     try:
+        # What it names is told in files, by the paths beside it.
+        if not _is_utf8(str(path)):
+            raise CheckError("its path is not UTF-8, so no file could tell of what lies beside it; rename the folder")
         take_head(content, FORMAT, FORMAT_VERSION, CheckError)
         plan = _plan(build(_Stated, content, "the check", CheckError), path.parent, budget)
         if not trust:
@@ -263,6 +266,14 @@ def _check_drives(plan: CheckPlan) -> None:
                     f"too few drives: {count} a case ({what}) can never show {name}{above} for {kind} with its 95 % "
                     f"interval, expected {least} or more"
                 )
+
+
+def _is_utf8(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeError:
+        return False
+    return True
 
 
 def _one_of(value: str, name: str, choices: Iterable[str]) -> None:

@@ -238,6 +238,11 @@ def one_line(reason: BaseException) -> str:
     return f"{words or type(reason).__name__:.400}"
 
 
+def printable(text: str) -> str:
+    """A text of anyone's in one line, fit for a terminal and for any file: what cannot be printed by its code."""
+    return "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in text)
+
+
 def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write a JSON object, whole or not at all.
 
