@@ -100,3 +100,9 @@ def test_one_may_go_to_another_directory_while_working(tmp_path, monkeypatch):
         monkeypatch.chdir("/")
     with working_in(tmp_path / "run"):
         pass
+
+
+def test_a_folder_may_have_a_name_that_is_not_utf8(tmp_path):
+    folder = tmp_path / os.fsdecode(b"out-\xff")
+    with working_in(folder):
+        assert folder.is_dir()

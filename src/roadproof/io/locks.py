@@ -79,7 +79,7 @@ def _place(folder: Path) -> Path:
     # Where every process looks, whatever its TMPDIR says.
     shared = Path("/tmp")  # noqa: S108  # the folder in it is the user's own
     locks = own_folder(shared if shared.is_dir() else Path(tempfile.gettempdir()), "locks")
-    return locks / digest(str(folder.resolve()))[:32]
+    return locks / digest(os.fsencode(folder.resolve()))[:32]
 
 
 def own_folder(shared: Path, purpose: str) -> Path:
