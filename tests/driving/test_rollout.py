@@ -182,6 +182,28 @@ def test_a_drive_is_looked_at_again_only_where_it_is_asked_for(town):
     assert frames == [False] * 5
 
 
+class Blind:
+    """The town without full pictures."""
+
+    def __init__(self, town):
+        self._town = town
+
+    def __getattr__(self, name):
+        return getattr(self._town, name)
+
+    def reset(self, scenario, **options):
+        return self._town.reset(scenario, **options | {"full_pictures": False})
+
+
+def test_a_full_picture_that_is_looked_at_and_does_not_come_is_named(town):
+    episode = rollout(town, expert, SHORT)
+    with pytest.raises(
+        SimulatorError, match=r"^the simulator gave no full picture at step 3, .*check_simulator[^\n]*$"
+    ):
+        look_again(Blind(town), episode, SHORT, (3,), lambda seen: seen.shown, full_pictures=True)
+    assert look_again(Blind(town), episode, SHORT, (3,), lambda seen: seen.shown.any()) == {3: True}
+
+
 def test_what_a_driver_gets_wrong_is_named(town):
     class Large(Straight):
         input_size = (66, 200)

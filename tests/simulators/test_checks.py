@@ -111,6 +111,24 @@ class ShowsTheFrameBefore(Altered):
         return dataclasses.replace(seen, frame=before) if self.is_late and before is not None else seen
 
 
+class ShowsPicturesWithFramesAlone(Altered):
+    """A full picture comes only where its frame is asked for too."""
+
+    def reset(self, scenario, **options):
+        self.blind = not options.get("frames", True)
+        return super().reset(scenario, **options)
+
+    def altered(self, seen):
+        return dataclasses.replace(seen, picture=None) if self.blind else seen
+
+
+class ShowsPicturesOfNothing(ShowsPicturesWithFramesAlone):
+    def altered(self, seen):
+        if seen.picture is None or not self.blind:
+            return seen
+        return dataclasses.replace(seen, picture=np.zeros_like(seen.picture))
+
+
 class Crashes(Altered):
     def step(self, control):
         raise RuntimeError("lost the connection")
@@ -137,6 +155,8 @@ def test_the_town_passes(town):
         (ShowsGamma, "colours"),
         (StartsElsewhere, "start"),
         (ShowsTheFrameBefore, "frames"),
+        (ShowsPicturesWithFramesAlone, "frames"),
+        (ShowsPicturesOfNothing, "frames"),
         (Crashes, "clock"),
     ],
     ids=lambda value: getattr(value, "__name__", value),

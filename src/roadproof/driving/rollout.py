@@ -18,7 +18,7 @@ from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_act_of, require_size
 from roadproof.datatypes import Control, Ending, Observation, Weather
 from roadproof.driving.episode import GIVEN, SEEN, Episode
-from roadproof.errors import ControllerError
+from roadproof.errors import ControllerError, SimulatorError
 from roadproof.machine import threads
 from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import Scenario
@@ -172,9 +172,20 @@ def drive_again(
         on_step: called after each step, as by `rollout`.
 
     Raises:
-        SimulatorError, ScenarioError, PatternError: as `rollout` does.
+        SimulatorError: a full picture that is looked at did not come; else as `rollout` does.
+        ScenarioError, PatternError: as `rollout` does.
     """
-    seen, last, unseen = count(), max(looked_at), frozenset[int]()
+    numbers, last, unseen = count(), max(looked_at), frozenset[int]()
+
+    def is_last(seen: Observation) -> bool:
+        number = next(numbers)
+        if full_pictures and number in looked_at and seen.picture is None:
+            raise SimulatorError(
+                f"the simulator gave no full picture at step {number}, though it was asked for; see what "
+                "`roadproof.simulators.checks.check_simulator` says of it"
+            )
+        return number >= last
+
     return rollout(
         simulator,
         replay(episode),
@@ -187,7 +198,7 @@ def drive_again(
         frames=unseen if full_pictures else looked_at,
         full_pictures=looked_at if full_pictures else unseen,
         on_step=on_step,
-        until=lambda _: next(seen) >= last,
+        until=is_last,
     )
 
 

@@ -188,8 +188,11 @@ class _Kit:
     def frames(self) -> str:
         """What is asked for is seen, whatever else is."""
         asked = frozenset({0, self._steps})
-        whole, some = self._drive(AHEAD), self._drive(AHEAD, frames=asked)
+        whole, some = self._drive(AHEAD, full_pictures=True), self._drive(AHEAD, frames=asked)
         _same([whole[k] for k in sorted(asked)], [some[k] for k in sorted(asked)], "a drive with two frames")
+        some = self._drive(AHEAD, frames=frozenset(), full_pictures=asked)
+        whole, some = ([_in_full(seen[k]) for k in sorted(asked)] for seen in (whole, some))
+        _same(whole, some, "a drive with two full pictures and no frames")
         return "those asked for are the same, whatever else is seen"
 
     def homography(self) -> str:
@@ -265,10 +268,15 @@ def _picture(seen: Observation) -> UInt8[np.ndarray, "h w 3"]:
     return seen.picture
 
 
+def _in_full(seen: Observation) -> Observation:
+    """An observation whose frame is its full picture."""
+    return dataclasses.replace(seen, frame=_picture(seen))
+
+
 def _same(first: list[Observation], second: list[Observation], what: str) -> None:
     for step, (a, b) in enumerate(zip(first, second, strict=True)):
         levels = int(np.abs(a.frame.astype(int) - b.frame).max())
-        _expect(levels == 0, f"{what}: frames differ by up to {levels} levels at step {step}")
+        _expect(levels == 0, f"{what}: pictures differ by up to {levels} levels at step {step}")
         _expect(dataclasses.astuple(a.state) == dataclasses.astuple(b.state), f"{what}: states differ at step {step}")
         _expect(a.events == b.events, f"{what}: events differ at step {step}")
 
