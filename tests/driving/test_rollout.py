@@ -1,6 +1,7 @@
 """Rollouts in the town itself, and episodes on disk."""
 
 import dataclasses
+import inspect
 import json
 
 import numpy as np
@@ -202,6 +203,30 @@ def test_a_full_picture_that_is_looked_at_and_does_not_come_is_named(town):
     ):
         look_again(Blind(town), episode, SHORT, (3,), lambda seen: seen.shown, full_pictures=True)
     assert look_again(Blind(town), episode, SHORT, (3,), lambda seen: seen.shown.any()) == {3: True}
+
+
+def test_a_simulator_that_is_not_told_which_frames_are_wanted_is_refused_before_its_first_drive(town):
+    class Earlier(Blind):
+        def reset(self, scenario, *, weather, pattern, cars, pedestrians, seed, full_pictures):
+            raise AssertionError("begun")
+
+    class Compiled:
+        """Does not say what it takes, as code in C need not."""
+
+        @property
+        def __signature__(self):
+            raise ValueError("no signature")
+
+        def __call__(self, scenario, **options):
+            return town.reset(scenario, **options)
+
+    with pytest.raises(SimulatorError, match=r"^reset of Earlier takes no keyword `frames`, [^\n]* add it, [^\n]*$"):
+        rollout(Earlier(town), expert, SHORT)
+    compiled = Blind(town)
+    compiled.reset = Compiled()
+    with pytest.raises(ValueError, match="no signature"):
+        inspect.signature(compiled.reset)
+    assert len(rollout(compiled, Straight(), SHORT)) == 41
 
 
 def test_what_a_driver_gets_wrong_is_named(town):

@@ -9,6 +9,8 @@ For example:
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import suppress
+from inspect import signature
 from itertools import chain, count
 from typing import TypeAlias, TypeVar
 
@@ -79,6 +81,7 @@ def rollout(
         # Before the town is built, also for controllers that would not complain.
         size = simulator.input.height_px, simulator.input.width_px
         require_size(driver, size, "the simulator gives", "give the simulator another `input`")
+    _require_frames(simulator)
     seen = simulator.reset(
         scenario,
         weather=weather,
@@ -121,6 +124,19 @@ def rollout(
         command=command.astype(np.int64),
         **dict(zip((*SEEN[:-1], *GIVEN), chain(observed, given), strict=True)),
     )
+
+
+def _require_frames(simulator: Simulator) -> None:
+    """See that a simulator is told which frames are wanted, before its first drive and not at its first replay."""
+    # Compiled code need not say what it takes.
+    with suppress(ValueError):
+        try:
+            signature(simulator.reset).bind_partial(frames=True)
+        except TypeError:
+            raise SimulatorError(
+                f"reset of {type(simulator).__name__} takes no keyword `frames`, which says what frames are looked at; "
+                "add it, `frames=True`, and show every frame all the same, or only those"
+            ) from None
 
 
 def _ending(seen: Observation, scenario: Scenario, dt_s: float) -> Ending:
