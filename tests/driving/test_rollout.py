@@ -172,6 +172,16 @@ def test_frames_that_nobody_asks_for_are_black_and_the_others_are_the_same(town)
     assert not none.any()
 
 
+@pytest.mark.parametrize("frames", [False, frozenset({0, 7})], ids=str)
+def test_a_controller_is_never_driven_by_black_frames(town, frames):
+    driver = Straight()
+    with pytest.raises(
+        SimulatorError, match=r"^a controller drives by every frame, [^\n]* `frames` is not True; [^\n]*$"
+    ):
+        rollout(town, driver, SHORT, frames=frames)
+    assert driver.seen == []
+
+
 def test_a_drive_is_looked_at_again_only_where_it_is_asked_for(town):
     episode, frames = rollout(town, expert, SHORT), []
     seen = look_again(town, episode, SHORT, (3, 9), lambda seen: (seen.frame.any(), seen.picture is None))

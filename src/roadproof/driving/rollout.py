@@ -65,7 +65,8 @@ def rollout(
         cars: number of other cars on the road.
         pedestrians: number of pedestrians.
         seed: seed of cars and pedestrians.
-        frames: which observations show the controller's frame to driver and `on_step`, all by default.
+        frames: which observations show the controller's frame to driver and `on_step`, all by default; for a controller
+            all of them.
         full_pictures: which observations show the full camera picture to driver and `on_step`.
         on_step: called after each step; the simulator is then still at the state of the observation.
         until: condition that ends the drive at the first observation for which it is true; None for none.
@@ -81,6 +82,11 @@ def rollout(
         # Before the town is built, also for controllers that would not complain.
         size = simulator.input.height_px, simulator.input.width_px
         require_size(driver, size, "the simulator gives", "give the simulator another `input`")
+        if frames is not True:
+            raise SimulatorError(
+                "a controller drives by every frame, but `frames` is not True; leave it to drivers that look at none, "
+                "such as `replay`"
+            )
     _require_frames(simulator)
     seen = simulator.reset(
         scenario,

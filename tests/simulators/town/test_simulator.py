@@ -1,4 +1,5 @@
 import dataclasses
+import inspect
 import json
 import subprocess
 import sys
@@ -320,6 +321,20 @@ def test_bad_arguments_are_one_clear_line(town):
         TownSimulator(input=CropResize(left_px=0, top_px=0, right_px=900, bottom_px=88, width_px=200, height_px=88))
     with pytest.raises(SimulatorError, match=r"-1 cars were asked for"):
         town.reset(STRAIGHT, cars=-1)
+
+
+@pytest.mark.parametrize("name", ["frames", "full_pictures"])
+def test_steps_that_are_none_are_refused_and_the_drive_under_way_goes_on(town, name):
+    reset = inspect.unwrap(TownSimulator.reset)  # without the checks of types that tests run under
+    town.reset(STRAIGHT)
+    for asked in (3, None, "all", [0, 2], np.eye(9)):
+        with pytest.raises(SimulatorError, match=rf"^{name} is of type \w+, expected True, False or a set of steps"):
+            reset(town, STRAIGHT, **{name: asked})
+    for steps, step in (({-1, 2}, "-1"), ({0.5}, r"0\.5"), ({True}, "True"), ({"all"}, "'all'")):
+        with pytest.raises(SimulatorError, match=rf"^{name} asks for step {step}, expected whole numbers from 0$"):
+            reset(town, STRAIGHT, **{name: steps})
+    assert town.step(Control(0.0)).time_s == pytest.approx(town.dt_s)
+    assert reset(town, STRAIGHT, **{name: {0, 5}}).frame.any()
 
 
 def test_a_canvas_off_the_road_is_refused(town):

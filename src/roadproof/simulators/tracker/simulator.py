@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Set
 from functools import cached_property
+from numbers import Integral
 from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from jaxtyping import UInt8
@@ -99,7 +101,8 @@ class TrackedSimulator(ABC, Generic[DriveT]):
             raise SimulatorError(
                 f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {shape} (RGBA)"
             )
-        request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, frames, full_pictures)
+        asked = _steps("frames", frames), _steps("full_pictures", full_pictures)
+        request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, *asked)
         self._drive = self._begin(request)
         return self._observe(self._drive)
 
@@ -145,6 +148,20 @@ class TrackedSimulator(ABC, Generic[DriveT]):
     @abstractmethod
     def _observe(self, drive: DriveT) -> Observation:
         """What is seen, and what happened in the last step."""
+
+
+def _steps(name: str, asked: object) -> Pictures:
+    """What a reset asks to see: all, nothing, or the steps of a set."""
+    if isinstance(asked, bool):
+        return asked
+    if not isinstance(asked, Set):
+        kind = type(asked).__name__
+        raise SimulatorError(f"{name} is of type {kind}, expected True, False or a set of steps, counted from 0")
+    steps = cast("Set[object]", asked)
+    for step in steps:
+        if isinstance(step, bool) or not isinstance(step, Integral) or step < 0:
+            raise SimulatorError(f"{name} asks for step {step!r}, expected whole numbers from 0")
+    return frozenset(cast("Set[int]", steps))
 
 
 class RouteSimulator(TrackedSimulator[RouteDriveT]):
