@@ -18,6 +18,7 @@ TEXTS = [
     for path in ([place] if place.is_file() else [*place.glob("*.md"), *place.glob("*.py")])
     if path.name != "conf.py"  # builds the docs, and is none of them
 ]
+CONVENTIONS = Path(__file__).parents[1] / "docs" / "conventions.md"
 
 
 def test_every_public_name_can_be_used_and_is_typed():
@@ -44,10 +45,20 @@ def test_importing_roadproof_loads_nothing_of_it():
     assert done.stdout == "[]\n"
 
 
+def test_every_name_that_a_documented_room_offers_is_there():
+    offered = [
+        (room, name)
+        for room, holds in re.findall(r"^\| `(roadproof\.[\w.]+)` \| (.+) \|$", CONVENTIONS.read_text(), re.M)
+        for name in re.findall(r"`(\w+)`", holds)
+    ]
+    assert ("roadproof.calibration", "CalibrationMethod") in offered
+    assert len(offered) > 50
+    assert [each for each in offered if not hasattr(importlib.import_module(each[0]), each[1])] == []
+
+
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
 def test_readme_docs_and_examples_use_public_names_and_documented_rooms_alone(path):
-    listed = (Path(__file__).parents[1] / "docs" / "conventions.md").read_text()
-    rooms = set(re.findall(r"^\| `(roadproof\.[\w.]+)` \|", listed, re.M))
+    rooms = set(re.findall(r"^\| `(roadproof\.[\w.]+)` \|", CONVENTIONS.read_text(), re.M))
     assert "roadproof.geometry" in rooms
     text = path.read_text()
     assert set(re.findall(r"^(?:from|import) (roadproof[\w.]*)", text, re.M)) <= rooms | {"roadproof"}
