@@ -5,7 +5,16 @@ import time
 import pytest
 import torch
 
-from roadproof.attacks import TPE, BayesianOptimisation, GradOpt, PathDeviation, SteeringShift
+from roadproof.attacks import (
+    CMAES,
+    TPE,
+    BayesianOptimisation,
+    GaussianProcess,
+    GradOpt,
+    PathDeviation,
+    RandomSearch,
+    SteeringShift,
+)
 from roadproof.compositing import Variation
 from roadproof.pipeline import workload
 from roadproof.pipeline.workload import frame_seconds, of_proposals, of_search
@@ -51,7 +60,35 @@ def test_a_search_over_looks_shows_every_frame_in_each(monkeypatch, objective):
 
 def test_a_guided_proposal_takes_the_longer_the_more_was_tried():
     few, many = (of_proposals(BayesianOptimisation(calls=calls, random_calls=56)).seconds for calls in (140, 1000))
-    assert few == pytest.approx(sum(workload.PROPOSED_S + workload.LATER_S * n**2 for n in range(56, 140)), rel=0.02)
+    each_s, later_s = workload.PUBLISHED_S
+    assert few == pytest.approx(sum(each_s + later_s * n**2 for n in range(56, 140)), rel=0.02)
     assert many > 20 * few
     assert not of_proposals(BayesianOptimisation(calls=40)).seconds
-    assert not of_proposals(TPE(calls=1000)).seconds
+
+
+MEASURED_S = [
+    (GaussianProcess, 140, 1, 0.35),
+    (GaussianProcess, 140, 16, 3.5),
+    (GaussianProcess, 400, 1, 1.3),
+    (GaussianProcess, 400, 8, 6.3),
+    (GaussianProcess, 400, 16, 9.9),
+    (GaussianProcess, 1000, 1, 10.6),
+    (TPE, 1000, 1, 0.56),
+    (TPE, 1000, 16, 1.03),
+]
+"""A batch of proposals in 45 dimensions on one thread: after so many trials, so many, in so many seconds."""
+
+
+@pytest.mark.parametrize(("kind", "trials", "at_once", "took_s"), MEASURED_S)
+def test_a_batch_of_proposals_takes_what_was_measured_within_a_factor_of_two(kind, trials, at_once, took_s):
+    before, after = (of_proposals(kind(calls=calls), at_once=at_once).seconds for calls in (trials, trials + at_once))
+    assert 0.5 * took_s < after - before < 2 * took_s
+
+
+def test_a_search_on_recordings_is_estimated_with_its_proposals(monkeypatch):
+    monkeypatch.setattr(workload, "frame_seconds", lambda *_, **__: 0.0)
+    for method in (GaussianProcess(calls=400), TPE(calls=400)):
+        told = of_search(method, SteeringShift(), 40, Waits(0.0)).seconds
+        assert told == of_proposals(method, at_once=16).seconds > 0
+    for method in (RandomSearch(calls=400), CMAES(calls=400)):
+        assert not of_search(method, SteeringShift(), 40, Waits(0.0)).seconds

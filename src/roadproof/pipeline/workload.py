@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch.nn import Module
 
-from roadproof.attacks import BayesianOptimisation, GradOpt, Method, Objective, Published
+from roadproof.attacks import TPE, BayesianOptimisation, GaussianProcess, GradOpt, Method, Objective, Published
+from roadproof.attacks.blackbox import AT_ONCE
 from roadproof.attacks.cheapest import MOST_LEVELS, RUNGS
 from roadproof.attacks.gradopt import DRAWN, Rung
 from roadproof.attacks.objective import ClosedLoop, SpeedChange, variation_of
@@ -38,8 +39,15 @@ COMPOSITING = 1.3
 DRIVE_MB, FILM_MB, EPISODE_MB = 1.1, 7.0, 0.1
 """A recorded drive, or a replay of one; the film and the report; a drive of an evaluation."""
 
-PROPOSED_S, LATER_S = 0.4, 8e-6
-"""A guided proposal of Bayesian optimisation as published takes a constant, and so much times the trials squared."""
+PUBLISHED_S, PROCESS_S = (0.4, 8e-6), (0.1, 1e-5)
+"""A guided proposal, of Bayesian optimisation as published and of Optuna's Gaussian process on one thread, takes a
+constant, and so much times the trials squared."""
+
+FURTHER = 0.25
+"""Of what grows with the trials, Optuna's further proposals of a batch take a part: they go on from what was fitted."""
+
+TOLD_S = 6e-4
+"""A batch of proposals of TPE takes so much times the trials."""
 
 _BATCH, _ROUNDS = 8, 3
 _USUAL, _MEASURED = "from usual costs", "the controller measured here, drives from usual costs"
@@ -128,19 +136,27 @@ def of_search(
     )
     timed = for_climbing(controller, _device_of(controller)) if isinstance(method, GradOpt) else controller
     seconds = groups * count * _looks(objective) * frame_seconds(timed, gradients=method.by_gradient)
-    return Workload(seconds=seconds, megabytes=1.0, basis=_MEASURED) + of_proposals(method)
+    return Workload(seconds=seconds, megabytes=1.0, basis=_MEASURED) + of_proposals(method, at_once=AT_ONCE)
 
 
-def of_proposals(method: Method) -> Workload:
-    """Estimate what a search takes to choose what to try next; only Bayesian optimisation as published shows.
+def of_proposals(method: Method, *, at_once: int = 1) -> Workload:
+    """Estimate what a search takes to choose what to try next; it shows where a model of the trials chooses.
 
     Args:
         method: search method.
+        at_once: number of patterns proposed in a batch.
     """
-    if not isinstance(method, BayesianOptimisation) or method.random_calls >= method.calls:
+    if isinstance(method, TPE):
+        return Workload(seconds=TOLD_S * method.calls**2 / (2 * at_once))
+    if isinstance(method, BayesianOptimisation):
+        first, (each_s, later_s) = min(method.random_calls, method.calls), PUBLISHED_S
+    elif isinstance(method, GaussianProcess):
+        first, (each_s, later_s) = 0, PROCESS_S
+        later_s *= FURTHER + (1 - FURTHER) / at_once
+    else:
         return Workload()
-    first, last = method.random_calls, method.calls
-    return Workload(seconds=PROPOSED_S * (last - first) + LATER_S * (last**3 - first**3) / 3)
+    last = method.calls
+    return Workload(seconds=each_s * (last - first) + later_s * (last**3 - first**3) / 3)
 
 
 def of_cheapest(figures: int, objective: Objective, controller: Controller) -> Workload:
