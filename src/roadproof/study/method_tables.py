@@ -13,7 +13,7 @@ from roadproof.study.folder import pandas
 from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, Block, Results
 from roadproof.study.rows import Frame
 from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios
-from roadproof.study.table import Cell, Heading, Table, headings, marked, share_of
+from roadproof.study.table import Cell, Heading, Table, headings, marked, share_of, unmarked
 from roadproof.study.table_notes import counted, missing, table_note
 
 
@@ -66,14 +66,16 @@ class _Found:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every method was driven in every weather."""
-        return all(each is not None for row in self.medians for each in row)
+        """Whether every method was driven in every weather, and in each with the seeds of the others."""
+        driven = {frozenset(zip(each["seed"], each["weather"], strict=True)) for each in self.drives}
+        return len(driven) == 1 and all(each is not None for row in self.medians for each in row)
 
 
 def scenarios_table(results: Results) -> Table:
     """The same scenario by scenario, in every weather: medians over drives, and how many of these left the lane.
 
-    A last block for each K has the means of those medians over the scenarios that every method came to the end of.
+    A last block for each K has the means of those medians over the scenarios that every method came to the end of with
+    the same seeds; only these are compared.
     """
     traffic, names = not results.has(traffic=False), [method.name for method in results.methods]
     driven = results.drives[results.drives["traffic"] == traffic]
@@ -125,8 +127,9 @@ def _found_in(scenario: str, drives: Frame, results: Results) -> _Found:
 
 
 def _rows_of(found: _Found, figures: str, names: Sequence[str]) -> list[tuple[Cell, ...]]:
-    """A row a method; none where no method was driven."""
-    columns, rows = list(map(marked, found.medians)), list[tuple[Cell, ...]]()
+    """A row a method; none where no method was driven, and no mark where their drives are not of the same cases."""
+    columns = [marked(each) if found.is_whole else unmarked(each) for each in found.medians]
+    rows = list[tuple[Cell, ...]]()
     for number, (name, drives) in enumerate(zip(names, found.drives, strict=True)):
         told = f"{drives['left_lane'].sum():.0f} of {len(drives)}", f"{drives['points'].median():g}"
         named = (figures, found.scenario) if number == 0 else ("", "")

@@ -59,6 +59,11 @@ def marked(numbers: Sequence[Estimate | None]) -> list[Cell]:
     return [MISSING if each is None else Number(each, best=one and each.value >= top - EQUAL) for each in numbers]
 
 
+def unmarked(numbers: Sequence[Estimate | None]) -> list[Cell]:
+    """Numbers that are not compared."""
+    return [MISSING if each is None else Number(each) for each in numbers]
+
+
 def share_of(mean: Estimate | None) -> str:
     """The mean of what is 0 or 1, in percent."""
     return MISSING if mean is None else f"{mean.value:.0%}"
