@@ -42,6 +42,13 @@ def test_the_interval_is_that_of_means_drawn_by_hand():
     assert found.high == pytest.approx(high, abs=0.03)
 
 
+@pytest.mark.parametrize("value", [0.1, 0.3, 1.1, 1.23])
+@pytest.mark.parametrize("scenarios", range(2, 8))
+def test_the_mean_of_equal_scenarios_lies_within_its_interval(value, scenarios):
+    found = mean_over_scenarios(Series({(f"s{k}", seed): value for k in range(scenarios) for seed in range(2)}))
+    assert found.low <= found.value <= found.high
+
+
 def test_one_scenario_has_no_interval_and_none_no_mean():
     one = Series({("a", 0): 1.0, ("a", 1): 3.0})
     assert mean_over_scenarios(one) is not None

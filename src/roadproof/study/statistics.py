@@ -48,7 +48,8 @@ def mean_over_scenarios(values: Values) -> Estimate | None:
         method="percentile",
         random_state=np.random.default_rng(SEED),
     ).confidence_interval
-    return Estimate(mean, float(interval.low), float(interval.high), len(values))
+    # Where all draws are equal, their rounding may put the mean outside.
+    return Estimate(mean, min(float(interval.low), mean), max(float(interval.high), mean), len(values))
 
 
 def _ratio(sums: np.ndarray, counts: np.ndarray, axis: int) -> np.ndarray:
