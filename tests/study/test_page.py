@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +20,12 @@ from roadproof.study.folder import write_table
 from roadproof.study.kept_jobs import read_jobs
 from roadproof.study.methods import BlackBoxPlan
 from roadproof.study.page import write_tables
+from roadproof.study.paper_tables import paper_tables
+from roadproof.study.plan import load_study
+from roadproof.study.results import results_of
 from roadproof.study.rows import JobId
 
+STUDIES = Path(__file__).parents[2] / "studies"
 HOSTILE = "<b>_all_ 100% $x"
 
 
@@ -89,6 +94,44 @@ def test_a_list_of_gaps_goes_when_they_are_filled(tmp_path):
         frame = write_made_up_study(tmp_path, study, failing=failing)
         page = write_tables(frame, tmp_path, tmp_path / "tables")
         assert page.with_name("missing.tex").exists() == bool(failing)
+
+
+def read_again(folder, methods):
+    """The numbers of a made-up study of some methods, with what its folder says of them."""
+    study = made_up_study(scenarios=made_up_study().scenarios[:1], figures=(1,), methods=methods)
+    rows = write_made_up_study(folder, study)
+    return results_of(rows, [job.method for job in read_jobs(folder, rows).values()])
+
+
+def test_gradopt_with_another_objective_is_a_rival_and_no_ablation(tmp_path):
+    methods = load_study(STUDIES / "searches.toml").methods[:3]
+    found = read_again(tmp_path, methods)
+    assert (found.reference.name, found.ablation) == ("GradOpt, steering shift", ())
+    assert found.compared == ["GradOpt, steering shift", "GradOpt", "random"]
+    assert not any(table.name.startswith("ablation") for table in paper_tables(found))
+
+
+def test_gradopt_with_other_recordings_has_the_ablation(tmp_path):
+    methods = load_study(STUDIES / "ablation.toml").methods
+    found = read_again(tmp_path, (*methods, METHODS[4]))
+    assert found.reference.name == "Group T=3"
+    assert [method.name for method in found.ablation] == [method.name for method in methods]
+    assert found.compared == ["Group T=3", "TPE"], "noise is another recording too"
+    (table, _) = (table for table in paper_tables(found) if table.name.startswith("ablation"))
+    named = ["T=1", "Group T=3", "Group T=3, noise", "T=5", "T=7", "T=3", "T=5", "T=7", "T=3", "T=5", "T=7"]
+    assert [heading.text for heading in table.header[1]] == ["K", *named]
+
+
+def test_a_setting_that_older_jobs_lack_makes_no_difference(tmp_path):
+    methods = METHODS[:2]
+    study = made_up_study(scenarios=made_up_study().scenarios[:1], figures=(1,), methods=methods)
+    rows = write_made_up_study(tmp_path, study)
+    path = tmp_path / "jobs" / study.jobs[0].key / "job.json"
+    told = json.loads(path.read_text())
+    assert told["method"].pop("attack_weathers") == []
+    path.write_text(json.dumps(told))
+    one, other = (job.method for job in read_jobs(tmp_path, rows).values())
+    assert one.searches_as(other)
 
 
 def test_a_weather_never_names_a_file_elsewhere(finished):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -21,6 +22,8 @@ from roadproof.study.history import Progress, read_history
 from roadproof.study.passages import file_of
 from roadproof.study.rows import Frame, JobId
 
+_RECORDING = ("trajectories", "scheme", "swerves_m", "weaves_m", "noise_deg")
+"""Settings of a gradopt search that say how its drives are recorded and put together."""
 _AGAIN = "remove its folder and run the study again"
 
 
@@ -33,12 +36,27 @@ class StatedMethod:
         search: "gradopt", or the word of another search; empty where nobody said.
         trajectories: T, how many drives are recorded for a gradopt search; 0 where nobody said.
         scheme: "group", "group-all" or "random": how a gradopt search groups its drives; empty where nobody said.
+        settings: all that job.json says of the method, by name, but for its name and what is empty; empty where nobody
+            said.
     """
 
     name: str
     search: str = ""
     trajectories: int = 0
     scheme: Literal["", "group", "group-all", "random"] = ""
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def recording(self) -> tuple[object, ...]:
+        """How drives are recorded for a gradopt search, and put together."""
+        return self.scheme, self.trajectories, *map(self.settings.get, _RECORDING)
+
+    def searches_as(self, other: StatedMethod) -> bool:
+        """Whether both are gradopt, alike in all that is known of them but in their recordings."""
+        mine, theirs = (
+            {name: value for name, value in each.settings.items() if name not in _RECORDING} for each in (self, other)
+        )
+        return self.search == other.search == "gradopt" and mine == theirs
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -55,11 +73,11 @@ class _Stated:
 
     controller: str
     scenario: StatedScenario
-    method: StatedMethod
+    method: dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class KeptJob(_Stated):
+class KeptJob:
     """A job of which there are rows, and its folder.
 
     Args:
@@ -71,6 +89,9 @@ class KeptJob(_Stated):
     """
 
     id: JobId
+    controller: str
+    scenario: StatedScenario
+    method: StatedMethod
     folder: Path
 
     def pattern(self) -> Pattern | None:
@@ -143,10 +164,17 @@ def read_jobs(folder: Path, rows: Frame) -> dict[JobId, KeptJob]:
             continue
         try:
             told = msgspec.json.decode(path.read_bytes(), type=_Stated)
+            method = _method(told.method)
         except (OSError, msgspec.MsgspecError, RecursionError) as error:
             raise StudyError(f"{path} is damaged ({error}); {_AGAIN}") from None
         job = JobId(*name)
         found[job] = KeptJob(
-            id=job, folder=path.parent, controller=told.controller, scenario=told.scenario, method=told.method
+            id=job, folder=path.parent, controller=told.controller, scenario=told.scenario, method=method
         )
     return found
+
+
+def _method(told: Mapping[str, Any]) -> StatedMethod:
+    """A method as job.json has it; what is empty may be missing in an older one."""
+    settings = {name: value for name, value in told.items() if name != "name" and value}
+    return replace(msgspec.convert(told, StatedMethod), settings=settings)

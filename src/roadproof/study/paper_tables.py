@@ -28,9 +28,8 @@ GAPS = "missing"
 def paper_tables(results: Results) -> tuple[Table, ...]:
     """Every table that makes sense for a study, in the paper's order; what failed comes last."""
     tables = [methods_table(results), scenarios_table(results)]
-    gradopt = [method for method in results.methods if method.search == "gradopt" and method.scheme]
-    if len(gradopt) > 1:
-        tables += [ablation_table(results, gradopt, metric) for metric in (DEVIATION, PENALTY)]
+    if variants := results.ablation:
+        tables += [ablation_table(results, variants, metric) for metric in (DEVIATION, PENALTY)]
     taken: set[str] = set()
     for theirs in results.rivals:
         name = slug(theirs.name)[:LONGEST_NAME].strip("-")

@@ -108,15 +108,23 @@ class Results:
 
     @property
     def rivals(self) -> tuple[StatedMethod, ...]:
-        """The methods that the reference is compared with; GradOpt with other recordings has the ablation."""
+        """The methods that the reference is compared with; GradOpt with other recordings alone has the ablation."""
         ours = self.reference
-        ablated = {
-            method.name
+        return tuple(
+            method
             for method in self.methods
-            if method.search == ours.search == "gradopt"
-            and (method.scheme, method.trajectories) != (ours.scheme, ours.trajectories)
-        }
-        return tuple(method for method in self.methods if method != ours and method.name not in ablated)
+            if method != ours and not (method.searches_as(ours) and method.recording != ours.recording)
+        )
+
+    @property
+    def ablation(self) -> tuple[StatedMethod, ...]:
+        """Variants of GradOpt that differ in their recordings alone: the reference's, else the first there are."""
+        gradopt = [method for method in self.methods if method.search == "gradopt" and method.scheme]
+        for one in sorted(gradopt, key=lambda method: method != self.reference):
+            alike = tuple(method for method in gradopt if method.searches_as(one))
+            if len(alike) > 1:
+                return alike
+        return ()
 
     @property
     def compared(self) -> list[str]:
