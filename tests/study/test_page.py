@@ -134,6 +134,21 @@ def test_a_setting_that_older_jobs_lack_makes_no_difference(tmp_path):
     assert one.searches_as(other)
 
 
+def test_patterns_were_found_in_the_first_weather_of_the_plan_whatever_the_first_row_has(finished, tmp_path):
+    folder, rows, page = finished
+    told = page.with_name("overall-bo.tex").read_text()
+    # As where the first job's drive over the bare road did not reach the canvas, and then those of all.
+    first = (rows["weather"] == "clear-noon") & (rows["job"] == rows["job"].iloc[0])
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "jobs").symlink_to(folder / "jobs")
+    write_tables(rows[~first], tmp_path / "study", tmp_path / "out")
+    assert "all scenarios, clear noon" in told
+    assert "all scenarios, clear noon" in (tmp_path / "out" / "overall-bo.tex").read_text()
+    assert (tmp_path / "out" / "rainy-noon-alone-bo.tex").exists()
+    none = write_tables(rows[rows["weather"] != "clear-noon"], tmp_path / "study", tmp_path / "none")
+    assert "found at clear noon, judged also at cloudy noon, rainy noon" in none.with_name("tables.md").read_text()
+
+
 def test_a_weather_never_names_a_file_elsewhere(finished):
     folder, rows, _ = finished
     job = next(

@@ -13,14 +13,14 @@ def row(method, deviation_m, *, weather="clear-noon", traffic=False, error=None,
 
 def test_methods_are_summed_up_as_they_were_searched():
     rows = [
+        row("GradOpt", 9.0, weather="rainy-noon"),
         row("GradOpt", 1.0),
         row("GradOpt", 9.0, traffic=True),
-        row("GradOpt", 9.0, weather="rainy-noon"),
         row("GradOpt", 2.0, search_calls=16),
         row("BO", 0.5),
         {**row("BO", None), "error": "no luck"},
     ]
-    ours, theirs = summary(DataFrame(rows))
+    ours, theirs = summary(DataFrame(rows), "clear-noon")
     assert "GradOpt: 1.50 m deviation, alone in clear-noon; found with 15 simulator calls in 30 s" in ours
     assert "BO: 0.50 m" in theirs
     assert failures(DataFrame(rows)) == ("left-01, K = 1, BO, seed 0: no luck",)
@@ -28,7 +28,7 @@ def test_methods_are_summed_up_as_they_were_searched():
 
 def test_a_study_in_which_all_failed_has_failures_alone():
     rows = [row("BO", None, error="no luck")]
-    assert summary(DataFrame(rows)) == ()
+    assert summary(DataFrame(rows), "clear-noon") == ()
     assert len(failures(DataFrame(rows))) == 1
 
 

@@ -55,7 +55,7 @@ def run(
             show(done, failed)
 
         rows = run_study(chosen, out, run_job, workers=workers, cluster=cluster, on_job=told)
-    say(*summary(rows))
+    say(*summary(rows, str(chosen.weathers[0])))
     say(f"Rows in {out / 'rows.parquet'}; tables and figures: roadproof study tables {out}")
     bad = failures(rows)
     say(*(f"FAILED {line}" for line in bad))

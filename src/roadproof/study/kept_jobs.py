@@ -74,6 +74,7 @@ class _Stated:
     controller: str
     scenario: StatedScenario
     method: dict[str, Any]
+    weathers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -85,6 +86,8 @@ class KeptJob:
         controller: spec of the controller that the pattern was found against.
         scenario: the map and the canvas of the scenario.
         method: how the pattern was searched.
+        weathers: the weathers of its drives, also of those left out, that in which the pattern was found first; empty
+            where job.json has none.
         folder: the folder with the job's files.
     """
 
@@ -92,6 +95,7 @@ class KeptJob:
     controller: str
     scenario: StatedScenario
     method: StatedMethod
+    weathers: tuple[str, ...]
     folder: Path
 
     def pattern(self) -> Pattern | None:
@@ -169,7 +173,12 @@ def read_jobs(folder: Path, rows: Frame) -> dict[JobId, KeptJob]:
             raise StudyError(f"{path} is damaged ({error}); {_AGAIN}") from None
         job = JobId(*name)
         found[job] = KeptJob(
-            id=job, folder=path.parent, controller=told.controller, scenario=told.scenario, method=method
+            id=job,
+            controller=told.controller,
+            scenario=told.scenario,
+            method=method,
+            weathers=told.weathers,
+            folder=path.parent,
         )
     return found
 

@@ -49,7 +49,8 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     """
     check_jobs(rows)
     jobs = read_jobs(folder, rows)
-    results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder))
+    weathers = next((job.weathers for job in jobs.values()), ())
+    results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder), weathers)
     kept, again = (None, "") if transfer is None else _of_these_jobs(transfer, results)
     driven = [] if kept is None or kept.empty else [(kept, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from numbers import Integral
@@ -65,7 +65,7 @@ class Results:
         kinds: the kind of each scenario, by the scenario's name.
         figures: the values of K as text, in rising order, one black figure first.
         seeds: the seeds, in rising order.
-        weathers: the weathers of the drives; patterns were found in the first.
+        weathers: that in which patterns were found, then the others of the drives.
     """
 
     drives: Frame
@@ -180,13 +180,17 @@ class Results:
         return found
 
 
-def results_of(rows: Frame, methods: Iterable[StatedMethod] = (), named: str | None = None) -> Results:
+def results_of(
+    rows: Frame, methods: Iterable[StatedMethod] = (), named: str | None = None, weathers: Sequence[str] = ()
+) -> Results:
     """Sort a study's rows into drives and failures.
 
     Args:
-        rows: the rows of the study; the first weather is the one in which patterns were found.
+        rows: the rows of the study.
         methods: what is known of the methods besides their names.
         named: the method that the plan compares with the others; None where it names none.
+        weathers: the plan's weathers, that in which patterns were found first; where nobody says, they are in the order
+            of the rows.
 
     Raises:
         StudyError: there is no row, a column is missing, a number is not finite, or every job failed.
@@ -203,6 +207,9 @@ def results_of(rows: Frame, methods: Iterable[StatedMethod] = (), named: str | N
     for name in NUMBERS:
         check_finite(drives, name)
     known = {method.name: method for method in methods}
+    # The first weather of a job, or of all, may have no drive: where none over the bare road reached the canvas.
+    driven = list(drives["weather"].unique())
+    order = dict.fromkeys([*weathers[:1], *(weather for weather in weathers if weather in driven), *driven])
     return Results(
         drives=drives.astype({"traffic": bool, **dict.fromkeys(NUMBERS, float)}),
         failures=failures,
@@ -211,7 +218,7 @@ def results_of(rows: Frame, methods: Iterable[StatedMethod] = (), named: str | N
         kinds=dict(zip(rows["scenario"], rows["kind"], strict=True)),
         figures=tuple(sorted(rows["figures"].unique(), key=_by_number)),
         seeds=tuple(sorted(map(int, rows["seed"].unique()))),
-        weathers=tuple(drives["weather"].unique()),
+        weathers=tuple(order),
     )
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from roadproof.study.rows import Frame, JobId
 
 
-def summary(rows: Frame) -> tuple[str, ...]:
+def summary(rows: Frame, home: str) -> tuple[str, ...]:
     """A line for each method: means over its jobs, driven alone in the weather the patterns were found in.
 
     Args:
         rows: the rows of the study (`study.rows`).
+        home: the weather in which patterns were found.
     """
     good = rows[rows["error"].isna()]
     if good.empty:
         return ()
-    home = good["weather"].iloc[0]
     alone = good[~good["traffic"].astype(bool) & (good["weather"] == home)]
     numbers = ["deviation_m", "search_calls", "search_seconds"]
     means = alone.astype(dict.fromkeys(numbers, float)).groupby("method", sort=False)[numbers].mean()
