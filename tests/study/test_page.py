@@ -149,6 +149,16 @@ def test_patterns_were_found_in_the_first_weather_of_the_plan_whatever_the_first
     assert "found at clear noon, judged also at cloudy noon, rainy noon" in none.with_name("tables.md").read_text()
 
 
+def test_drives_that_all_jobs_lack_are_missing_too(finished, tmp_path):
+    folder, rows, _ = finished
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "jobs").symlink_to(folder / "jobs")
+    lost = (rows["weather"] == "rainy-noon") & ~rows["traffic"].fillna(value=False).astype(bool)
+    page = write_tables(rows[~lost & rows["error"].isna()], tmp_path / "study", tmp_path / "out")
+    assert "0 of 1 drives at rainy noon; left out where the drive over the bare road" in page.read_text()
+    assert "1 failed or missing, 17 without some drives, listed below" in page.read_text()
+
+
 def test_a_weather_never_names_a_file_elsewhere(finished):
     folder, rows, _ = finished
     job = next(

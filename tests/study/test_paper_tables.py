@@ -3,7 +3,7 @@ import dataclasses
 from hand_made_study import BO, GRADOPT, bad, results, row
 from roadproof.study.kept_jobs import StatedMethod
 from roadproof.study.paper_tables import ablation_table, methods_table, paper_tables
-from roadproof.study.results import DEVIATION
+from roadproof.study.results import DEVIATION, LEFT_OUT
 
 
 def text(cell):
@@ -172,9 +172,16 @@ def test_what_failed_is_noted_and_left_out_on_both_sides(records):
         if name != "missing":
             assert "2 jobs: right-01, K = 1, BO, seed 0 (out of memory)" in table.note, name
     assert rows_of(tables["missing"])[0] == ("right-01", "1", "BO", "0", "out of memory")
-    assert tables["missing"].note.startswith("2 of 16 jobs")
+    assert tables["missing"].note.startswith("2 of 16 jobs. The same study run again tries those again")
     right = tables["type-deviation-bo"].rows[0][7:]
     assert right == ("–", "–", "–")
+
+
+def test_drives_that_were_left_out_are_not_promised_to_be_tried_again(records):
+    table = tables_of(records[:-1])["missing"]
+    (cells,) = rows_of(table)
+    assert cells[4] == f"1 of 2 drives at rainy noon in traffic; {LEFT_OUT}"
+    assert table.note == "1 of 16 jobs."
 
 
 def test_a_note_is_about_the_cases_that_are_compared(records):

@@ -2,7 +2,7 @@ import pytest
 
 from hand_made_study import BO, GRADOPT, bad, results, row
 from roadproof.errors import StudyError
-from roadproof.study.results import DEVIATION, PENALTY, Block
+from roadproof.study.results import DEVIATION, LEFT_OUT, PENALTY, Block
 from roadproof.study.rows import JobId
 
 
@@ -39,9 +39,9 @@ def test_what_failed_or_is_missing_is_said():
     ]
     gaps = results(rows, (GRADOPT, BO)).gaps()
     assert gaps == {
-        JobId("left-01", "1", "GradOpt", 0): "0 of 2 drives at clear noon in traffic",
+        JobId("left-01", "1", "GradOpt", 0): f"0 of 2 drives at clear noon in traffic; {LEFT_OUT}",
         JobId("left-01", "1", "BO", 0): "its process died",
-        JobId("left-02", "1", "GradOpt", 0): "1 of 2 drives at clear noon in traffic",
+        JobId("left-02", "1", "GradOpt", 0): f"1 of 2 drives at clear noon in traffic; {LEFT_OUT}",
         JobId("left-03", "1", "BO", 0): "no row; not done yet",
     }
     assert len(results(rows).gaps(["GradOpt"], {("clear-noon", False)})) == 0

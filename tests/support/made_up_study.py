@@ -8,6 +8,7 @@ from PIL import Image
 
 from roadproof.coverage import Shape
 from roadproof.datatypes import Weather
+from roadproof.driving.starts import StartPlan
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.roads.maps import load_map, scenario_route
 from roadproof.scenarios import builtin_scenarios
@@ -37,6 +38,7 @@ def made_up_study(**changed):
         "figures": ("1-b", 1, 3, 5),
         "methods": METHODS,
         "weathers": WEATHERS,
+        "starts": StartPlan(count=1),
         "traffic": TrafficPlan(runs=3),
     }
     return Study(**values | changed)

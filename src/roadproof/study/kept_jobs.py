@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.driving.deviation import Path2D
-from roadproof.errors import StudyError
+from roadproof.driving.starts import StartPlan
+from roadproof.errors import RoadproofError, StudyError
 from roadproof.geometry import CanvasPlacement
 from roadproof.io.arrays import read_archive
 from roadproof.io.files import inside
@@ -20,6 +21,7 @@ from roadproof.io.pictures import read_picture
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.study.history import Progress, read_history
 from roadproof.study.passages import file_of
+from roadproof.study.plan import TrafficPlan
 from roadproof.study.rows import Frame, JobId
 
 _RECORDING = ("trajectories", "scheme", "swerves_m", "weaves_m", "noise_deg")
@@ -75,6 +77,8 @@ class _Stated:
     scenario: StatedScenario
     method: dict[str, Any]
     weathers: tuple[str, ...] = ()
+    starts: StartPlan | None = None
+    traffic: TrafficPlan | None = None
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,6 +92,8 @@ class KeptJob:
         method: how the pattern was searched.
         weathers: the weathers of its drives, also of those left out, that in which the pattern was found first; empty
             where job.json has none.
+        starts: how many drives alone there are in each weather, and where they begin; None where job.json does not say.
+        traffic: how many drives there are in traffic; None for none.
         folder: the folder with the job's files.
     """
 
@@ -96,7 +102,21 @@ class KeptJob:
     scenario: StatedScenario
     method: StatedMethod
     weathers: tuple[str, ...]
+    starts: StartPlan | None
+    traffic: TrafficPlan | None
     folder: Path
+
+    @property
+    def planned(self) -> dict[tuple[str, bool], int]:
+        """How many drives there are in each weather, alone and in traffic; empty where job.json does not say."""
+        if self.starts is None:
+            return {}
+        alone = len(set(self.starts.range.draw(self.starts.count, self.id.seed)))  # as equal starts are driven once
+        found = {(weather, False): alone for weather in self.weathers}
+        if self.traffic is not None:
+            among = self.weathers[:1] if self.traffic.weathers == "first" else self.weathers
+            found |= {(weather, True): self.traffic.runs for weather in among}
+        return found
 
     def pattern(self) -> Pattern | None:
         """The pattern that the job found; None where the job has none.
@@ -169,7 +189,7 @@ def read_jobs(folder: Path, rows: Frame) -> dict[JobId, KeptJob]:
         try:
             told = msgspec.json.decode(path.read_bytes(), type=_Stated)
             method = _method(told.method)
-        except (OSError, msgspec.MsgspecError, RecursionError) as error:
+        except (OSError, msgspec.MsgspecError, RecursionError, RoadproofError) as error:
             raise StudyError(f"{path} is damaged ({error}); {_AGAIN}") from None
         job = JobId(*name)
         found[job] = KeptJob(
@@ -178,6 +198,8 @@ def read_jobs(folder: Path, rows: Frame) -> dict[JobId, KeptJob]:
             scenario=told.scenario,
             method=method,
             weathers=told.weathers,
+            starts=told.starts,
+            traffic=told.traffic,
             folder=path.parent,
         )
     return found

@@ -49,8 +49,9 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
     """
     check_jobs(rows)
     jobs = read_jobs(folder, rows)
-    weathers = next((job.weathers for job in jobs.values()), ())
-    results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder), weathers)
+    any_job = next(iter(jobs.values()), None)  # all have the plan's conditions
+    weathers, planned = ((), None) if any_job is None else (any_job.weathers, any_job.planned)
+    results = results_of(rows, [job.method for job in jobs.values()], reference_of(folder), weathers, planned)
     kept, again = (None, "") if transfer is None else _of_these_jobs(transfer, results)
     driven = [] if kept is None or kept.empty else [(kept, metric) for metric in (DEVIATION, PENALTY)]
     drawn = (by_figures(results), progress(results, tuple(jobs.values())), trajectories(results, jobs))
@@ -82,14 +83,16 @@ def _of_these_jobs(transfer: Frame, results: Results) -> tuple[Frame, str]:
 def _page(
     name: str, sentence: str, results: Results, tables: Sequence[Table], pictures: Sequence[Picture], out: Path
 ) -> str:
-    jobs, gaps = len(results.jobs), len(results.gaps())
+    jobs, undone = len(results.jobs), len(results.undone)
+    lacking = len(results.gaps()) - undone
+    told = [f"{undone} failed or missing"] * (undone > 0) + [f"{lacking} without some drives"] * (lacking > 0)
     black = "1-b is one black figure" if BLACK in results.figures else "figures a pattern"
     kinds = list(results.kinds.values())
     facts = [
         (len(kinds), "scenarios", ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))),
         (", ".join(results.figures), "K", black),
         (len(results.methods), "methods", ", ".join(map(described, results.methods))),
-        (f"{jobs - gaps} of {jobs}", "jobs done", f"{gaps} failed or missing, listed below" if gaps else ""),
+        (f"{jobs - undone} of {jobs}", "jobs done", f"{', '.join(told)}, listed below" if told else ""),
     ]
     return rendered(
         "study.html.jinja",

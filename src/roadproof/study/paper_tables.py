@@ -167,10 +167,11 @@ def ablation_table(results: Results, variants: Sequence[StatedMethod], metric: M
 
 def _gaps_table(results: Results, gaps: Mapping[JobId, str]) -> Table:
     """Every job that failed or is not complete, and why."""
+    again = " The same study run again tries those again that failed or are not done." if results.undone else ""
     return Table(
         name=GAPS,
         title="What failed or is missing",
-        note=f"{len(gaps)} of {len(results.jobs)} jobs. The same study run again tries them again.",
+        note=f"{len(gaps)} of {len(results.jobs)} jobs.{again}",
         header=(headings("scenario", "K", "method", "seed", "why"),),
         rows=tuple((*map(str, job), reason) for job, reason in gaps.items()),
         left=5,

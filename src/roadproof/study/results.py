@@ -17,6 +17,7 @@ from roadproof.study.rows import Frame, JobColumns, JobId
 from roadproof.study.statistics import Values
 
 JOB, CONDITION = list(JobId._fields), ["weather", "traffic"]
+LEFT_OUT = "left out where the drive over the bare road did not reach the canvas"
 NUMBERS = ["deviation_m", "left_lane", "points", "clean_points", "search_calls", "search_seconds"]
 
 
@@ -66,6 +67,7 @@ class Results:
         figures: the values of K as text, in rising order, one black figure first.
         seeds: the seeds, in rising order.
         weathers: that in which patterns were found, then the others of the drives.
+        planned: how many drives a job has in a weather, alone or in traffic; empty where nobody says.
     """
 
     drives: Frame
@@ -76,6 +78,7 @@ class Results:
     figures: tuple[str, ...]
     seeds: tuple[int, ...]
     weathers: tuple[str, ...]
+    planned: Mapping[tuple[str, bool], int]
 
     @property
     def home(self) -> str:
@@ -152,36 +155,50 @@ class Results:
         names = [method.name for method in self.methods]
         return tuple(JobId(*job) for job in product(self.kinds, self.figures, names, self.seeds))
 
+    @property
+    def undone(self) -> list[JobId]:
+        """The jobs that failed or are not done yet; the others may lack drives and yet are finished."""
+        done = {JobId(*job) for job in self.drives[JOB].drop_duplicates().itertuples(index=False)}
+        return [job for job in self.jobs if job not in done]
+
     def gaps(
         self, methods: Collection[str] | None = None, conditions: Collection[tuple[str, bool]] | None = None
     ) -> dict[JobId, str]:
         """The jobs that lack drives for a table of some methods, weathers and traffic, and why they do.
+
+        A job has as many as are planned; where nobody says, as many as any other.
 
         Args:
             methods: names of the methods in the table; None takes all.
             conditions: (weather, whether in traffic) of the drives in the table; None takes all that occur.
         """
         counts = self.drives.groupby([*JOB, *CONDITION]).size().unstack(CONDITION, fill_value=0)
-        kept = counts[[where for where in counts if conditions is None or where in conditions]]
-        most, of_job = dict(kept.max()), kept.to_dict("index")
+        of_job, whole = counts.to_dict("index"), {**counts.max(), **self.planned}
+        most = {where: count for where, count in whole.items() if conditions is None or where in conditions}
         found: dict[JobId, str] = {}
         for job in self.jobs:
             if methods is not None and job.method not in methods:
                 continue
             own = of_job.get(job, {})
-            lacking = [where for where in own if own[where] < most[where]]
+            lacking = [where for where in most if own.get(where, 0) < most[where]]
             if job not in of_job:
                 found[job] = self.failures.get(job, "no row; not done yet")
             elif lacking:
-                found[job] = "; ".join(
-                    f"{own[where]} of {most[where]} drives at {in_words(where[0])}{' in traffic' if where[1] else ''}"
+                told = (
+                    f"{own.get(where, 0)} of {most[where]} drives at {in_words(where[0])}"
+                    f"{' in traffic' if where[1] else ''}"
                     for where in lacking
                 )
+                found[job] = f"{'; '.join(told)}; {LEFT_OUT}"
         return found
 
 
 def results_of(
-    rows: Frame, methods: Iterable[StatedMethod] = (), named: str | None = None, weathers: Sequence[str] = ()
+    rows: Frame,
+    methods: Iterable[StatedMethod] = (),
+    named: str | None = None,
+    weathers: Sequence[str] = (),
+    planned: Mapping[tuple[str, bool], int] | None = None,
 ) -> Results:
     """Sort a study's rows into drives and failures.
 
@@ -191,6 +208,7 @@ def results_of(
         named: the method that the plan compares with the others; None where it names none.
         weathers: the plan's weathers, that in which patterns were found first; where nobody says, they are in the order
             of the rows.
+        planned: how many drives a job has in a weather, alone or in traffic; None where nobody says.
 
     Raises:
         StudyError: there is no row, a column is missing, a number is not finite, or every job failed.
@@ -219,6 +237,7 @@ def results_of(
         figures=tuple(sorted(rows["figures"].unique(), key=_by_number)),
         seeds=tuple(sorted(map(int, rows["seed"].unique()))),
         weathers=tuple(order),
+        planned=planned or {},
     )
 
 
