@@ -22,17 +22,20 @@ import needs
 from paint_shy import along_a_street
 from roadproof.attacks import CMAES, AttackResult, GradOpt, PathDeviation, Published, SteeringShift, proposals
 from roadproof.calibration import CalibrationMethod
+from roadproof.controllers.shipped import installed_weights
 from roadproof.datatypes import Weather
 from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.starts import StartPlan
+from roadproof.errors import StudyError
 from roadproof.patterns import load_pattern
 from roadproof.pipeline.budget import PUBLISHED, QUICK, STEERING
 from roadproof.pipeline.stage_costs import read_cost
 from roadproof.scenarios import find_scenario
 from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.study import job as job_module
 from roadproof.study.job import run_job, space_of
 from roadproof.study.methods import BlackBoxPlan, GradOptPlan, PublishedPlan, budget_of
-from roadproof.study.plan import Job, TrafficPlan
+from roadproof.study.plan import Job, TrafficPlan, weights_digest
 from roadproof.study.rows import CostColumns, DriveColumns, JobColumns, PaintColumns
 from roadproof.study.shared import SharedRecordings, _link
 
@@ -118,6 +121,37 @@ def check_files(result, figures, conditions=("clear-noon",)):
             assert np.asarray(picture).std() > 10
     assert len({result.files[name] for name in views}) == len(views), "every condition looks different"
     assert len(json.loads(result.files["pattern.json"])["figures"]) == figures
+
+
+def test_a_job_is_not_done_with_other_weights_than_it_is_known_by(tmp_path):
+    weights = tmp_path / "own.safetensors"
+    weights.write_bytes(b"one")
+    job = job_of(GRADOPT, controller=f"pilotnet:{weights}", weights=weights_digest(f"pilotnet:{weights}"))
+    weights.write_bytes(b"another")
+    with pytest.raises(StudyError, match=r"own\.safetensors are no longer those that the study began with") as refused:
+        run_job(job, tmp_path / "job")
+    assert "\n" not in str(refused.value)
+    weights.unlink()
+    with pytest.raises(StudyError, match="no longer those"):
+        run_job(job, tmp_path / "job")
+
+
+@pytest.mark.slow
+def test_weights_that_are_written_again_while_a_job_runs_give_it_no_rows(street, tmp_path, monkeypatch):
+    weights = tmp_path / "own.safetensors"
+    shutil.copy(installed_weights("pilotnet"), weights)
+    job = job_of(GRADOPT, street, controller=str(weights), weights=weights_digest(str(weights)))
+    search = job_module.stress_test
+
+    def meanwhile(*args, **options):
+        found = search(*args, **options)
+        weights.write_bytes(weights.read_bytes() + b" ")
+        return found
+
+    assert run_job(job, tmp_path / "whole").rows
+    monkeypatch.setattr(job_module, "stress_test", meanwhile)
+    with pytest.raises(StudyError, match="no longer those"):
+        run_job(job, tmp_path / "job")
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from roadproof.driving.deviation import path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.evaluation import Evaluation
+from roadproof.errors import StudyError
 from roadproof.io.arrays import packed
 from roadproof.paint import Site, conspicuousness
 from roadproof.patterns import Pattern, raster, save_pattern
@@ -33,7 +34,7 @@ from roadproof.simulators.protocol import Simulator
 from roadproof.study.history import History, Progress
 from roadproof.study.methods import BlackBoxPlan, black_box, budget_of
 from roadproof.study.passages import passages
-from roadproof.study.plan import BLACK, Job, TrafficPlan
+from roadproof.study.plan import BLACK, Job, TrafficPlan, weights_digest
 from roadproof.study.rows import CostColumns, JobResult, Row, drive_columns, job_columns, paint_columns
 from roadproof.study.shared import SharedRecordings, bare_drives, bring_bare_drives, keep_bare_drives
 
@@ -62,8 +63,10 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         scratch: the job's own folder; what an interrupted run left there is gone on from.
 
     Raises:
-        RoadproofError: the simulator or controller is not there, or a stage refuses; the message says why.
+        RoadproofError: the simulator or controller is not there, its files are not those of the job, or a stage
+            refuses; the message says why.
     """
+    _check_weights(job)
     controller = load_controller(job.controller)
     with open_simulator(job.simulator) as world:
         drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
@@ -79,6 +82,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         paint, pictures = raster(found.pattern), dict[str, bytes]()
         for name, part in zip(PARTS, parts, strict=False):
             pictures |= passages(world, part, scratch / name, paint)
+    # What was loaded lies between two looks at the files.
+    _check_weights(job)
     costs: CostColumns = {
         "search_calls": found.calls,
         "search_seconds": found.seconds,
@@ -96,6 +101,19 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     files["paths.npz"] = packed({"clean_xy": path_of(clean), "painted_xy": path_of(painted)})
     files["history.json"] = found.history.to_json()
     return JobResult(rows, files | pictures)
+
+
+def _check_weights(job: Job) -> None:
+    """See that a controller's files are those that the job is known by; they may be written again while a study runs.
+
+    Raises:
+        StudyError: they are others, or gone.
+    """
+    if weights_digest(job.controller) != job.weights:
+        raise StudyError(
+            f"the files of {job.controller} are no longer those that the study began with; run it again for those of "
+            "now, or put the old ones back"
+        )
 
 
 def space_of(job: Job) -> SearchSpace:

@@ -184,7 +184,7 @@ class Study(Conditions):
     @property
     def jobs(self) -> tuple[Job, ...]:
         """The job of every combination, scenario by scenario."""
-        more: dict[str, Any] = {"weights": _digest(self.controller), **self.shared}
+        more: dict[str, Any] = {"weights": weights_digest(self.controller), **self.shared}
         combinations = product(self.scenarios, self.figures, self.methods, self.seeds)
         return tuple(
             Job(scenario=scenario, figures=figures, method=method, seed=seed, **more)
@@ -259,7 +259,7 @@ _FIRST_WEIGHTS = {
 """Digests of the shipped weights that keys of jobs are older than: those that the published rows were made with."""
 
 
-def _digest(controller: str) -> str:
+def weights_digest(controller: str) -> str:
     """The digest of the files that a spec names: weights, and the module that a function is written in.
 
     It is empty for a controller that comes with the package, with the weights that it had first.
