@@ -8,6 +8,8 @@ import pytest
 
 import needs
 from command import answered
+from roadproof.driving.evaluate import evaluate
+from roadproof.errors import EpisodeError
 from roadproof.study.folder import pandas, read_table
 from street_plan import write_plan
 
@@ -34,7 +36,7 @@ def plan(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_path):
+def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_path, monkeypatch):
     needs.town()
     for _ in range(2):
         code, printed = study("run", plan, "--quiet", "--out", tmp_path / "out")
@@ -62,6 +64,25 @@ def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_pa
     assert other["deviation_m"].iloc[1] != own["deviation_m"].iloc[0]
     # A clean and a painted drive each; the second call found them.
     assert len(list((tmp_path / "out" / "transfer").rglob("episodes/*.npz"))) == 4
+
+    def misses(*args, driver_name, **options):
+        if driver_name == "pilotnet":
+            raise EpisodeError("without paint the car never comes near the canvas")
+        return evaluate(*args, driver_name=driver_name, **options)
+
+    monkeypatch.setattr("roadproof.study.transfer.evaluate", misses)
+    failure = "pilotnet: street, K = 1-b, chance, seed 0: without paint the car never comes near the canvas"
+    code, printed = study("transfer", plan, "--controllers", "pilotnet, cil", "--out", tmp_path / "out")
+    assert code == 1
+    assert f"FAILED {failure}" in printed.out
+    code, printed = study("transfer", plan, "--controllers", "pilotnet, cil", "--out", tmp_path / "out", "--json")
+    assert (code, answered(printed.out)["failures"]) == (1, [failure])
+    # The others are kept.
+    assert list(read_table(tmp_path / "out", "transfer.parquet")["controller"]) == ["cil"]
+    code, printed = study("transfer", plan, "--controllers", "pilotnet", "--out", tmp_path / "out")
+    assert code == 2
+    assert f"roadproof: no pattern could be driven over; the first of 1: {failure}\n" in printed.err
+    assert list(read_table(tmp_path / "out", "transfer.parquet")["controller"]) == ["cil"]
 
 
 def test_a_dry_run_counts_traffic_in_the_weathers_that_have_some(study, tmp_path, monkeypatch):

@@ -109,9 +109,12 @@ def transfer(
     chosen = load_study(plan, trust=trust)
     specs = [spec.strip() for spec in controllers.split(",") if spec.strip()]
     with stages() as show:
-        rows = run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
-    say(*transfer_summary(rows), f"Rows in {out / 'transfer.parquet'}")
-    answer({"rows": rows.to_dict("records")})
+        found = run_transfer(chosen, out, specs, on_pattern=lambda done, total: show("Patterns", done, total, ""))
+    say(*transfer_summary(found.rows), f"Rows in {out / 'transfer.parquet'}")
+    say(*(f"FAILED {line}" for line in found.failures))
+    answer({"rows": found.rows.to_dict("records"), "failures": list(found.failures)})
+    if found.failures:
+        raise typer.Exit(1)
 
 
 def tables(

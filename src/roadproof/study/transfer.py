@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from roadproof.controllers import Controller, load_controller
 from roadproof.driving.evaluate import evaluate
-from roadproof.errors import ScenarioError, StudyError
+from roadproof.errors import RoadproofError, ScenarioError, StudyError
 from roadproof.io.files import inside, write_atomically
 from roadproof.io.locks import working_in
 from roadproof.patterns import load_pattern
@@ -22,7 +23,20 @@ from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
 from roadproof.study.folder import is_done, pandas
 from roadproof.study.plan import Job, Study
-from roadproof.study.rows import Frame, TransferRow, drive_columns, job_columns
+from roadproof.study.rows import Frame, JobId, TransferRow, drive_columns, job_columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transfer:
+    """What came of the patterns of a study under other controllers.
+
+    Args:
+        rows: a row for each pattern and drive of a controller.
+        failures: a line for each pattern that a controller could not be judged on, with the controller and the reason.
+    """
+
+    rows: Frame
+    failures: tuple[str, ...]
 
 
 def transfer(
@@ -31,8 +45,10 @@ def transfer(
     controllers: Sequence[str],
     *,
     on_pattern: Callable[[int, int], object] = lambda _done, _total: None,
-) -> Frame:
+) -> Transfer:
     """Drive every controller over the patterns of a study.
+
+    A controller that fails on a pattern, as one that never comes to its canvas, is told, and the others go on.
 
     Args:
         study: the study whose patterns are driven over.
@@ -41,7 +57,7 @@ def transfer(
         on_pattern: told how many patterns have been driven over, and of how many, all controllers counted.
 
     Raises:
-        StudyError: no controller is named, or no job of the study is done.
+        StudyError: no controller is named, no job of the study is done, or every pattern failed.
         ControllerError: there is no such controller.
         OutputError: the folder cannot be written.
     """
@@ -52,17 +68,25 @@ def transfer(
         raise StudyError(f"{folder} has no results of this study yet; run the study first")
     drivers = {spec: load_controller(spec) for spec in controllers}
     pandas()  # what writes the table is missed now, not after the last drive
-    rows: list[TransferRow] = []
-    done = 0
+    rows, failures, done = list[TransferRow](), list[str](), 0
     with working_in(folder), open_simulator(study.simulator) as world:
         for spec, driver in drivers.items():
             for job in found:
-                rows += _rows(job, folder, world, spec, driver)
+                try:
+                    rows += _rows(job, folder, world, spec, driver)
+                except RoadproofError as error:
+                    failures.append(f"{spec}: {_named(job)}: {error}")
                 done += 1
                 on_pattern(done, len(drivers) * len(found))
+    if not rows:
+        raise StudyError(f"no pattern could be driven over; the first of {len(failures)}: {failures[0]}")
     frame = pandas().DataFrame(rows)
     write_atomically(folder / "transfer.parquet", lambda part: frame.to_parquet(part, index=False))
-    return frame
+    return Transfer(frame, tuple(failures))
+
+
+def _named(job: Job) -> JobId:
+    return JobId(job.scenario.name, str(job.figures), job.method.name, job.seed)
 
 
 def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> list[TransferRow]:
