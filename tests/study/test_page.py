@@ -227,6 +227,15 @@ def test_rows_without_the_keys_of_their_jobs_are_refused_and_gathered_again(fini
     assert (tmp_path / "out" / "overall-bo.tex").read_text() == (page.parent / "overall-bo.tex").read_text()
 
 
+def test_keys_that_are_no_text_are_named(finished, tmp_path):
+    folder, rows, _ = finished
+    driven = rows[rows["error"].isna()].assign(found_on="cil")
+    lists = [["a"]] * len(rows)
+    for frame, transfer in ((rows.assign(job=lists), None), (rows, driven.assign(job=lists[: len(driven)]))):
+        with pytest.raises(StudyError, match=r"job of the rows is \['a'\], expected text"):
+            write_tables(frame, folder, tmp_path, transfer)
+
+
 def test_a_key_never_names_a_folder_elsewhere(finished):
     folder, rows, _ = finished
     with pytest.raises(StudyError, match=r"job '\.\./jobs' is not a plain name"):

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from hand_made_study import BO, GRADOPT, bad, results, row
@@ -58,6 +59,14 @@ def test_what_failed_or_is_missing_is_said():
         ([row(figures=5)], "figures of the rows is .*5.*, expected text; run the study again"),
         ([row(), row(method=None)], "method of the rows is .*, expected text"),
         ([row(seed=float("nan"))], "seed of the rows is .*nan.*, expected a whole number"),
+        ([row(job=["a"])], r"job of the rows is \['a'\], expected text"),
+        ([row(method=np.array([["a"], ["b"]]))], r"method of the rows is array\(\[\['a'\], \['b'\]\].*, expected text"),
+        ([row(method=["a"])], r"method of the rows is \['a'\], expected text"),
+        ([row(weather=["a"])], r"weather of the rows is \['a'\], expected text"),
+        ([row(), row(error=["a"])], r"error of the rows is \['a'\], expected text"),
+        ([row(traffic="False")], "traffic of the rows is 'False', expected true or false; run the study again"),
+        ([row(traffic=["a"])], r"traffic of the rows is \['a'\], expected true or false"),
+        ([row(points=[1.0])], "points of the rows is not all numbers"),
         ([row(), row(weather=None)], "weather of the rows is .*, expected text"),
     ],
 )

@@ -61,7 +61,14 @@ def test_the_heat_map_is_a_picture(tmp_path):
 
 @pytest.mark.parametrize(
     ("rows", "message"),
-    [([], "no rows"), ([{"found_on": "cil"}], "no column 'controller'"), ([drive("a", "b", float("nan"))], "is nan")],
+    [
+        ([], "no rows"),
+        ([{"found_on": "cil"}], "no column 'controller'"),
+        ([drive("a", "b", float("nan"))], "is nan"),
+        ([drive(["a"], "b", 1.0)], r"found_on of the rows is \['a'\], expected text"),
+        ([drive("a", "b", 1.0, method=["a"])], r"method of the rows is \['a'\], expected text"),
+        ([drive("a", "b", 1.0, seed=[0])], r"seed of the rows is \[0\], expected a whole number"),
+    ],
 )
 def test_rows_that_make_no_matrix_are_named(rows, message):
     with pytest.raises(StudyError, match=message):

@@ -23,7 +23,7 @@ from roadproof.study.kept_jobs import KeptJob, StatedMethod, read_jobs
 from roadproof.study.paper_tables import GAPS, paper_tables
 from roadproof.study.pictures import gallery, passages, trajectories
 from roadproof.study.plan import BLACK
-from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, results_of
+from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, check_kind, results_of
 from roadproof.study.rows import Frame
 from roadproof.study.table import Table, in_latex, in_markdown, markdown_text
 from roadproof.study.table_notes import counted
@@ -75,6 +75,7 @@ def _of_these_jobs(transfer: Frame, results: Results) -> tuple[Frame, str]:
     """The rows of a transfer that are of a study's patterns, and what a note says where these are not all of both."""
     if "job" not in transfer or "job" not in results.drives:
         return transfer, ""
+    check_kind(transfer, "job", str, "text")
     known, driven = transfer["job"].isin(results.drives["job"]), results.drives["job"].isin(transfer["job"])
     whole = bool(known.all()) and bool(driven.all())
     return transfer[known], "" if whole else " The study has changed since; run the transfer again."

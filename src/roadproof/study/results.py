@@ -221,7 +221,8 @@ def results_of(
         job, reason = next(iter(failures.items()))
         raise StudyError(f"no job came to its end; the first of {len(failures)} that failed ({job}): {reason}")
     _check_columns(drives, [*CONDITION, *NUMBERS])
-    _check_kind(drives, "weather", str, "text")
+    check_kind(drives, "weather", str, "text")
+    check_kind(drives, "traffic", (bool, np.bool_), "true or false")
     for name in NUMBERS:
         check_finite(drives, name)
     known = {method.name: method for method in methods}
@@ -250,9 +251,10 @@ def check_jobs(rows: Frame) -> None:
     if rows.empty:
         raise StudyError("the study has no rows yet; run it first")
     _check_columns(rows, [name for name in (*JobColumns.__annotations__, "error") if name != "job"])
-    for name in ("scenario", "kind", "figures", "method"):
-        _check_kind(rows, name, str, "text")
-    _check_kind(rows, "seed", Integral, "a whole number")
+    for name in ("scenario", "kind", "figures", "method", *(["job"] if "job" in rows else [])):
+        check_kind(rows, name, str, "text")
+    check_kind(rows, "seed", Integral, "a whole number")
+    check_kind(rows[rows["error"].notna()], "error", str, "text")
 
 
 def check_finite(rows: Frame, column: str) -> None:
@@ -269,6 +271,19 @@ def check_finite(rows: Frame, column: str) -> None:
         raise StudyError(f"{JobId(*job)}: {column} is {value}, expected a finite number; run the study again")
 
 
+def check_kind(rows: Frame, column: str, kind: type | tuple[type, ...], expected: str) -> None:
+    """See that a column holds values of one kind.
+
+    Raises:
+        StudyError: a value is of another; the message names the first.
+    """
+    for value in rows[column]:  # which need not be what can be hashed
+        if not isinstance(value, kind):
+            shown = " ".join(repr(value).split())[:40]  # arrays are several lines
+            found = f"{column} of the rows is {shown}, expected {expected}"
+            raise StudyError(f"{found}; run the study again, finished jobs are kept")
+
+
 def _by_number(figures: str) -> tuple[int, str]:
     return (0, "") if figures == BLACK else (int(figures) if figures.isdecimal() else 1 << 30, figures)
 
@@ -277,10 +292,3 @@ def _check_columns(rows: Frame, columns: Iterable[str]) -> None:
     for column in columns:
         if column not in rows:
             raise StudyError(f"the study's rows have no column {column!r}; run the study again, finished jobs are kept")
-
-
-def _check_kind(rows: Frame, column: str, kind: type, expected: str) -> None:
-    for value in rows[column].unique():
-        if not isinstance(value, kind):
-            found = f"{column} of the rows is {value!r:.40}, expected {expected}"
-            raise StudyError(f"{found}; run the study again, finished jobs are kept")

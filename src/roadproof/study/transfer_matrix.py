@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -9,7 +11,7 @@ from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
 from roadproof.report.formatting import MISSING
 from roadproof.study.charts import INK, MUTED, Picture, plain
-from roadproof.study.results import DEVIATION, JOB, Metric, check_finite
+from roadproof.study.results import DEVIATION, JOB, Metric, check_finite, check_kind
 from roadproof.study.rows import Frame
 from roadproof.study.statistics import mean_over_scenarios
 from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
@@ -84,6 +86,10 @@ def _matrix(rows: Frame, metric: Metric) -> Frame:
     for column in (*pairs, *JOB, metric.column):
         if column not in rows:
             raise StudyError(f"the transfer's rows have no column {column!r}; run the transfer again")
+    for column in (*pairs, *JOB):
+        if column != "seed":
+            check_kind(rows, column, str, "text")
+    check_kind(rows, "seed", Integral, "a whole number")
     check_finite(rows, metric.column)
     patterns = rows.groupby([*pairs, *JOB], sort=False)[metric.column].mean()
     means = patterns.reorder_levels([*JOB, *pairs]).groupby(level=pairs, sort=False).apply(mean_over_scenarios)
