@@ -60,7 +60,7 @@ def test_what_failed_or_is_missing_is_said():
         ([row(), row(method=None)], "method of the rows is .*, expected text"),
         ([row(seed=float("nan"))], "seed of the rows is .*nan.*, expected a whole number"),
         ([row(job=["a"])], r"job of the rows is \['a'\], expected text"),
-        ([row(method=np.array([["a"], ["b"]]))], r"method of the rows is array\(\[\['a'\], \['b'\]\].*, expected text"),
+        ([row(kind=np.array([["a"], ["b"]]))], r"kind of the rows is array\(\[\['a'\], \['b'\]\].*, expected text"),
         ([row(method=["a"])], r"method of the rows is \['a'\], expected text"),
         ([row(weather=["a"])], r"weather of the rows is \['a'\], expected text"),
         ([row(), row(error=["a"])], r"error of the rows is \['a'\], expected text"),
