@@ -4,7 +4,8 @@ import pytest
 
 from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
-from roadproof.study.table import Heading, Number, Table, in_latex, in_markdown, latex_text, markdown_text
+from roadproof.report.formatting import markdown_text
+from roadproof.study.table import Heading, Number, Table, in_latex, in_markdown, latex_text
 
 HOSTILE = "<b>_BO_ 100% $x^2$ {a} \\end{table} #1 & ~ | `c` *d* [e](f)"
 

@@ -14,8 +14,7 @@ from roadproof.gate.verdict import Status, digits_apart
 from roadproof.io.files import printable, write_atomically, write_text
 from roadproof.pipeline.film import Strip
 from roadproof.recordings import evenly
-from roadproof.report.formatting import MISSING, in_words
-from roadproof.study.table import markdown_text
+from roadproof.report.formatting import MISSING, in_words, markdown_text
 
 WORST = "worst.jpg"
 SHOWN_PX, BLACK = 1500, 12

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from roadproof.calibration.report import Spread
 from roadproof.driving.intervals import Estimate
 
@@ -31,3 +33,8 @@ def aside_in_words(left_m: float) -> str:
 def spread_in_words(spread: Spread | None) -> str:
     """A mean and in brackets the 95th percentile, in pixels: "0.20 (0.40)"."""
     return MISSING if spread is None else f"{spread.mean:.2f} ({spread.p95:.2f})"
+
+
+def markdown_text(text: str) -> str:
+    """Text that Markdown and the HTML in it leave as it is."""
+    return re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", " ".join(text.split())).replace("&", "&amp;").replace("<", "&lt;")

@@ -13,7 +13,7 @@ from roadproof.study.folder import pandas
 from roadproof.study.results import DEVIATION, JOB, LEFT_LANE, Block, Results
 from roadproof.study.rows import Frame
 from roadproof.study.statistics import EQUAL, Values, mean_over_scenarios
-from roadproof.study.table import Cell, Heading, Table, headings, marked, share_of, unmarked
+from roadproof.study.table import Cell, Heading, Table, headings, marked, share_of
 from roadproof.study.table_notes import counted, missing, table_note
 
 
@@ -128,7 +128,7 @@ def _found_in(scenario: str, drives: Frame, results: Results) -> _Found:
 
 def _rows_of(found: _Found, figures: str, names: Sequence[str]) -> list[tuple[Cell, ...]]:
     """A row a method; none where no method was driven, and no mark where their drives are not of the same cases."""
-    columns = [marked(each) if found.is_whole else unmarked(each) for each in found.medians]
+    columns = [marked(each, compared=found.is_whole) for each in found.medians]
     rows = list[tuple[Cell, ...]]()
     for number, (name, drives) in enumerate(zip(names, found.drives, strict=True)):
         told = f"{drives['left_lane'].sum():.0f} of {len(drives)}", f"{drives['points'].median():g}"

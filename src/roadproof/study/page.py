@@ -14,7 +14,7 @@ from pathlib import Path
 
 from roadproof.io.files import write_text
 from roadproof.io.html import data_url
-from roadproof.report.formatting import in_words
+from roadproof.report.formatting import in_words, markdown_text
 from roadproof.report.html import rendered
 from roadproof.report.plots import save
 from roadproof.study.charts import Picture, by_figures, progress
@@ -25,7 +25,7 @@ from roadproof.study.pictures import gallery, passages, trajectories
 from roadproof.study.plan import BLACK
 from roadproof.study.results import DEVIATION, PENALTY, Results, check_jobs, check_kind, results_of
 from roadproof.study.rows import Frame
-from roadproof.study.table import Table, in_latex, in_markdown, markdown_text
+from roadproof.study.table import Table, in_latex, in_markdown
 from roadproof.study.table_notes import counted
 from roadproof.study.transfer_matrix import transfer_map, transfer_table
 

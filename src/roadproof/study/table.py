@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
-from roadproof.report.formatting import MISSING
+from roadproof.report.formatting import MISSING, markdown_text
 from roadproof.study.statistics import EQUAL
 
 
@@ -51,17 +51,12 @@ class Number:
 Cell: TypeAlias = str | Number
 
 
-def marked(numbers: Sequence[Estimate | None]) -> list[Cell]:
-    """Numbers that are compared, the highest marked; equal ones all, unless all are equal."""
+def marked(numbers: Sequence[Estimate | None], *, compared: bool = True) -> list[Cell]:
+    """Numbers, where they are compared with the highest marked; equal ones all, unless all are equal."""
     values = [number.value for number in numbers if number is not None]
     top = max(values, default=0.0)
-    one = min(values, default=0.0) < top - EQUAL
+    one = compared and min(values, default=0.0) < top - EQUAL
     return [MISSING if each is None else Number(each, best=one and each.value >= top - EQUAL) for each in numbers]
-
-
-def unmarked(numbers: Sequence[Estimate | None]) -> list[Cell]:
-    """Numbers that are not compared."""
-    return [MISSING if each is None else Number(each) for each in numbers]
 
 
 def share_of(mean: Estimate | None) -> str:
@@ -139,11 +134,6 @@ def in_markdown(table: Table) -> str:
         *(_markdown_row([_markdown_cell(cell) for cell in row]) for row in table.rows),
     ]
     return f"### {markdown_text(table.title)}\n\n" + "\n".join(lines) + f"\n\n{markdown_text(table.note)}\n"
-
-
-def markdown_text(text: str) -> str:
-    """Text that Markdown and the HTML in it leave as it is."""
-    return re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", " ".join(text.split())).replace("&", "&amp;").replace("<", "&lt;")
 
 
 def in_latex(table: Table) -> str:
