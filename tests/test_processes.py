@@ -76,10 +76,20 @@ def test_what_travelled_in_a_file_is_gone_when_the_parent_is_killed(blow):
 
 
 ENDED_AT_ONCE = """
-import operator
+import operator, threading, time
 from contextlib import nullcontext
+from multiprocessing import synchronize
 from roadproof.processes import Pool
+
+unlink = synchronize.sem_unlink
+
+def unlink_slowly(name):
+    unlink(name)
+    if threading.current_thread() is not threading.main_thread():
+        time.sleep(0.3)  # Python ends meanwhile, where it does not wait for the thread
+
 if __name__ == "__main__":
+    synchronize.sem_unlink = unlink_slowly
     try:
         with Pool(nullcontext, 2) as pool:
             pool.begin(operator.is_)

@@ -83,12 +83,12 @@ class Pool(Generic[Inside]):
         self._folder.cleanup()
         if kind is not None:
             self._stop.set()
-        # All of them together: one after another takes half a second each.
-        ends = [threading.Thread(target=_end, args=(each, self._stop), daemon=True) for each in self._beside]
+        # All of them together: one after another takes half a second each. Python waits for them when it ends, so that
+        # they are not cut off between giving a semaphore back and telling so.
+        ends = [threading.Thread(target=_end, args=(each, self._stop)) for each in self._beside]
         for end in ends:
             end.start()
         if kind is None:
-            # Not waited for they may complain when Python ends.
             for end in ends:
                 end.join()
 
