@@ -340,15 +340,19 @@ def test_transfer_has_its_matrix_in_the_page(finished, tmp_path):
 def test_a_transfer_of_another_state_of_the_study_is_left_out(finished, tmp_path):
     _, rows, page = finished
     driven = rows[rows["error"].isna()].assign(found_on="cil")
-    again = "The study has changed since; run the transfer again."
+    again = "Patterns that the study no longer has are left out; run the transfer again."
+    lacking = f"{driven[driven['method'] == 'BO']['job'].nunique()} of the study&#39;s patterns are not in it"
     for of_now, shown in ((driven["method"] != "BO", True), (driven["method"] == "none", False)):
         out = tmp_path / str(shown)
         text = write_tables(rows, out, out, driven.assign(job=driven["job"].where(of_now, "0" * 16))).read_text()
-        assert ("driven by" in text, again in text) == (shown, shown)
+        assert ("driven by" in text, again in text, lacking in text) == (shown, shown, shown)
         assert (out / "figures" / "transfer-deviation.png").exists() is shown
     whole = write_tables(rows, tmp_path, tmp_path / "whole", driven).read_text()
     assert "driven by" in whole
     assert again not in whole
+    assert "are not in it" not in whole
+    unjudged = write_tables(rows, tmp_path, tmp_path / "unjudged", driven[driven["method"] != "BO"]).read_text()
+    assert (again in unjudged, lacking in unjudged) == (False, True)
     assert "driven by" not in page.read_text()
 
 

@@ -26,7 +26,9 @@ DRIVES = [
     drive("cil", "cil", 2.0),
     drive("cil", "cil", 1.0, "left-02"),
     drive("cil", "pilotnet", 0.5),
+    drive("cil", "pilotnet", 0.5, "left-02"),
     drive("cil", "robust", 0.25),
+    drive("cil", "robust", 0.25, "left-02"),
     drive("pilotnet", "pilotnet", 1.5),
     # Twice the same pattern, in two runs: one value.
     drive("pilotnet", "cil", 0.2),
@@ -42,6 +44,13 @@ def test_the_matrix_is_found_on_by_driven_by():
     assert [cell.best for cell in table.rows[0][1:]] == [True, False, True]
     assert "1 to 2 patterns a cell" in table.note
     assert "1 pairs were not driven" in table.note
+
+
+def test_controllers_are_compared_over_the_patterns_that_all_of_them_drove():
+    unjudged = [drive("cil", "cil", 9.0, "left-03"), drive("cil", "robust", 9.0, "left-04")]
+    assert transfer_table(DataFrame([*DRIVES, *unjudged])) == transfer_table(DataFrame(DRIVES))
+    with pytest.raises(StudyError, match="no pattern of the transfer was driven over by every controller"):
+        transfer_table(DataFrame(unjudged))
 
 
 def test_the_penalty_has_a_matrix_of_its_own():

@@ -251,10 +251,19 @@ def check_jobs(rows: Frame) -> None:
     if rows.empty:
         raise StudyError("the study has no rows yet; run it first")
     _check_columns(rows, [name for name in (*JobColumns.__annotations__, "error") if name != "job"])
-    for name in ("scenario", "kind", "figures", "method", *(["job"] if "job" in rows else [])):
-        check_kind(rows, name, str, "text")
-    check_kind(rows, "seed", Integral, "a whole number")
+    check_names(rows, ["kind", *(["job"] if "job" in rows else [])])
     check_kind(rows[rows["error"].notna()], "error", str, "text")
+
+
+def check_names(rows: Frame, others: Sequence[str]) -> None:
+    """See that what names a job is text, its seed a whole number, and other columns text too.
+
+    Raises:
+        StudyError: a value is of another kind; the message names the first.
+    """
+    for name in (*others, *JOB):
+        whole = name == "seed"
+        check_kind(rows, name, Integral if whole else str, "a whole number" if whole else "text")
 
 
 def check_finite(rows: Frame, column: str) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from numbers import Integral
-
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -11,7 +9,7 @@ from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
 from roadproof.report.formatting import MISSING
 from roadproof.study.charts import INK, MUTED, Picture, plain
-from roadproof.study.results import DEVIATION, JOB, Metric, check_finite, check_kind
+from roadproof.study.results import DEVIATION, JOB, Metric, check_finite, check_names
 from roadproof.study.rows import Frame
 from roadproof.study.statistics import mean_over_scenarios
 from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
@@ -40,8 +38,8 @@ def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
         name=f"transfer-{slug(metric.title)}",
         title=f"Transfer: {metric.title.lower()} of patterns found against one controller, driven by another",
         note=f"{metric.title} in {metric.unit}, driven; means over "
-        f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} patterns a cell with 95 % bootstrap "
-        "intervals over scenarios."
+        f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} patterns a cell, those that all "
+        "controllers of its row drove, with 95 % bootstrap intervals over scenarios."
         + (" The highest of each driver in bold." if several else "")
         + (f" {missing} pairs were not driven." if missing else ""),
         header=((Heading(""), Heading("driven by", len(driven_by))), headings("found on", *driven_by)),
@@ -73,26 +71,30 @@ def transfer_map(rows: Frame, metric: Metric = DEVIATION) -> Picture:
     return Picture(
         f"transfer-{slug(metric.title)}",
         f"{metric.title} in {metric.unit} of patterns found against one controller (rows) and driven by another "
-        "(columns), driven; means over all patterns of a pair.",
+        "(columns), driven; means over the patterns that all controllers of a row drove.",
         figure,
     )
 
 
 def _matrix(rows: Frame, metric: Metric) -> Frame:
-    """Means over all patterns: a row for whom they were found against, a column for who drove; None where nobody."""
+    """Means over patterns: a row for whom they were found against, a column for who drove; None where nobody.
+
+    All cells of a row are over the same patterns, those that every controller in it drove.
+    """
     if rows.empty:
         raise StudyError("the transfer has no rows; drive some patterns first")
     pairs = ["found_on", "controller"]
     for column in (*pairs, *JOB, metric.column):
         if column not in rows:
             raise StudyError(f"the transfer's rows have no column {column!r}; run the transfer again")
-    for column in (*pairs, *JOB):
-        if column != "seed":
-            check_kind(rows, column, str, "text")
-    check_kind(rows, "seed", Integral, "a whole number")
+    check_names(rows, pairs)
     check_finite(rows, metric.column)
     patterns = rows.groupby([*pairs, *JOB], sort=False)[metric.column].mean()
-    means = patterns.reorder_levels([*JOB, *pairs]).groupby(level=pairs, sort=False).apply(mean_over_scenarios)
+    drivers = patterns.reset_index("controller").groupby("found_on")["controller"].transform("nunique")
+    by_all = patterns.groupby(level=["found_on", *JOB]).transform("size").to_numpy() == drivers.to_numpy()
+    if not by_all.any():
+        raise StudyError("no pattern of the transfer was driven over by every controller; run the transfer again")
+    means = patterns[by_all].reorder_levels([*JOB, *pairs]).groupby(level=pairs, sort=False).apply(mean_over_scenarios)
     # Controllers that stand on both sides first and in one order, so that the diagonal is their own patterns.
     found, drivers = list(rows["found_on"].unique()), list(rows["controller"].unique())
     driven = [*(name for name in found if name in drivers), *(name for name in drivers if name not in found)]
