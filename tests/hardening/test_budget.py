@@ -47,6 +47,12 @@ def test_budgets_judge_by_kinds_that_training_did_not_use():
         assert (shapes.figures, shapes.shape) == (3, Shape.ELLIPSE)
 
 
+def test_judging_paints_in_other_shapes_what_else_the_space_allows():
+    asked = SearchSpace(figures=2, colour=False, albedo=(0.1, 0.8), max_painted_share=0.1)
+    for _, space in HardeningBudget().kinds(asked).values():
+        assert dataclasses.replace(space, family=asked.family, shape=asked.shape) == asked
+
+
 def test_budgets_that_make_no_sense_are_refused():
     with pytest.raises(TrainingError, match="give attack and judge a path deviation"):
         HardeningBudget(attack=dataclasses.replace(QUICK, objective=SteeringShift()))

@@ -80,7 +80,7 @@ class HardeningBudget:
 
     def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
         """What judging searches besides `judge`: method and search space by the name of the kind."""
-        shapes = SearchSpace(figures=space.figures, family="free", shape=self.unseen_shape, limits=space.limits)
+        shapes = replace(space, family="free", shape=self.unseen_shape)
         return {
             f"{self.unseen.word}, {self.unseen.steps(self.judge.objective)} patterns tried": (self.unseen, space),
             f"{self.unseen_shape}s by gradient": (self.judge.method, shapes),
