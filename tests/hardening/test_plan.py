@@ -15,6 +15,7 @@ from roadproof.hardening.judgement import clean_drives
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.tuning import training_step
 from roadproof.io.identity import require_same
+from roadproof.limits import MAX_SEED
 from roadproof.patterns import Shape
 from roadproof.scenarios import find_scenario
 
@@ -35,6 +36,15 @@ def test_an_edited_training_step_is_another_hardening(tmp_path):
     for other in (parts[0], parts[2]):
         with pytest.raises(RoadproofError, match="holds a hardening with training step"):
             require_same(tmp_path, "a hardening", parts[1], other, RoadproofError)
+
+
+@pytest.mark.parametrize("seed", [0, 999, MAX_SEED - 1000, MAX_SEED])
+def test_judging_has_a_seed_that_no_round_has_and_that_searches_take(tmp_path, seed):
+    plan = HardeningPlan(
+        spec="pilotnet", scenarios=(), folder=tmp_path, budget=HardeningBudget(), space=SPACE, seed=seed, device="cpu"
+    )
+    assert plan.judging_seed <= MAX_SEED
+    assert all(plan.seed_of(number) < plan.judging_seed for number in range(101))
 
 
 def test_a_street_that_is_named_twice_is_driven_over_once(tmp_path):

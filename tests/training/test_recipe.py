@@ -68,7 +68,7 @@ def test_a_recipe_may_start_from_weights(tmp_path):
     assert isinstance(Recipe(network="waypoint").fresh(), TrajectoryController)
 
 
-@pytest.mark.parametrize("changes", [{"network": "resnet"}, {"rounds": -1}, {"painted_drives": -2}])
+@pytest.mark.parametrize("changes", [{"network": "resnet"}, {"rounds": -1}, {"painted_drives": -2}, {"seed": -1}])
 def test_recipes_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError, match=next(iter(changes))):
         Recipe(**changes)

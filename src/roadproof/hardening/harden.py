@@ -33,6 +33,8 @@ from roadproof.hardening.tuning import TrainingStep
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.locks import working_in
+from roadproof.io.tables import check_range
+from roadproof.limits import MAX_SEED
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stress_test import OnProgress
 from roadproof.processes import require_opened
@@ -75,15 +77,15 @@ def harden(
         budget: how much is spent on attacks, tuning and judging; `HardeningBudget()` by default.
         space: the space of the patterns that are searched; five rectangles of the published family by default.
         training_step: gives the loss of a batch; your own where the usual one does not fit your controller.
-        seed: the seed of everything random; judging has fresh ones.
+        seed: the seed of everything random, 0 to 2³² − 1; judging has fresh ones.
         device: the torch device on which to search and learn, such as "cpu" or "cuda".
         factory: opens one more simulator of the same kind; needed for several processes.
         processes: how many streets are attacked at once, each in a process with a simulator of its own.
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
-        TrainingError: there are no rounds, streets for training and judging are not disjoint, or the training step
-            gives no finite loss.
+        TrainingError: there are no rounds, the seed is out of range, streets for training and judging are not disjoint,
+            or the training step gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: the folder holds another hardening, or a stage refuses; the message says why.
     """
@@ -91,6 +93,7 @@ def harden(
     check_streets(scenarios, judge_on)
     if rounds < 1:
         raise TrainingError(f"rounds is {rounds}, expected 1 or more")
+    check_range(seed, "seed", 0, MAX_SEED, TrainingError)
     budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
     if judge_on:
         budget.require_libraries(space)

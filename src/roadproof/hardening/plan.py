@@ -12,6 +12,7 @@ from roadproof.controllers.loading import runs_code
 from roadproof.hardening.budget import HardeningBudget
 from roadproof.hardening.tuning import TrainingStep
 from roadproof.io.known import known_by, without_addresses
+from roadproof.limits import MAX_SEED
 from roadproof.pipeline.stress_test import OnProgress, StressTest, stress_test
 from roadproof.scenarios import Scenario, identity
 from roadproof.search_space import SearchSpace, derived_seed
@@ -19,7 +20,7 @@ from roadproof.simulators.protocol import Simulator, world_of
 
 WEIGHTS = "hardened.safetensors"
 _FRESH = 1000
-"""Distance between the seeds of training and those of judging."""
+"""The least seed of judging; those of the rounds are below it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,7 +84,7 @@ class HardeningPlan:
     @property
     def judging_seed(self) -> int:
         """The seed of all judging, which no round has."""
-        return self.seed + _FRESH
+        return _FRESH + self.seed % (MAX_SEED + 1 - _FRESH)
 
     def made_of(self, simulator: Simulator, teacher: Controller, step: TrainingStep) -> dict[str, object]:
         """What identifies the hardening; judging may be asked for later."""

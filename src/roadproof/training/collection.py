@@ -52,14 +52,14 @@ class CollectionPlan:
 
     Args:
         drives: how many drives to record, at least 1.
-        seed: the seed of everything drawn: scenarios, weathers, traffic, disturbances, paint.
+        seed: the seed of everything drawn, at least 0: scenarios, weathers, traffic, disturbances, paint.
         controller: spec of the controller that drives; None for the expert.
         disturbed: share of the drives that start beside the lane's middle and are disturbed, 0 to 1.
         traffic: share of the drives with others on the road, 0 to 1.
         painted: share of the drives with a random pattern on the canvas, 0 to 1.
 
     Raises:
-        TrainingError: a share is not in [0, 1], or there is no drive.
+        TrainingError: a share is not in [0, 1], the seed is below 0, or there is no drive.
     """
 
     drives: int
@@ -72,6 +72,8 @@ class CollectionPlan:
     def __post_init__(self) -> None:
         if self.drives < 1:
             raise TrainingError(f"drives is {self.drives}, expected at least 1")
+        if self.seed < 0:
+            raise TrainingError(f"seed is {self.seed}, expected 0 or more")
         for name in ("disturbed", "traffic", "painted"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected a share in [0, 1]")
