@@ -22,6 +22,7 @@ from roadproof.hardening.page import write_hardening
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import Tuning, training_step
+from roadproof.paint import PaintLimits
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
@@ -189,7 +190,12 @@ def check_result(found, out):
 
 def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
     folder = tmp_path / "out"
+    nowhere = dataclasses.replace(street(tmp_path, "far", 115.0), goal_m=(500.0, 500.0))
     for options, message in (
+        ({"judge_on": [nowhere]}, "scenario far: "),
+        ({"clean_on": [nowhere]}, "scenario far: "),
+        ({"space": SearchSpace(figures=1, limits=PaintLimits(keep_out_m=9.0))}, "leaves no place for paint"),
+        ({"training_step": lambda model, batch: batch.target.mean()}, "expected one number with a gradient"),
         ({"judge_on": [street(tmp_path, "next", 40.0)]}, "lie 25 m apart, on one street; expected at least 40 m"),
         ({"rounds": 0}, "rounds is 0"),
         ({"seed": -1}, "seed is -1, expected 0 to"),

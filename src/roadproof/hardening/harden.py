@@ -22,6 +22,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 
+from roadproof.controllers.checks import require_usable
 from roadproof.controllers.loading import load_trainable
 from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
@@ -29,15 +30,16 @@ from roadproof.hardening.judgement import Judgement
 from roadproof.hardening.plan import WEIGHTS, HardeningPlan
 from roadproof.hardening.result import Hardened
 from roadproof.hardening.stages import HardeningStages
-from roadproof.hardening.tuning import TrainingStep
+from roadproof.hardening.tuning import TrainingStep, require_loss
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.locks import working_in
 from roadproof.io.tables import check_range
 from roadproof.limits import MAX_SEED
 from roadproof.pipeline.stage_costs import Ledger
-from roadproof.pipeline.stress_test import OnProgress
+from roadproof.pipeline.stages import OnProgress, check_paint
 from roadproof.processes import require_opened
+from roadproof.roads.marks import require_route
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
@@ -98,7 +100,12 @@ def harden(
     if judge_on:
         budget.require_libraries(space)
     require_opened(processes, factory)
-    load_trainable(controller)
+    streets = (*scenarios, *judge_on)
+    for street in streets:
+        check_paint(simulator, street, space, budget.attack.method)
+    for each in dict.fromkeys((*streets, *clean_on)):
+        require_route(simulator, each)
+    network = load_trainable(controller)
     plan = HardeningPlan(
         spec=controller,
         scenarios=tuple(scenarios),
@@ -108,7 +115,9 @@ def harden(
         seed=seed,
         device=device,
     )
-    teacher = plan.controller(0)
+    teacher, size = plan.controller(0), (simulator.input.height_px, simulator.input.width_px)
+    require_usable(teacher, size=size, device=device, gradients=budget.attack.method.by_gradient)
+    require_loss(training_step, network, teacher, size=size, device=device)
     with working_in(folder):
         ledger = Ledger(folder, plan.made_of(simulator, teacher, training_step), STAGES, "a hardening")
         stages = HardeningStages(plan, simulator, teacher, training_step, factory, processes, ledger, on_progress)
@@ -118,7 +127,7 @@ def harden(
         write_atomically(weights, lambda part: shutil.copyfile(plan.weights(best), part))
         judgement = None
         if judge_on:
-            clean = stages.drive_clean(best, clean_on or (*scenarios, *judge_on))
+            clean = stages.drive_clean(best, clean_on or streets)
             judgement = Judgement(stages.judge(best, judge_on), clean)
         found = Hardened(
             controller=controller,

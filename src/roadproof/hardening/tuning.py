@@ -26,6 +26,7 @@ from torch.nn import functional
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import Controller
 from roadproof.controllers.precision import mixed_precision
+from roadproof.datatypes import Command
 from roadproof.errors import TrainingError
 from roadproof.foreign import call
 from roadproof.hardening.batches import Pictures, TuningBatch, answers
@@ -159,9 +160,7 @@ def tune(
             batch = TuningBatch(*(torch.cat(columns) for columns in zip(*painted, strict=True)))
             for group in optimiser.param_groups:
                 group["lr"] = tuning.rate(number * tuning.repeats + again)
-            with mixed_precision(place):
-                loss = call("the training step", step, network, batch)
-            loss = _checked(loss, number)
+            loss = _loss(step, network, batch, number)
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, 5.0)
@@ -195,6 +194,34 @@ def _resume(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, ch
         if own:
             optimiser.state[each] = own
     return int(kept["steps"])
+
+
+def require_loss(
+    step: TrainingStep, network: nn.Module, teacher: Controller, *, size: tuple[int, int], device: torch.device | str
+) -> None:
+    """Refuse a training step that cannot teach a controller, by made-up pictures, before anything is driven.
+
+    Args:
+        step: the function that gives the loss of a batch.
+        network: a controller whose parameters want gradients; it is moved to `device`.
+        teacher: the controller before, on `device`.
+        size: (height, width) of the pictures.
+        device: the torch device on which the controller will learn.
+
+    Raises:
+        TrainingError, ControllerError: as `tune`.
+    """
+    frames = torch.rand(4, 3, *size, generator=torch.Generator().manual_seed(0)).to(device)
+    speed_mps, command = torch.full((4,), 7.0, device=device), torch.full((4,), int(Command.FOLLOW), device=device)
+    with torch.no_grad():
+        target = answers(teacher, frames, speed_mps, command)
+    _loss(step, network.to(device), TuningBatch(frames, speed_mps, command, target), 0)
+
+
+def _loss(step: TrainingStep, network: nn.Module, batch: TuningBatch, number: int) -> Tensor:
+    """The loss of a batch, of the step of this number."""
+    with mixed_precision(batch.frames.device):
+        return _checked(call("the training step", step, network, batch), number)
 
 
 def _checked(loss: object, number: int) -> Tensor:

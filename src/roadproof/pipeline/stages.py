@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from roadproof.attacks import AttackResult, Cheapest, cheapest, kept_attack, parse_groups
+from roadproof.attacks import AttackResult, Cheapest, Method, cheapest, kept_attack, parse_groups
 from roadproof.attacks.cheapest import FILE, MOST_LEVELS
 from roadproof.attacks.groups import Group
 from roadproof.attacks.objective import own_objective, variation_of
@@ -116,18 +116,6 @@ class Stages:
             # Of a calibration that is older than marks, or by a simulator without a map.
             return replace(done.recordings, marks=marks_of(self.simulator, self.scenario))
         return done.recordings
-
-    def check_paint(self) -> None:
-        """Check, before anything is driven, that the method can search the patterns and the limits leave some.
-
-        Raises:
-            PatternError: the method cannot search them, or the limits leave none.
-        """
-        space = self.space
-        self.budget.method.check_space(space)
-        if space.limits is not None:
-            site = space.limits.site(site_at(self.simulator, self.scenario))
-            space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)
 
     def groups(self, recordings: RecordingSet) -> tuple[Group, ...]:
         """The groups to attack: the method's own, or all drives pooled if the budget says so."""
@@ -296,3 +284,15 @@ class Stages:
     def _folder_of(self, number: int) -> Path:
         """The folder of the drives in the weather of this number."""
         return self.folder / self.budget.recorded_in[number] if number else self.folder
+
+
+def check_paint(simulator: Simulator, scenario: Scenario, space: SearchSpace, method: Method) -> None:
+    """Check, before anything is driven, that a method can search the patterns and the limits leave some on a street.
+
+    Raises:
+        PatternError: the method cannot search them, or the limits leave none.
+    """
+    method.check_space(space)
+    if space.limits is not None:
+        site = space.limits.site(site_at(simulator, scenario))
+        space.limits.check(site, albedo=space.albedo, black=not space.colour, measured=False)

@@ -40,7 +40,7 @@ from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
-from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages
+from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages, check_paint
 from roadproof.processes import here_or_beside, require_opened, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
@@ -173,7 +173,7 @@ def stress_test(
         pool=here_or_beside(simulator, factory, processes),
         on_progress=on_progress,
     )
-    stages.check_paint()
+    check_paint(simulator, scenario, stages.space, budget.method)
     if cheapest_m is not None:
         check_wanted(cheapest_m)
         if not isinstance(budget.objective, PathDeviation):

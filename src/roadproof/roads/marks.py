@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.paint.site import WHITE_MARK, YELLOW_MARK, LaneMark, Site
+from roadproof.roads.maps import scenario_route
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 
@@ -101,3 +102,13 @@ def marks_of(simulator: object, scenario: Scenario) -> tuple[LaneMark, ...] | No
         ScenarioError: the simulator has no such map.
     """
     return marks_on(scenario.canvas, simulator.road_map(scenario.map_name)) if isinstance(simulator, Mapped) else None
+
+
+def require_route(simulator: object, scenario: Scenario) -> None:
+    """Refuse a scenario that does not fit the simulator's map, before anything is driven; without a map none is.
+
+    Raises:
+        SimulatorError, ScenarioError: as `marks_of`; or start, goal and canvas do not fit the map.
+    """
+    if isinstance(simulator, Mapped):
+        scenario_route(scenario, simulator.road_map(scenario.map_name))
