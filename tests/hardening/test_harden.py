@@ -78,29 +78,45 @@ class StoppedError(Exception):
     """The plug is pulled."""
 
 
-def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
-    budget = dataclasses.replace(TINY, town_drives=1)
-    asked = HardeningPlan(
+def planned(folder, budget):
+    return HardeningPlan(
         spec="pilotnet",
-        scenarios=(street(tmp_path, "near", 15.0),),
-        folder=tmp_path / "out",
+        scenarios=(street(folder, "near", 15.0),),
+        folder=folder / "out",
         budget=budget,
         space=SearchSpace(figures=1),
         seed=0,
         device="cpu",
     )
+
+
+def stages_of(plan, town):
+    ledger = Ledger(plan.folder, {}, STAGES)
+    return HardeningStages(plan, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
+
+
+def test_a_tuning_that_was_ended_after_its_weights_were_kept_leaves_nothing_else(town, tmp_path):
+    plan = planned(tmp_path, TINY)
+    plan.round(1).mkdir(parents=True)
+    for name in ("hardened.safetensors", "learning.safetensors"):
+        (plan.round(1) / name).touch()
+    stages_of(plan, town).tune(1, [])
+    assert [path.name for path in plan.round(1).iterdir()] == ["hardened.safetensors"]
+
+
+def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
+    asked = planned(tmp_path, dataclasses.replace(TINY, town_drives=1))
     spoilt = load_trainable("pilotnet")
     with torch.no_grad():
         for weights in spoilt.parameters():
             weights.mul_(0.5)
     asked.round(1).mkdir(parents=True)
     save_controller(spoilt, asked.weights(1), origin="spoilt")
-    ledger = Ledger(asked.folder, {}, STAGES)
-    stages = HardeningStages(asked, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
+    stages = stages_of(asked, town)
     first = stages.town(1).draw(500, torch.Generator().manual_seed(0), to_paint=False)
     assert not (asked.round(1) / "town").exists()
     both = stages.town(2).draw(500, torch.Generator().manual_seed(0), to_paint=False)
-    assert ledger.cost["town"].simulator_calls == 2
+    assert stages.ledger.cost["town"].simulator_calls == 2
     drives = [Shard.load(asked.town(number) / "drive-00000.npz") for number in (0, 1)]
     seen = [{int(frame.sum()) for frame in drive.frames} for drive in drives]
     shown = [{round(255 * float(frame.double().sum())) for frame in views.frames} for views in (first, both)]

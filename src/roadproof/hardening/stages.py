@@ -83,7 +83,10 @@ class HardeningStages:
     def tune(self, number: int, tests: Sequence[Sequence[StressTest]]) -> None:
         """Tune on what all attacks so far found, from the weights of the round before."""
         plan, tuning = self.plan, self.plan.budget.tuning
+        path = plan.round(number) / "learning.safetensors"
         if plan.weights(number).exists():
+            # One that was ended between writing the one file and removing the other left both.
+            path.unlink(missing_ok=True)
             return
         network, town = load_trainable(plan.spec_of(number - 1)), self.town(number)
         # It learns from paint of all kinds, also where attacks are limited.
@@ -101,7 +104,7 @@ class HardeningStages:
                 streets.append(street)
                 found.append(points)
                 told += [recordings.digest(), points]
-        title, path = f"Round {number}: learning", plan.round(number) / "learning.safetensors"
+        title = f"Round {number}: learning"
         with self.ledger.stage("learn"):
             tune(
                 network,

@@ -203,20 +203,18 @@ def _trained(
     device: str,
     on_stage: OnStage,
 ) -> None:
-    if path.exists():
-        return
-    plan = recipe.training_plan(number)
-    title = "Learning from the expert" if number == 0 else f"Round {number}, learning"
     checkpoint = path.with_suffix(".ckpt")
-    learnt = imitate(
-        start(),
-        Dataset.load(shards),
-        plan,
-        checkpoint=checkpoint,
-        device=device,
-        on_progress=lambda at: on_stage(title, at.step, at.steps, f"loss {at.loss:.4f}"),
-    )
-    save_controller(learnt, path)
+    if not path.exists():
+        title = "Learning from the expert" if number == 0 else f"Round {number}, learning"
+        learnt = imitate(
+            start(),
+            Dataset.load(shards),
+            recipe.training_plan(number),
+            checkpoint=checkpoint,
+            device=device,
+            on_progress=lambda at: on_stage(title, at.step, at.steps, f"loss {at.loss:.4f}"),
+        )
+        save_controller(learnt, path)
     checkpoint.unlink(missing_ok=True)
 
 
