@@ -13,18 +13,18 @@ interrupted study goes on there.
 from __future__ import annotations
 
 import argparse
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rich.progress import Progress, TaskID
 
+from roadproof.cli.progress import stages
 from roadproof.hardening import Hardened, harden, write_hardening
 from roadproof.hardening.budget import HARDENING_BUDGETS
 from roadproof.hardening.judgement import JudgedAttack
+from roadproof.io.files import write_text
 from roadproof.machine import keep_freed_memory
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from roadproof.simulators.loading import open_simulator
@@ -58,13 +58,7 @@ def main() -> None:
     if given.steps is not None:
         budget = replace(budget, tuning=replace(budget.tuning, steps=given.steps))
     keep_freed_memory()
-    with open_simulator("town") as town, Progress() as progress:
-        bars: dict[str, TaskID] = {}
-
-        def show(title: str, done: int, total: int, word: str) -> None:
-            task = bars.setdefault(title, progress.add_task(title, total=total))
-            progress.update(task, completed=done, total=total, description=f"{title}: {word}")
-
+    with open_simulator("town") as town, stages() as show:
         found = harden(
             town,
             given.controller,
@@ -80,7 +74,7 @@ def main() -> None:
             on_progress=show,
         )
     write_hardening(found, given.keep)
-    shutil.copyfile(given.keep / "hardening.json", given.json)
+    write_text(given.json, (given.keep / "hardening.json").read_text(encoding="utf-8"))
     print(table(found))
 
 
