@@ -47,3 +47,16 @@ def test_the_estimate_counts_the_drives_over_the_bare_road_that_are_asked_for(in
     asked = ("harden", "pilotnet", "--train-on", "left-07", "--judge-on", "straight-04", "--dry-run", "--json")
     usual, all_forty = (json.loads(invoke(*asked, *more)[1].out)["drives"] for more in ((), ("--clean-on", "all")))
     assert all_forty - usual == 2 * 4 * (40 - 2)
+
+
+def test_the_estimate_counts_all_drives_of_judging_and_what_is_done_at_once(invoke):
+    asked = ("harden", "pilotnet", "--train-on", "left-07", "--dry-run", "--json", "--judge-on")
+    streets = ("straight-04", "straight-04,left-03", "straight-04,left-03")
+    told = [
+        json.loads(invoke(*asked, names, "--processes", processes)[1].out)
+        for names, processes in zip(streets, (1, 1, 2), strict=True)
+    ]
+    # As studies/harden.py made them: 44 a street on average over before and after, and four over the bare road each.
+    assert told[1]["drives"] - told[0]["drives"] == 2 * (44 + 4)
+    assert told[2]["drives"] == told[1]["drives"]
+    assert told[2]["seconds"] < told[1]["seconds"]

@@ -75,7 +75,7 @@ def harden(
     check_streets(training, judging)
     load_trainable(controller)
     who = load_controller(controller, device=device)
-    begin(_workload(spent, who, rounds, len(training), len(judging), len(clean)), out)
+    begin(_workload(spent, who, rounds, len(training), len(judging), len(clean), processes), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,
@@ -105,17 +105,22 @@ def harden(
 
 
 def _workload(
-    budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int, clean: int
+    budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int, clean: int, processes: int
 ) -> Workload:
     """Attacks, tuning and judging, from numbers of streets; clean drives are made before and after."""
-    from roadproof.pipeline.workload import Workload, frame_seconds, of_drives, of_run, of_search
+    from roadproof.pipeline.workload import Workload, frame_seconds, of_drives, of_evaluation, of_run, of_search
 
-    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who))
-    whole = of_run(budget.attack, who, film=False).times((rounds + 1) * training) + learnt.times(rounds)
-    whole += of_drives(budget.town_drives * rounds)
+    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who)) + of_drives(budget.town_drives)
+    whole = of_run(budget.attack, who, film=False).times(training, at_once=processes).times(rounds + 1)
+    whole += learnt.times(rounds)
     if judging:
-        found = of_search(budget.unseen, budget.judge.objective, 0, who)
-        again = of_search(budget.judge.method, budget.judge.objective, budget.judge.window.frames, who)
-        whole += (of_run(budget.judge, who, film=False) + found + again).times(2 * judging)
+        judge = budget.judge
+        found = of_search(budget.unseen, judge.objective, 0, who)
+        again = of_search(judge.method, judge.objective, judge.window.frames, who)
+        driven = of_evaluation(len(judge.weathers), judge.starts, judge.runs, film=False)
+        before = of_run(judge, who, film=False) + found + again + driven.times(2)
+        # The one after also drives over what was found against the one before.
+        for each in (before, before + driven):
+            whole += each.times(judging, at_once=processes)
         whole += of_drives(2 * len(budget.clean_weathers) * clean)
     return whole
