@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import pytest
 
 import needs
-from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController, load_controller
+from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController, load_controller, save_controller
 from roadproof.errors import TrainingError
 from roadproof.training.recipe import Recipe, follow, gather
 
@@ -61,15 +61,20 @@ def test_a_folder_of_another_recipe_is_refused(tmp_path):
 
 
 def test_a_recipe_may_start_from_weights(tmp_path):
-    from roadproof.controllers import save_controller
-
     save_controller(CIL(width=0.05, seed=11), tmp_path / "start.safetensors")
     network = Recipe(start=str(tmp_path / "start.safetensors")).fresh()
     assert isinstance(network, CIL)
     assert network.width == 0.05
     assert not network.is_folded
-    assert isinstance(Recipe(start="pilotnet").fresh(), ConditionalPilotNet)
+    assert isinstance(Recipe(network="pilotnet", start="pilotnet").fresh(), ConditionalPilotNet)
     assert isinstance(Recipe(network="waypoint").fresh(), TrajectoryController)
+
+
+@pytest.mark.parametrize(("network", "start"), [("cil", "pilotnet"), ("waypoint", "temporal")])
+def test_weights_of_another_network_are_refused_before_anything_is_driven(tmp_path, network, start):
+    with pytest.raises(TrainingError, match=f"start {start} is a .*, network {network} a .*; give the network"):
+        follow(Recipe(network=network, start=start, drives=1, samples=128), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("changes", [{"network": "resnet"}, {"rounds": -1}, {"painted_drives": -2}, {"seed": -1}])

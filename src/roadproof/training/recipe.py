@@ -100,12 +100,24 @@ class Recipe:
             self.training_plan(number)
 
     def fresh(self) -> Learner:
-        """The network as a recipe begins with it, before it has learnt anything."""
-        if self.start is not None:
-            named = not self.start.endswith(".safetensors")
-            return load_network(shipped_weights(self.start) if named else Path(self.start))
+        """The network as a recipe begins with it, before it has learnt anything.
+
+        Raises:
+            TrainingError: the weights to go on from are of another network.
+            ControllerError: they are missing or damaged.
+        """
         width = {"width": self.width} if self.network == "cil" else {}
-        return FRESH[self.network](seed=self.seed, **width)
+        fresh = FRESH[self.network](seed=self.seed, **width)
+        if self.start is None:
+            return fresh
+        named = not self.start.endswith(".safetensors")
+        begun = load_network(shipped_weights(self.start) if named else Path(self.start))
+        if type(begun) is not type(fresh):
+            raise TrainingError(
+                f"start {self.start} is a {type(begun).__name__}, network {self.network} a {type(fresh).__name__}; "
+                "give the network that it goes on with"
+            )
+        return begun
 
     def expert_plans(self) -> dict[str, CollectionPlan]:
         """The plans of the expert's drives, by the name of their folder."""
