@@ -120,6 +120,8 @@ def test_a_batch_is_learnt_from_again_while_its_patterns_climb(street):
     tuned(street, tuning=Tuning(steps=10, repeats=4, batch=16, learning_rate=1e-9), step=step)
     first, last = losses[::4], losses[3::4]
     assert sum(last) > 1.1 * sum(first)
+    asked = [batch.frames.requires_grad for batch in seen]
+    assert asked == [True, True, True, False] * 10, "no gradient is taken for a step that is not made"
     pairs = list(zip(seen[::4], seen[3::4], strict=True))
     assert all(torch.equal(one.target, again.target) for one, again in pairs)
     changed = torch.cat([(one.frames != again.frames).flatten(1).any(1) for one, again in pairs])

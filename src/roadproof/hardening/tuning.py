@@ -155,7 +155,9 @@ def tune(
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
         shown = [pictures.of(source, count, draw) for source in (streets[number % len(streets)], *besides)]
         for again in range(tuning.repeats):
-            shown = [each._replace(unit=each.unit.detach().requires_grad_()) for each in shown]
+            # After the last time they climb no more.
+            climbs = again + 1 < tuning.repeats
+            shown = [each._replace(unit=each.unit.detach().requires_grad_(climbs)) for each in shown]
             painted = [each.painted(space.pattern(each.unit)) for each in shown]
             batch = TuningBatch(*(torch.cat(columns) for columns in zip(*painted, strict=True)))
             for group in optimiser.param_groups:
