@@ -1,4 +1,4 @@
-"""Does hardening help on streets that were not trained on?
+"""Does hardening help on held-out streets?
 
     python studies/harden.py --json OUT --keep FOLDER [--controller cil] [--budget full] [--steps 1500] [--rounds 2]
         [--processes N]

@@ -45,7 +45,7 @@ def harden(
     *,
     paint: Paint,
 ) -> None:
-    """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on streets not trained on."""
+    """Attack, fine-tune on what was found, attack afresh, in rounds; then judge on held-out streets."""
     from roadproof.cli.progress import stages
     from roadproof.controllers.loading import imported, load_controller, load_trainable
     from roadproof.hardening.budget import HARDENING_BUDGETS, check_streets

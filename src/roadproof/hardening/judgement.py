@@ -1,4 +1,4 @@
-"""Did it help? Both controllers are attacked afresh, by several kinds of search, on streets that were not trained on.
+"""Did it help? Both controllers are attacked afresh, by several kinds of search, on held-out streets.
 
     judged/SCENARIO/               the attack of the kind that training used, with fresh seeds (`pipeline.stress_test`)
     judged/SCENARIO/kind-1/ …      attacks of kinds that training did not use: a black box, another shape
@@ -121,7 +121,7 @@ class HardeningVerdict:
         paint_alone = self.clean_worse and c.high is not None and c.high < 0
         begin = "It helped against paint but not on the whole" if paint_alone else outcome[self.outcome]
         return (
-            f"{begin}: over the strongest attack on streets not trained on it deviates by "
+            f"{begin}: over the strongest attack on held-out streets it deviates by "
             f"{self.after_m:.2f} m instead of {self.before_m:.2f} m, {c.value:+.2f} m on average{between}; it leaves "
             f"its lane in {self.left_lane_after:.0%} of the drives instead of {self.left_lane_before:.0%}{worse}."
         )
