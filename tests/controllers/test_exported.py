@@ -131,6 +131,54 @@ def test_programs_that_cannot_serve_are_refused(program, tmp_path):
         load_controller(tmp_path / "net.pt2")
 
 
+class Other(nn.Module):
+    """A network that takes a picture as others have it, and would answer to ours too."""
+
+    def forward(self, frames, speed_mps):
+        return frames.float().mean(dim=(1, 2, 3)) * speed_mps.flatten()
+
+
+BYTES = torch.zeros(2, 3, 16, 16, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize(
+    ("frames", "speed", "told"),
+    [
+        (torch.zeros(2, 16, 16, 3), torch.zeros(2), r"frames as floating-point numbers of shape \(any, 16, 16, 3\)"),
+        (torch.zeros(2, 1, 16, 16), torch.zeros(2), r"frames as floating-point numbers of shape \(any, 1, 16, 16\)"),
+        (BYTES, torch.zeros(2), r"frames as whole numbers of shape \(any, 3, 16, 16\)"),
+        (torch.zeros(2, 3, 16, 16), torch.zeros(2, 1), r"speed_mps as floating-point numbers of shape \(any, 1\)"),
+    ],
+    ids=["channels-last", "grey", "bytes", "columns"],
+)
+def test_inputs_in_another_shape_or_type_than_they_are_given_are_refused(frames, speed, told, tmp_path):
+    export(Other(), (frames, speed), tmp_path / "net.pt2")
+    with pytest.raises(ControllerError, match=told):
+        load_controller(tmp_path / "net.pt2")
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "told"),
+    [
+        ("FLOAT", ["b", 16, 16, 3], r"floating-point numbers of shape \(any, 16, 16, 3\), expected .* \(b, 3, h, w\)"),
+        ("UINT8", ["b", 3, 16, 16], r"whole numbers of shape \(any, 3, 16, 16\), expected floating-point RGB"),
+    ],
+)
+def test_so_are_those_of_onnx(kind, shape, told, tmp_path):
+    onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
+    helper, path = onnx.helper, tmp_path / "net.onnx"
+    nodes = [
+        helper.make_node("Cast", ["frames"], ["x"], to=onnx.TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["x"], ["y"], axes=[1, 2, 3], keepdims=0),
+    ]
+    frames = helper.make_tensor_value_info("frames", getattr(onnx.TensorProto, kind), shape)
+    steer = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, ["b"])
+    graph = helper.make_graph(nodes, "graph", [frames], [steer])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), path)
+    with pytest.raises(ControllerError, match=told):
+        load_controller(path)
+
+
 DAMAGED = """
 import sys
 from roadproof.controllers import load_controller

@@ -15,7 +15,7 @@ import logging
 import os
 import warnings
 import zipfile
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,8 @@ def exported_controller(
 
     Raises:
         ControllerError: the file cannot be read, its inputs cannot be told apart, its batch is fixed, or it takes
-            several frames and the card does not say how far apart.
+            several frames and the card does not say how far apart; or an input has another shape or type than it is
+            given.
         DeviceError: the precision of a `.pt2` file is another.
     """
     network = TorchProgram(path, device) if path.suffix == ".pt2" else OnnxGraph(path)
@@ -60,6 +61,7 @@ def exported_controller(
         if own:
             raise DeviceError(f"{path} computes in {own.pop()}, not {dtype}; ask for that dtype or export it again")
     names, frames, preparation = _bound(network.inputs, card, path)
+    _check_inputs(network, names, path)
     cruise = CruiseControl(target_mps=card.target_speed_mps)
     if card.tracking is not None:
         single = TrajectoryController(
@@ -95,6 +97,7 @@ class TorchProgram(nn.Module):
 
         self.path = path
         self.inputs: InputShapes = {}
+        self.whole: set[str] = set()
         try:
             with _pickles_refused(), _quiet():
                 program = torch.export.load(path)
@@ -102,8 +105,11 @@ class TorchProgram(nn.Module):
                 wanted = program.graph_signature.user_inputs
                 for node in program.graph.nodes:
                     if node.op == "placeholder" and node.name in wanted:
-                        shape = cast("tuple[int | torch.SymInt, ...]", node.meta["val"].shape)
+                        like = node.meta["val"]
+                        shape = cast("tuple[int | torch.SymInt, ...]", like.shape)
                         self.inputs[node.name] = tuple(size if isinstance(size, int) else None for size in shape)
+                        if not like.is_floating_point():
+                            self.whole.add(node.name)
                 self.program = program.module()
         except Exception as error:  # whatever the archive's contents make the reader raise
             if _is_torchscript(path):
@@ -175,6 +181,23 @@ def _bound(
     if len(picture) == 5 and frames is None:
         raise ControllerError(f"{path} takes any number of frames at once; export it for one number of them")
     return tuple("frames" if name in pictures else name for name in names), frames, preparation
+
+
+def _check_inputs(network: TorchProgram | OnnxGraph, names: Sequence[str], path: Path) -> None:
+    """Refuse a network that takes its inputs in another shape or type than they come, which it might not tell."""
+    for (own, shape), name in zip(network.inputs.items(), names, strict=True):
+        if name == "frames":
+            fits = len(shape) in (4, 5) and shape[-3] in (3, None) and own not in network.whole
+            expected = "floating-point RGB or YUV of shape (b, 3, h, w), or (b, n, 3, h, w) where it takes several"
+        else:
+            fits, expected = len(shape) == 1, "shape (b,)"
+        if shape and not fits:
+            sizes = ", ".join("any" if size is None else str(size) for size in shape)
+            kind = "whole numbers" if own in network.whole else "floating-point numbers"
+            raise ControllerError(
+                f"{path} takes {own} as {kind} of shape ({sizes}), expected {expected}; export it with what it does to "
+                "them first"
+            )
 
 
 def _is_torchscript(path: Path) -> bool:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from roadproof.controllers.onnx_operators import OPERATORS, SEVERAL_OUTPUTS
+from roadproof.controllers.onnx_operators import DTYPES, OPERATORS, SEVERAL_OUTPUTS
 from roadproof.errors import ControllerError
 from roadproof.foreign import in_one_line
 
@@ -74,6 +74,9 @@ class OnnxGraph(nn.Module):
             if value.name not in self._buffer_of
         }
         """Shape of each input; None where it is not fixed."""
+        kinds = {value.name: DTYPES.get(value.type.tensor_type.elem_type) for value in graph.input}
+        self.whole = {name for name, kind in kinds.items() if kind is None or not kind.is_floating_point}
+        """Inputs that are whole numbers."""
         nodes: list[_Node] = []
         for node in graph.node:
             attributes = {a.name: helper.get_attribute_value(a) for a in node.attribute}

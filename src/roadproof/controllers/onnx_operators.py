@@ -23,7 +23,7 @@ Inputs = Sequence[Any]
 Operator = Callable[[Attributes, Inputs], Tensor | tuple[Tensor, ...]]
 
 # ONNX' codes of element types (TensorProto.DataType).
-_DTYPES = {
+DTYPES = {
     1: torch.float32, 2: torch.uint8, 3: torch.int8, 5: torch.int16, 6: torch.int32, 7: torch.int64,
     9: torch.bool, 10: torch.float16, 11: torch.float64, 16: torch.bfloat16,
 }  # fmt: skip
@@ -303,7 +303,7 @@ OPERATORS: dict[str, Operator] = {
     "BatchNormalization": lambda a, x: functional.batch_norm(
         x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5)
     ),
-    "Cast": lambda a, x: x[0].to(_DTYPES[a["to"]]),
+    "Cast": lambda a, x: x[0].to(DTYPES[a["to"]]),
     "Ceil": _elementwise(torch.ceil),
     "Celu": lambda a, x: functional.celu(x[0], a.get("alpha", 1.0)),
     "Clip": lambda _, x: torch.clamp(x[0], min=_get(x, 1), max=_get(x, 2)),
