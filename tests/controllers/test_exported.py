@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -129,6 +130,20 @@ def test_programs_that_cannot_serve_are_refused(program, tmp_path):
     (tmp_path / "net.json").write_text(wrong.to_json())
     with pytest.raises(ControllerError, match=r"says network_size \(66, 200\), the file \(16, 16\)"):
         load_controller(tmp_path / "net.pt2")
+
+
+def test_a_card_that_denies_what_the_inputs_name_says_is_refused(tmp_path):
+    class Yuv(FramesAlone):
+        def forward(self, frames_yuv):
+            return super().forward(frames_yuv)
+
+    export(Yuv(), inputs()[:1], tmp_path / "net.pt2")
+    for colour, fits in (("yuv", True), ("rgb", False)):
+        (tmp_path / "net.json").write_text(ControllerCard(preparation=FramePreparation(colour=colour)).to_json())
+        with (
+            nullcontext() if fits else pytest.raises(ControllerError, match="takes frames_yuv and its card says colour")
+        ):
+            assert load_controller(tmp_path / "net.pt2").preparation.colour == "yuv"
 
 
 class Other(nn.Module):

@@ -169,6 +169,11 @@ def _bound(
         )
     picture = shapes[list(shapes)[names.index(pictures[0])]]
     preparation = card.preparation or (_YUV_SIGNED if pictures[0] == "frames_yuv" else FramePreparation())
+    if pictures[0] == "frames_yuv" and preparation.colour != "yuv":
+        raise ControllerError(
+            f"{path} takes frames_yuv and its card says colour {preparation.colour!r}; say 'yuv' there, with the mean "
+            "and std that it learnt with, or name its input frames"
+        )
     size = picture[-2:] if len(picture) in (4, 5) else (None, None)
     if size[0] is not None and size[1] is not None:
         fixed = (size[0], size[1])
