@@ -58,6 +58,10 @@ def test_damaged_and_unfitting_weights_are_refused(cil, tmp_path):
     refused(state | {"extra": torch.zeros(1)}, "has an unexpected tensor extra")
     full = CIL().state_dict()
     refused(full | {"join.0.bias": torch.full((512,), np.nan)}, r"join\.0\.bias has NaN")
+    for kind in (torch.int8, torch.bool, torch.complex64):
+        refused(full | {"join.0.bias": torch.zeros(512, dtype=kind)}, rf"join\.0\.bias is of type {kind}, expected")
+    eighths = torch.full((512,), np.nan).to(torch.float8_e4m3fn)
+    refused(full | {"join.0.bias": eighths}, r"join\.0\.bias has NaN")
 
 
 def test_what_cannot_be_saved_is_said(cil, tmp_path):

@@ -153,7 +153,9 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
         if tensor.shape != expected[key].shape:
             shapes = f"{tuple(tensor.shape)}, expected {tuple(expected[key].shape)}"
             raise ControllerError(f"{path}: tensor {key} has shape {shapes} for this {name}")
-        if not tensor.isfinite().all():
+        if tensor.is_floating_point() != expected[key].is_floating_point():
+            raise ControllerError(f"{path}: tensor {key} is of type {tensor.dtype}, expected {expected[key].dtype}")
+        if not tensor.float().isfinite().all():  # of numbers of 8 bits torch does not tell
             raise ControllerError(f"{path}: tensor {key} has NaN or infinite values")
     network.load_state_dict(state)
 
