@@ -2,6 +2,7 @@
 
 import sys
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -16,7 +17,7 @@ from roadproof.controllers import (
     pilotnet_controller,
     save_controller,
 )
-from roadproof.controllers.loading import load_trainable
+from roadproof.controllers.loading import files_of, load_trainable
 from roadproof.errors import ControllerError, DeviceError
 
 
@@ -124,6 +125,37 @@ def test_a_factory_is_given_other_weights_and_learns_unmerged(tmp_path, monkeypa
         load_controller(f"small_driver:make@{tmp_path / 'few.safetensors'}")
     with pytest.raises(ControllerError, match=r"none\.safetensors does not exist"):
         load_controller("small_driver:make@none.safetensors")
+
+
+def test_the_files_of_a_controller_are_known_whatever_they_are_called(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("weights", "net.safetensors", "pilotnet", "made.py"):
+        (tmp_path / name).write_bytes(b"")
+    found = {
+        "cil:weights": ["weights"],
+        "cil:net.safetensors": ["net.safetensors"],
+        "made:make@weights": ["made.py", "weights"],
+        "pilotnet": [],
+    }
+    assert {spec: [path.name for path in files_of(spec)] for spec in found} == found
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"), [("weights", True), ("parts/0", True), ("../other.bin", False), (None, False)]
+)
+def test_external_data_of_an_onnx_file_are_its_files_where_they_lie_in_its_folder(tmp_path, name, counts):
+    onnx = pytest.importorskip("onnx", reason="the extra onnx is not installed")
+    path = tmp_path / "own" / "net.onnx"
+    data = path.parent / (name or tmp_path / "absolute.bin")
+    (path.parent / "parts").mkdir(parents=True)
+    data.write_bytes(b"numbers")
+    held = onnx.numpy_helper.from_array(np.zeros(3, np.float32), "w")
+    onnx.external_data_helper.set_external_data(held, name or str(data))
+    output = onnx.helper.make_tensor_value_info("w", onnx.TensorProto.FLOAT, [3])
+    path.write_bytes(
+        onnx.helper.make_model(onnx.helper.make_graph([], "graph", [], [output], [held])).SerializeToString()
+    )
+    assert files_of(str(path)) == ((path, data) if counts else (path,))
 
 
 def test_frozen_parameters_of_a_factory_stay_frozen_and_weights_files_learn_whole(tmp_path, monkeypatch, cil):

@@ -138,21 +138,22 @@ def files_of(spec: str) -> tuple[Path, ...]:
     """
     head, _, tail = spec.partition(":")
     factory, at, weights = tail.partition("@")
-    named = [Path(weights)] if at else []
-    if factory and all(part.isidentifier() for part in (*head.split("."), *factory.split("."))):
+    named: list[Path] = []
+    if head in ARCHITECTURES and tail:
+        named = [Path(tail)]
+    elif factory and all(part.isidentifier() for part in (*head.split("."), *factory.split("."))):
         with _current_directory_importable(), suppress(ImportError, ValueError):
             found = importlib.util.find_spec(head)
-            named = [*([Path(found.origin)] if found and found.origin else []), *named]
-    elif head not in ARCHITECTURES or tail:
-        named = [path := Path(tail if head in ARCHITECTURES else spec)]
-        if path.suffix and head not in ARCHITECTURES:
-            named.append(path.with_suffix(".json"))
+            named += [Path(found.origin)] if found and found.origin else []
+        named += [Path(weights)] if at else []
+    elif (path := Path(spec)).suffix:
+        named = [path, path.with_suffix(".json")]
         if path.suffix == ".onnx":
             from roadproof.controllers.onnx_graph import external_data_of
 
             with suppress(ControllerError):
                 named += external_data_of(path)
-    return tuple(path for path in named if path.suffix and path.is_file())
+    return tuple(path for path in named if path.is_file())
 
 
 PICKLES = (".pt", ".pth", ".ckpt", ".pkl", ".ts", ".torchscript", ".jit")

@@ -8,7 +8,7 @@ operators, each a line or a few.
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -138,7 +138,7 @@ def _with_spent_values(nodes: list[_Node], keep: str) -> tuple[_Node, ...]:
 
 
 def external_data_of(path: Path) -> tuple[Path, ...]:
-    """The files beside an ONNX file that hold its tensors, where it does not hold them itself.
+    """The files beside an ONNX file that hold its tensors, where it does not hold them itself; none leaves its folder.
 
     Raises:
         ControllerError: the extra is not installed, or the file is not ONNX.
@@ -146,7 +146,8 @@ def external_data_of(path: Path) -> tuple[Path, ...]:
     graph = _read(path, whole=False).graph
     tensors = [*graph.initializer, *(each.t for node in graph.node for each in node.attribute)]
     told = [entry for tensor in tensors for entry in tensor.external_data if entry.key == "location"]
-    return tuple(path.parent / name for name in sorted({entry.value for entry in told}))
+    names = [PurePath(name) for name in sorted({entry.value for entry in told})]
+    return tuple(path.parent / name for name in names if not name.is_absolute() and ".." not in name.parts)
 
 
 def _read(path: Path, *, whole: bool = True) -> Any:  # noqa: ANN401
