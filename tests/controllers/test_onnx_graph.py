@@ -24,6 +24,7 @@ KERNEL = RNG.normal(size=(6, 4, 3, 3)).astype(np.float32)
 BIAS = RNG.normal(size=6).astype(np.float32)
 CHANNEL = [RNG.uniform(0.5, 1.5, size=4).astype(np.float32) for _ in range(4)]
 TRUTH = MATRIX > 0
+STEPS, GATES = np.ones((3, 1, 2), np.float32), np.ones((1, 8, 2), np.float32)
 
 
 def ints(*values: int) -> np.ndarray:
@@ -207,6 +208,7 @@ def test_an_operator_is_that_of_the_reference(operator, inputs, attributes, tmp_
         ("AveragePool", [IMAGE], {**SAME, "dilations": [2, 2]}, "dilations"),
         ("AveragePool", [IMAGE], {**SAME, "pads": [1, 1, 1, 1], "ceil_mode": 1}, "ceil_mode with pads"),
         ("MaxPool", [IMAGE], {**SAME, "pads": [1, 1, 1, 1], "ceil_mode": 1}, "ceil_mode with pads"),
+        ("LSTM", [STEPS, GATES, GATES], {"hidden_size": 2, "input_forget": 1}, "input_forget"),
         ("Pad", [IMAGE, ints(0, 1, 0, 0, 0, 0, 0, 0)], {"mode": "edge"}, "replicate along the first two axes"),
         ("Resize", [IMAGE, None, FACTORS], {"mode": "cubic", "cubic_coeff_a": -0.5}, "cubic_coeff_a other than"),
         (

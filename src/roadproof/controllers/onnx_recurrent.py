@@ -38,8 +38,8 @@ def gru(a: dict[str, Any], x: Sequence[Any]) -> tuple[Tensor, ...]:
 
 def lstm(a: dict[str, Any], x: Sequence[Any]) -> tuple[Tensor, ...]:
     """All states (T, D, B, H), the last state and the last cell (D, B, H) of an LSTM, whose gates are i, o, f, c."""
-    if len(x) > 7 and x[7] is not None:
-        raise ValueError("peepholes")
+    if a.get("input_forget") or (len(x) > 7 and x[7] is not None):
+        raise ValueError("input_forget or peepholes")
 
     def step(fed: Tensor, state: State, weights: Tensor, bias: Tensor) -> State:
         h, cell = state
