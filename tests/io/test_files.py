@@ -8,12 +8,24 @@ import torch
 
 import roadproof
 from roadproof.coverage import Shape
+from roadproof.drives.own.plan import OwnDrive
+from roadproof.drives.own.table import read_table
 from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
-from roadproof.io.files import as_path, check_closed, inside, is_plain_name, write_atomically, write_folder_atomically
+from roadproof.io.commands import read_commands
+from roadproof.io.files import (
+    as_path,
+    bytes_of,
+    check_closed,
+    inside,
+    is_plain_name,
+    write_atomically,
+    write_folder_atomically,
+)
 from roadproof.io.locks import working_in
 from roadproof.io.tables import first_twice
 from roadproof.io.text import read_json, read_toml
 from roadproof.patterns import Pattern
+from roadproof.roads.opendrive import read_opendrive
 from roadproof.scenarios import builtin_scenarios, load_scenarios, save_scenarios
 from scenes import recording_set
 
@@ -131,12 +143,17 @@ def test_what_is_written_to_a_folder_that_is_worked_in_stays_there(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
-    for name in ("x.json", "x.toml"):
-        os.mkfifo(tmp_path / name)
-    with pytest.raises(RoadproofError, match="it is a pipe or a device, expected a file"):
-        read_json(tmp_path / "x.json", "x", 1, RoadproofError)
-    with pytest.raises(RoadproofError, match="it is a pipe or a device, expected a file"):
-        read_toml(tmp_path / "x.toml", RoadproofError)
+    os.mkfifo(path := tmp_path / "commands.txt")
+    for read in (
+        lambda: read_json(path, "x", 1, RoadproofError),
+        lambda: read_toml(path, RoadproofError),
+        lambda: bytes_of(path),
+        lambda: read_commands(tmp_path),
+        lambda: read_table(tmp_path, OwnDrive(name="clean", table=path.name)),
+        lambda: read_opendrive(path),
+    ):
+        with pytest.raises(RoadproofError, match=r"commands\.txt.*it is a pipe or a device, expected a file"):
+            read()
 
 
 @pytest.mark.parametrize("text", [".".join("a" * 5000) + " = 1", f"[{'.'.join('a' * 5000)}]"])

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from roadproof.errors import RoadproofError
-from roadproof.io.files import write_text
+from roadproof.io.files import bytes_of, write_text
 
 FILE = "commands.txt"
 
@@ -31,8 +31,7 @@ def read_commands(folder: Path) -> tuple[str, ...]:
     """
     path = folder / FILE
     try:
-        return tuple(line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip())
-    except FileNotFoundError:
-        return ()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = (bytes_of(path) or b"").decode("utf-8").splitlines()
+    except UnicodeDecodeError as error:
         raise RoadproofError(f"{path} cannot be read ({error}); remove it") from None
+    return tuple(line.strip() for line in lines if line.strip())

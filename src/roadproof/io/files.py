@@ -138,6 +138,21 @@ def open_file(path: Path) -> BinaryIO:
     return path.open("rb")
 
 
+def bytes_of(path: Path) -> bytes | None:
+    """What a file holds that need not be there; None where it is not.
+
+    Raises:
+        RoadproofError: the file cannot be read.
+    """
+    try:
+        with open_file(path) as file:
+            return file.read()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise RoadproofError(f"{path} cannot be read ({error.strerror or error}); remove it") from None
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then move it into place.
 

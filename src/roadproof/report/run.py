@@ -24,7 +24,7 @@ from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.trial import Trial
 from roadproof.errors import RoadproofError
 from roadproof.io.commands import read_commands
-from roadproof.io.files import check_closed
+from roadproof.io.files import bytes_of, check_closed
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
@@ -214,8 +214,8 @@ def _judged(folder: Path) -> ShownEvaluation:
         painted=pairs[0][2],
         by_weather=pairs,
         fidelity=Fidelity.load(fidelity) if fidelity.exists() else None,
-        film=_bytes(folder / FILM),
-        poster=_bytes(folder / POSTER),
+        film=bytes_of(folder / FILM),
+        poster=bytes_of(folder / POSTER),
         strip=Strip.load(path) if (path := folder / STRIP).exists() else None,
     )
 
@@ -223,7 +223,3 @@ def _judged(folder: Path) -> ShownEvaluation:
 def _driven(folder: Path, trial: Trial) -> tuple[Weather, Episode, Episode]:
     clean, painted = load_episodes(folder, (trial.clean, trial.painted))
     return trial.weather, clean, painted
-
-
-def _bytes(path: Path) -> bytes | None:
-    return path.read_bytes() if path.exists() else None

@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 
 from roadproof.errors import ScenarioError
+from roadproof.io.files import open_file
 from roadproof.roads.records import (
     Clothoid,
     Connection,
@@ -46,14 +47,15 @@ def read_opendrive(path: Path) -> OpenDrive:
             message names the road and the element.
     """
     try:
-        text = path.read_bytes()
+        with open_file(path) as file:
+            text = file.read()
         if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
             raise ScenarioError(f"map {path} declares XML entities, expected plain OpenDRIVE")
         if b"\0" in text:
             raise ScenarioError(f"map {path} has two or more bytes a letter, expected UTF-8; save it so")
         root = ET.fromstring(text)  # noqa: S314  entities are refused above
     except OSError as error:
-        raise ScenarioError(f"map {path} cannot be read ({error.strerror}); check the path") from error
+        raise ScenarioError(f"map {path} cannot be read ({error.strerror or error}); check the path") from error
     except (ET.ParseError, LookupError, ValueError) as error:  # the last two for encodings that are not known here
         raise ScenarioError(f"map {path} is not well-formed XML ({error})") from error
     if root.tag != "OpenDRIVE":

@@ -14,6 +14,7 @@ command                   CARLA's codes                                         
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from jaxtyping import Float, Int
 
 from roadproof.drives.own.plan import PLAN, OwnDrive
 from roadproof.errors import RecordingError
-from roadproof.io.files import inside
+from roadproof.io.files import inside, open_file
 from roadproof.io.tables import first_twice
 
 POSE = ("x_m", "y_m", "yaw_rad")
@@ -85,8 +86,8 @@ def read_table(folder: Path, drive: OwnDrive) -> Table:
                 f"{path} has more than {_MOST_BYTES >> 20} MiB, expected a row a step; leave others out"
             )
         # Spreadsheets begin a file with a byte order mark.
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file)
+        with open_file(path) as file:
+            reader = csv.DictReader(io.TextIOWrapper(file, encoding="utf-8-sig", newline=""))
             rows = list(reader)
             names = list(reader.fieldnames or ())
     except OSError as reason:
