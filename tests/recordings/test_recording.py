@@ -129,6 +129,9 @@ def test_pixel_maps_of_other_frames_are_refused(tmp_path, shape):
         RecordingError, match=r"drive clean: its pixel maps .* expected that of its frames, \(2, 88, 200"
     ):
         load_recordings(tmp_path / "set")
+    np.savez(tmp_path / "set" / "clean" / "shading.npz", **maps | {"visible": 255 * maps["visible"]})
+    with pytest.raises(RecordingError, match=r"shading\.npz: visible of the pixel maps goes from 255 to 255, expected"):
+        load_recordings(tmp_path / "set")
 
 
 def test_a_thinned_drive_ends_with_the_same_frame_and_keeps_what_belongs_to_each():

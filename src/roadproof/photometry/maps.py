@@ -46,6 +46,9 @@ class PixelMaps:
         for name in ("gain", "offset", "visible"):
             if not bool(getattr(self, name).isfinite().all()):
                 raise ColourError(f"{name} of the pixel maps has NaN or infinite values")
+        if bool(((self.visible < 0) | (self.visible > 1)).any()):
+            low, high = float(self.visible.min()), float(self.visible.max())
+            raise ColourError(f"visible of the pixel maps goes from {low:g} to {high:g}, expected shares in [0, 1]")
 
     def at(self, frames: list[int] | slice) -> PixelMaps:
         """The maps of some frames, by their indices."""
