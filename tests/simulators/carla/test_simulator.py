@@ -154,6 +154,8 @@ def test_nobody_at_the_port_is_told_in_time():
     with pytest.raises(SimulatorError, match=f"127.0.0.1:{port} did not answer for its version in time; check that"):
         CarlaSimulator(port=port, patience_s=1.0).__enter__()
     assert time.monotonic() - begin < 10.0
+    with pytest.raises(SimulatorError, match=r"at none\.invalid:2000 refused a connection: resolve: Host not found"):
+        CarlaSimulator("none.invalid").__enter__()
 
 
 def test_a_frozen_and_then_a_dead_server_end_a_drive_in_time(street):

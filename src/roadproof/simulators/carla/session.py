@@ -56,7 +56,7 @@ class Session:
         self._texture: tuple[carla.TextureColor, UInt8[np.ndarray, "h w 3"]] | None = None
         self._actors: list[carla.Actor] = []
         self._maps: dict[str, RoadMap] = {}
-        self.client = carla.Client(host, port, worker_threads=1)
+        self.client = self.ask("a connection", lambda: carla.Client(host, port, worker_threads=1))
         self.client.set_timeout(patience_s)
         self._check_version()
         self.world = self.ask("its world", self.client.get_world)
