@@ -84,6 +84,16 @@ def test_corners_of_the_canvas_give_poses_and_its_size(tmp_path):
     assert RecordedWorld(recordings).course.count > 60
 
 
+@pytest.mark.parametrize(
+    ("columns", "plan"),
+    [(CORNER_NAMES, PLAN), ((*CORNER_NAMES, "x_m", "y_m", "yaw_rad"), PLAN[: PLAN.index("[canvas]")])],
+)
+def test_what_says_twice_where_the_canvas_or_the_car_is_is_refused(tmp_path, columns, plan):
+    folder = write_own(tmp_path / "own", ["clean"], columns, plan)
+    with pytest.raises(RecordingError, match=r"corners in the tables say .* leave out \[canvas\]"):
+        import_drives(folder)
+
+
 def test_a_speed_in_another_unit_than_the_poses_is_refused(tmp_path):
     folder = write_own(tmp_path / "own", ["clean"])
     table = folder / "clean.csv"

@@ -22,7 +22,7 @@ from roadproof.drives.own.motion import motion_of
 from roadproof.drives.own.pictures import camera_picture
 from roadproof.drives.own.place import canvas_on, check_passes, fitted_camera, track_of
 from roadproof.drives.own.plan import PLAN, OwnColour, OwnDrives, read_plan
-from roadproof.drives.own.table import CORNERS, Table, read_table
+from roadproof.drives.own.table import CORNERS, POSE, Table, read_table
 from roadproof.drives.record import in_view
 from roadproof.drives.trajectories import Window
 from roadproof.errors import GeometryError, RecordingError
@@ -61,6 +61,12 @@ def import_drives(folder: AnyPath) -> RecordingSet:
     folder = as_path(folder)
     own = read_plan(folder)
     tables = [read_table(folder, drive) for drive in own.drive]
+    columns = {name for table in tables for name in table.numbers}
+    if columns & {*CORNERS} and (own.canvas is not None or columns & {*POSE, "yaw_rate_rad_s"}):
+        raise RecordingError(
+            f"the canvas' corners in the tables say where it is and where the car was: leave out [canvas] of {PLAN}, "
+            "poses and yaw rates, or the corners"
+        )
     given: dict[str, Any] = {
         "view": own.input,
         "colour": _colour(own.colour),
