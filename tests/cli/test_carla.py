@@ -114,6 +114,12 @@ def test_the_doctor_answers_programs_too(invoke, impatient):
     assert (told["passed"], [check["name"] for check in told["checks"]]) == (False, ["connection"])
 
 
+def test_a_list_that_is_damaged_is_refused_before_a_server_is_asked(call, tmp_path):
+    (tmp_path / "own.toml").write_text("[[scenario]")
+    said = call("carla", "scenario", "0", "3", "--out", "own.toml", "--port", str(free_port()), code=2)
+    assert "own.toml is not valid TOML" in said
+
+
 @pytest.mark.parametrize("verb", ["drive", "demo"])
 def test_an_unknown_way_to_paint_is_refused(call, verb):
     said = call(verb, "--simulator", "carla://127.0.0.1:2000?paint=spray", code=2)

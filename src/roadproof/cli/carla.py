@@ -96,6 +96,7 @@ def scenario(
     for place in (start, goal):
         if place < 0:
             raise ScenarioError(f"spawn point {place} has a number below 0, expected one that the server has")
+    listed = load_scenarios(out) if out.exists() else ()
     with CarlaSimulator(host, port) as simulator:
         where = map_name or simulator.session.map_name()
         roads = simulator.road_map(where)
@@ -106,6 +107,5 @@ def scenario(
     made = scenario_between(
         roads, where, places[start], places[goal], canvas_at_m=canvas_at_m, name=name or f"{where}-{start}-{goal}"
     )
-    listed = list(load_scenarios(out)) if out.exists() else []
     save_scenarios([*(known for known in listed if known.name != made.name), made], out)
     typer.echo(f"{made.name}, {made.kind}, in {out}")
