@@ -201,7 +201,11 @@ def test_black_and_white_are_seen_as_stated(tmp_path):
         (PLAN.replace("dt_s = 0.05", "dt_s = -1"), "dt_s is -1"),
         (PLAN.replace("fov_deg = 100.0", "fov_deg = 400.0"), "fov_deg is 400"),
         (PLAN.replace("up_m = 1.4", "up_m = 0.0"), "camera has up_m 0"),
-        (PLAN.replace("width_px = 800", "width_px = 640"), "has 800×600 pixels, expected 640×600"),
+        (PLAN.replace("width_px = 800", "width_px = 810"), "has 800×600 pixels, expected 810×600"),
+        (
+            PLAN.replace("width_px = 800", "width_px = 640"),
+            "up to column 800 and row 510 of camera pictures of 640×600",
+        ),
         (PLAN.replace("x_m = 130.0", "x_m = 900.0"), "never sees 8 pixels of the canvas at x_m 900.0"),
         (PLAN.replace("x_m = 130.0\n", ""), "neither ahead_m nor"),
         (PLAN + "ahead_m = 3\n", "both ahead_m and a place"),

@@ -273,6 +273,10 @@ DAMAGE = {
         "no camera's; scale it",
     ),
     "another canvas": (lambda s: edit_manifest(s, lambda m: m.update(canvas_px=800)), "canvas_px is 800, expected 400"),
+    "a crop of more than there is": (
+        lambda s: edit_manifest(s, lambda m: m["crop_resize"].update(right_px=5000)),
+        "up to column 5000 and row 510 of camera pictures of 800×600 pixels",
+    ),
     "other size": (lambda s: edit_manifest(s, lambda m: m["crop_resize"].update(width_px=100)), "expected 100×88"),
 }
 

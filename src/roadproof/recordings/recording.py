@@ -148,7 +148,8 @@ class RecordingSet:
         obstacles: what a car could run into near the canvas, in the world of the tracks; None if it is not known.
 
     Raises:
-        RecordingError: there is no drive, two have one name, or frames have another size than the controller's input.
+        RecordingError: there is no drive, two have one name, the controller's input is cut from beyond the camera
+            picture, or frames have another size than it.
     """
 
     camera: CameraModel
@@ -166,6 +167,11 @@ class RecordingSet:
         names = [recording.name for recording in self.recordings]
         if len(set(names)) != len(names):
             raise RecordingError(f"two drives have the same name among {', '.join(names)}")
+        if self.view.right_px > self.camera.width_px or self.view.bottom_px > self.camera.height_px:
+            raise RecordingError(
+                f"frames are cut up to column {self.view.right_px} and row {self.view.bottom_px} of camera pictures of "
+                f"{self.camera.width_px}×{self.camera.height_px} pixels; expected a box inside them"
+            )
         for recording in self.recordings:
             height, width = recording.frames.shape[1:3]
             if (height, width) != (self.view.height_px, self.view.width_px):

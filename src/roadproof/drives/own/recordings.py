@@ -184,20 +184,12 @@ def _with_pictures(folder: Path, own: OwnDrives, table: Table, drive: Recording)
     """The frames of a drive that are kept; its track stays whole."""
     kept = evenly(len(drive.frames), WINDOW.frames)
     rows = {name: getattr(drive, name)[kept] for name in PER_FRAME}
-    frames = np.stack([_frame(folder, own, table.pictures[int(step)]) for step in rows["frame_number"]])
+    frames = np.stack([own.input(_picture(folder, own, table.pictures[int(step)])) for step in rows["frame_number"]])
     return replace(drive, frames=frames, **rows)
 
 
 def _picture(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
     return camera_picture(folder, own.camera, name, "check the column picture")
-
-
-def _frame(folder: Path, own: OwnDrives, name: str) -> UInt8[np.ndarray, "h w 3"]:
-    picture = _picture(folder, own, name)
-    try:
-        return own.input(picture)
-    except GeometryError as error:
-        raise RecordingError(f"{folder / PLAN}, input: {error}") from None
 
 
 def _colour(colour: OwnColour) -> ColourTransform:
