@@ -136,6 +136,10 @@ def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():
         fitted_camera(CIL_CAMERA, ground[:2])
     with pytest.raises(RecordingError, match=r"missed by up to \d+\.\d px"):
         fitted_camera(CIL_CAMERA, [*ground[:3], replace(ground[3], y_px=ground[3].y_px + 200)])
+    middle = replace(ground[0], x_px=(ground[0].x_px + ground[1].x_px) / 2, left_m=0.0)
+    for few in ([ground[0]] * 3, [*ground[:2], middle]):
+        with pytest.raises(RecordingError, match="known points of the ground leave up_m of the camera open: a pixel"):
+            fitted_camera(true, few)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=str)

@@ -21,6 +21,7 @@ from roadproof.recordings import Track
 
 _ORIGIN = VehicleState(0.0, 0.0, 0.0, 0.0, 0.0)
 _MOST_MISSED_PX = 5.0
+_MOST_OPEN = 0.2  # of the camera's height
 _LEAST_WAY_M = 0.5
 
 
@@ -143,7 +144,8 @@ def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint], *, fov_kno
         fov_known: whether the field of view stays as it is.
 
     Raises:
-        RecordingError: there are one or two points, or the fit misses them by more than 5 px.
+        RecordingError: there are one or two points, the fit misses them by more than 5 px, or they leave open what is
+            fitted.
     """
     if not ground:
         return camera
@@ -175,4 +177,12 @@ def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint], *, fov_kno
             f"known points of the ground are missed by up to {off_px:.1f} px, expected at most {_MOST_MISSED_PX:g}; "
             "check them, and the camera's forward_m and left_m"
         )
+    _, spread, turned = np.linalg.svd(found.jac, full_matrices=False)
+    per_px = np.linalg.norm(turned.T / np.maximum(spread, 1e-9), axis=1)
+    for name, change, most in zip(names, per_px.tolist(), (_MOST_OPEN * found.x[0], 1.0, 5.0), strict=False):
+        if change > most:
+            raise RecordingError(
+                f"known points of the ground leave {name} of the camera open: a pixel's error in them changes it by "
+                f"{change:.2g}, expected at most {most:.2g}; give points near and far, and to both sides"
+            )
     return placed_as(found.x)
