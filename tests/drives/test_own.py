@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import csv
+import re
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from recorded_drives import CANVAS, track
 from roadproof.attacks import GradOpt, PathDeviation, attack
 from roadproof.drives.own import import_drives, preview
 from roadproof.drives.own.place import fitted_camera
-from roadproof.drives.own.plan import GroundPoint
+from roadproof.drives.own.plan import GroundPoint, read_plan
 from roadproof.drives.record import in_view
 from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, homography_from_pose
@@ -140,6 +142,18 @@ def test_known_points_of_the_ground_give_height_pitch_and_field_of_view():
     for few in ([ground[0]] * 3, [*ground[:2], middle]):
         with pytest.raises(RecordingError, match="known points of the ground leave up_m of the camera open: a pixel"):
             fitted_camera(true, few)
+
+
+def test_the_known_points_that_the_docs_show_fit_the_camera_that_they_show(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    plan, ground = (
+        next(block for block in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if word in block)
+        for word in ("[camera] ", "ground = ")
+    )
+    (tmp_path / "drives.toml").write_text(f"{ground}\n{plan}")
+    own = read_plan(tmp_path)
+    found = fitted_camera(own.camera, own.ground)
+    assert (found.up_m, found.pitch_deg, found.fov_deg) == pytest.approx((1.3, -4.0, 62.0), abs=1.0)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=str)
