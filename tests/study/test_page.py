@@ -327,6 +327,20 @@ def test_a_history_is_of_driving_alone(finished, tmp_path, content, expected):
     assert (None if course is None else (course.calls, course.seconds, course.best)) == expected
 
 
+def test_a_search_that_no_drive_chose_from_is_a_hollow_point(finished):
+    folder, rows, _ = finished
+    results, jobs = results_of(rows), read_jobs(folder, rows)
+    bo = {job for job in jobs if job.method == "BO"}
+    picture = charts.progress(results, [jobs[job] for job in jobs if job not in bo])
+    assert picture is not None
+    points = {line.get_markerfacecolor(): line for line in picture.figure.axes[0].lines if line.get_marker() == "s"}
+    assert set(points) == {"white"}
+    drives = results.drives_of(results.overall[0], ["BO"], results.figures[0]).groupby(["scenario", "seed"])
+    (point,) = points.values()
+    assert point.get_xdata() == pytest.approx(drives["search_calls"].mean().median())
+    assert point.get_ydata() == pytest.approx(drives["deviation_m"].mean().median())
+
+
 def test_transfer_has_its_matrix_in_the_page(finished, tmp_path):
     _, rows, _ = finished
     driven = rows[rows["error"].isna()].assign(found_on="cil")

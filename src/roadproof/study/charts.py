@@ -18,7 +18,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from roadproof.report.formatting import in_words
 from roadproof.study.history import Progress
 from roadproof.study.kept_jobs import KeptJob
-from roadproof.study.results import Block, Results
+from roadproof.study.results import DEVIATION, Block, Results
 from roadproof.study.statistics import mean_over_scenarios
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b07a00", "#56b4e9", "#000000", "#882255", "#7a7f85")
@@ -113,10 +113,15 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
     for column, figures in enumerate(shown):
         for row, (field, name) in enumerate((("calls", "simulator calls"), ("seconds", "seconds of search"))):
             axes: Axes = grid[row, column]
-            for method, own in courses[figures].items():
+            for method in results.compared:
+                chosen = courses[figures].get(method)
+                own = chosen or _judged(results, method, figures)
+                if not own:
+                    continue
                 at = [np.asarray(getattr(course, field), np.float64) for course in own]
                 best = [np.asarray(course.best, np.float64) for course in own]
-                _draw_course(axes, at, best, plain(method), style(results, method))
+                hollow = {} if chosen else {"markerfacecolor": "white"}
+                _draw_course(axes, at, best, plain(method), {**style(results, method), **hollow})
             axes.set_xscale("log")
             # 1, 2, 5, 10 … in words, however few decades there are.
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -132,9 +137,18 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
         "progress",
         "What the best pattern so far does when driven, against simulator calls and seconds: median over scenarios and "
         "seeds, and their range. Black-box searches choose the best by their own measure, so a line may fall; a search "
-        "on composited frames is a point, where its answer was driven.",
+        "on composited frames is a point, where its answer was driven; a hollow point, where no drive chose the "
+        "pattern, is the mean of those that judge it.",
         figure,
     )
+
+
+def _judged(results: Results, method: str, figures: str) -> list[Progress]:
+    """What each pattern of a method did in the drives that judge it, at the whole cost of its search."""
+    drives = results.drives_of(results.overall[0], [method], figures).groupby(["scenario", "seed"], sort=False)
+    means = drives[["search_calls", "search_seconds", DEVIATION.column]].mean()
+    rows = means.itertuples(index=False)
+    return [Progress(calls=(int(calls),), seconds=(took_s,), best=(far_m,)) for calls, took_s, far_m in rows]
 
 
 def _draw_course(
