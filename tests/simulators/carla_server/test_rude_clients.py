@@ -571,6 +571,32 @@ def test_a_signal_ends_it_in_one_line_with_clients_there(street, number):
                 exactly(world, 1)
 
 
+INTERRUPTED_WHERE_NOTHING_CAN_BE_RAISED = """
+import signal, sys
+from pathlib import Path
+from roadproof.simulators.carla_server.server import serve
+
+class Last:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def interrupt(number, frame):  # another than Python's own, as the command has
+    raise KeyboardInterrupt
+
+signal.signal(signal.SIGINT, interrupt)
+path = Path(sys.argv[1])
+serve(port=0, maps=[path], first=path.stem, ready=lambda _: Last() and None)
+print("ended")
+"""
+
+
+@LINUX
+def test_a_signal_is_never_lost(street):
+    command = [sys.executable, "-c", INTERRUPTED_WHERE_NOTHING_CAN_BE_RAISED, street]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "ended\n", "")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_the_town_is_built_ends_it_too(number):
     command = [sys.executable, "-c", PROGRAM, "carla", "serve", "--port", "0"]

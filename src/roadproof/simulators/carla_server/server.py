@@ -171,8 +171,11 @@ def serve(
 async def _run(server: Server, ready: Callable[[], object]) -> None:
     task = asyncio.current_task()
     assert task is not None
+    # Of the loop's own, which asks between two callbacks: an interrupt in the middle of one may be lost.
     with contextlib.suppress(NotImplementedError, RuntimeError):  # not on Windows, nor in another than the main thread
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     await server.run(ready)
 
 
