@@ -210,6 +210,7 @@ def test_mistakes_are_refused_before_anything_is_driven(town, tmp_path):
     for options, message in (
         ({"judge_on": [nowhere]}, "scenario far: "),
         ({"clean_on": [nowhere]}, "scenario far: "),
+        ({"clean_on": [street(tmp_path, "far", 115.0)], "judge_on": []}, "give judge_on too, or leave it out"),
         ({"space": SearchSpace(figures=1, limits=PaintLimits(keep_out_m=9.0))}, "leaves no place for paint"),
         ({"training_step": lambda model, batch: batch.target.mean()}, "expected one number with a gradient"),
         ({"judge_on": [street(tmp_path, "next", 40.0)]}, "lie 25 m apart, on one street; expected at least 40 m"),

@@ -66,7 +66,7 @@ def harden(
     training, judging = named(train_on), named(judge_on)
     if clean_on and not judging:
         raise RoadproofError("--clean-on is driven where the result is judged; give --judge-on too, or leave it out")
-    clean = list(known) if clean_on == "all" else named(clean_on) or [*training, *judging]
+    clean = list(known) if clean_on == "all" else named(clean_on)
     step = (
         usual_step
         if training_step is None
@@ -75,7 +75,9 @@ def harden(
     check_streets(training, judging)
     load_trainable(controller)
     who = load_controller(controller, device=device)
-    begin(_workload(spent, who, rounds, len(training), len(judging), len(clean), processes), out)
+    begin(
+        _workload(spent, who, rounds, len(training), len(judging), len(clean or (*training, *judging)), processes), out
+    )
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,

@@ -87,7 +87,7 @@ def harden(
 
     Raises:
         TrainingError: there are no rounds, the seed is out of range, streets for training and judging are not disjoint,
-            or the training step gives no finite loss.
+            there are some for clean driving and none for judging, or the training step gives no finite loss.
         ControllerError: the controller cannot learn, raises or answers wrongly.
         RoadproofError: the folder holds another hardening, or a stage refuses; the message says why.
     """
@@ -95,6 +95,8 @@ def harden(
     check_streets(scenarios, judge_on)
     if rounds < 1:
         raise TrainingError(f"rounds is {rounds}, expected 1 or more")
+    if clean_on and not judge_on:
+        raise TrainingError("clean_on is driven where the result is judged; give judge_on too, or leave it out")
     check_range(seed, "seed", 0, MAX_SEED, TrainingError)
     budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
     if judge_on:
