@@ -98,8 +98,7 @@ class Cell:
                 yield from self._cheapest(recordings, plain.attack)
                 continue
             found = plain.attack if name == NO_LIMIT else self._searched(recordings, name)
-            place = self.folder / _folder(name)
-            yield self._driven(recordings, name, found.pattern, place, predicted_m=found.predicted_m)
+            yield self._driven(recordings, name, found.pattern, predicted_m=found.predicted_m)
 
     def _searched(self, recordings: RecordingSet, name: str) -> AttackResult:
         variation = Variation() if name.endswith(ROBUST) else None
@@ -127,15 +126,15 @@ class Cell:
             searched.save(place)
             less = searched
         levels = [asdict(level) for level in less.levels]
-        yield self._driven(recordings, CHEAPEST, less.pattern, place, predicted_m=less.predicted_m, levels=levels)
+        yield self._driven(recordings, CHEAPEST, less.pattern, predicted_m=less.predicted_m, levels=levels)
 
-    def _driven(self, recordings: RecordingSet, name: str, pattern: Pattern, place: Path, **more: object) -> Row:
+    def _driven(self, recordings: RecordingSet, name: str, pattern: Pattern, **more: object) -> Row:
         judged = evaluate(
             self.town,
             self.controller,
             self.scenario,
             pattern,
-            folder=place / "evaluation",
+            folder=self.folder / "judged",  # of all limits, so that the bare road is driven once
             driver_name=self.spec,
             weathers=BUDGET.weathers,
             starts=STARTS,
