@@ -39,7 +39,7 @@ from roadproof.limits import MAX_SEED
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stages import OnProgress, check_paint
 from roadproof.processes import require_opened
-from roadproof.roads.marks import require_route
+from roadproof.roads.maps import require_route
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +20,20 @@ from roadproof.scenarios import Scenario
 
 BUILTIN_MAPS = ("town", "second")
 CANVAS_NEAR_ROUTE_M = 4.0
+
+
+@runtime_checkable
+class Mapped(Protocol):
+    """What can show the map of a scenario, such as a simulator."""
+
+    def road_map(self, name: str) -> RoadMap:
+        """The map that a scenario names.
+
+        Raises:
+            SimulatorError: the simulator does not answer.
+            ScenarioError: the simulator has no such map.
+        """
+        ...
 
 
 def load_map(name: str) -> RoadMap:
@@ -67,6 +82,17 @@ def scenario_route(scenario: Scenario, road_map: RoadMap) -> Route:
             f"the way from start to goal, expected its middle within {CANVAS_NEAR_ROUTE_M:.0f} m of the route; move it"
         )
     return route
+
+
+def require_route(simulator: object, scenario: Scenario) -> None:
+    """Refuse a scenario that does not fit the simulator's map, before anything is driven; without a map none is.
+
+    Raises:
+        SimulatorError: the simulator does not answer.
+        ScenarioError: it has no such map, or start, goal and canvas do not fit it.
+    """
+    if isinstance(simulator, Mapped):
+        scenario_route(scenario, simulator.road_map(scenario.map_name))
 
 
 def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 import numpy as np
 from jaxtyping import Float
 
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
 from roadproof.paint.site import WHITE_MARK, YELLOW_MARK, LaneMark, Site
-from roadproof.roads.maps import scenario_route
+from roadproof.roads.maps import Mapped
 from roadproof.roads.roadmap import RoadMap
 from roadproof.scenarios import Scenario
 
@@ -70,20 +68,6 @@ def _simpler(points: Float[np.ndarray, "n 2"], tolerance_m: float = 0.01) -> Flo
     return np.concatenate([_simpler(points[: k + 1], tolerance_m)[:-1], _simpler(points[k:], tolerance_m)])
 
 
-@runtime_checkable
-class Mapped(Protocol):
-    """What can show the map of a scenario, such as a simulator."""
-
-    def road_map(self, name: str) -> RoadMap:
-        """The map that a scenario names.
-
-        Raises:
-            SimulatorError: the simulator does not answer.
-            ScenarioError: the simulator has no such map.
-        """
-        ...
-
-
 def site_at(simulator: object, scenario: Scenario) -> Site:
     """What is known of a scenario's canvas before anything is recorded there: all but the colour of the asphalt.
 
@@ -102,13 +86,3 @@ def marks_of(simulator: object, scenario: Scenario) -> tuple[LaneMark, ...] | No
         ScenarioError: the simulator has no such map.
     """
     return marks_on(scenario.canvas, simulator.road_map(scenario.map_name)) if isinstance(simulator, Mapped) else None
-
-
-def require_route(simulator: object, scenario: Scenario) -> None:
-    """Refuse a scenario that does not fit the simulator's map, before anything is driven; without a map none is.
-
-    Raises:
-        SimulatorError, ScenarioError: as `marks_of`; or start, goal and canvas do not fit the map.
-    """
-    if isinstance(simulator, Mapped):
-        scenario_route(scenario, simulator.road_map(scenario.map_name))

@@ -11,7 +11,7 @@ from typing import Protocol, get_args
 from urllib.parse import urlsplit
 
 from roadproof.errors import SimulatorError
-from roadproof.roads.marks import Mapped
+from roadproof.roads.maps import Mapped
 from roadproof.simulators.protocol import OpenWorld, PaintChoice, Simulator
 
 TOWNS = {"town": "software", "town:egl": "egl"}
