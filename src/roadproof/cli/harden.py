@@ -75,9 +75,7 @@ def harden(
     check_streets(training, judging)
     load_trainable(controller)
     who = load_controller(controller, device=device)
-    begin(
-        _workload(spent, who, rounds, len(training), len(judging), len(clean or (*training, *judging)), processes), out
-    )
+    begin(_workload(spent, who, rounds, len(training), len(judging), len(clean), processes), out)
     with open_simulator(simulator) as world, stages() as show:
         found = run(
             world,
@@ -109,7 +107,7 @@ def harden(
 def _workload(
     budget: HardeningBudget, who: Controller, rounds: int, training: int, judging: int, clean: int, processes: int
 ) -> Workload:
-    """Attacks, tuning and judging, from numbers of streets; clean drives are made before and after."""
+    """Attacks, tuning and judging, from numbers of streets; clean drives, on all streets for 0, are made twice."""
     from roadproof.pipeline.workload import Workload, frame_seconds, of_drives, of_evaluation, of_run, of_search
 
     learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who)) + of_drives(budget.town_drives)
@@ -124,5 +122,5 @@ def _workload(
         # The one after also drives over what was found against the one before.
         for each in (before, before + driven):
             whole += each.times(judging, at_once=processes)
-        whole += of_drives(2 * len(budget.clean_weathers) * clean)
+        whole += of_drives(2 * len(budget.clean_weathers) * (clean or training + judging))
     return whole

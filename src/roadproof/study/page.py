@@ -72,17 +72,16 @@ def write_tables(rows: Frame, folder: Path, out: Path, transfer: Frame | None = 
 
 
 def _of_these_jobs(transfer: Frame, results: Results) -> tuple[Frame, str]:
-    """The rows of a transfer that are of a study's patterns, and what notes say where these are not all of both."""
+    """The rows of a transfer that are of a study's patterns, and what a note says where these are not all of both."""
     if "job" not in transfer or "job" not in results.drives:
         return transfer, ""
     check_kind(transfer, "job", str, "text")
     known, driven = transfer["job"].isin(results.drives["job"]), results.drives["job"].isin(transfer["job"])
     lacking = results.drives.loc[~driven, "job"].nunique()
-    notes = [" Patterns that the study no longer has are left out; run the transfer again."] * (not known.all())
-    notes += [f" {lacking} of the study's patterns are not in it: found since, or none could drive over them."] * (
-        lacking > 0
-    )
-    return transfer[known], "".join(notes)
+    note = "" if known.all() else " Patterns that the study no longer has are left out; run the transfer again."
+    if lacking:
+        note += f" {lacking} of the study's patterns are not in it: found since, or none could drive over them."
+    return transfer[known], note
 
 
 def _page(

@@ -90,8 +90,8 @@ def _matrix(rows: Frame, metric: Metric) -> Frame:
     check_names(rows, pairs)
     check_finite(rows, metric.column)
     patterns = rows.groupby([*pairs, *JOB], sort=False)[metric.column].mean()
-    drivers = patterns.reset_index("controller").groupby("found_on")["controller"].transform("nunique")
-    by_all = patterns.groupby(level=["found_on", *JOB]).transform("size").to_numpy() == drivers.to_numpy()
+    of_row = patterns.reset_index("controller").groupby("found_on")["controller"].transform("nunique")
+    by_all = patterns.groupby(level=["found_on", *JOB]).transform("size").to_numpy() == of_row.to_numpy()
     if not by_all.any():
         raise StudyError("no pattern of the transfer was driven over by every controller; run the transfer again")
     means = patterns[by_all].reorder_levels([*JOB, *pairs]).groupby(level=pairs, sort=False).apply(mean_over_scenarios)
