@@ -3,11 +3,11 @@
     python studies/harden.py --json OUT --keep FOLDER [--controller cil] [--budget full] [--steps 1500] [--rounds 2]
         [--processes N]
 
-A controller is hardened on fifteen of the built-in scenarios and judged on twelve others, four of each kind, on other
-streets: attacked afresh as in training, by a black box and with ellipses, and driven over what was found against it
-before. Then all forty scenarios are driven over the bare road, before and after, in the paper's four weathers. That is
-`roadproof harden` with these lists; the tables of its page are printed as Markdown. FOLDER keeps everything, and an
-interrupted study goes on there.
+A controller is hardened on twenty streets, thirteen of the built-in scenarios and seven crossings, and judged on twelve
+other built-in scenarios, four of each kind, on other streets: attacked afresh as in training, by a black box and with
+ellipses, and driven over what was found against it before. Then all forty scenarios are driven over the bare road,
+before and after, in the paper's four weathers. That is `roadproof harden` with these lists; the tables of its page are
+printed as Markdown. FOLDER keeps everything, and an interrupted study goes on there.
 """
 
 from __future__ import annotations
@@ -26,14 +26,11 @@ from roadproof.hardening.budget import HARDENING_BUDGETS
 from roadproof.hardening.judgement import JudgedAttack
 from roadproof.io.files import write_text
 from roadproof.machine import keep_freed_memory
-from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
+from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario, load_scenarios
 from roadproof.simulators.loading import open_simulator
 
-TRAIN_ON = {
-    "straight": (1, 6, 8, 10, 11),
-    "left": (1, 6, 8, 10, 12),
-    "right": (1, 6, 8, 10, 12),
-}
+TRAIN_ON = {"straight": (1, 6, 8, 10, 16), "left": (1, 6, 11, 12), "right": (1, 6, 10, 12)}
+CROSSINGS = Path(__file__).parent / "scenarios" / "crossings.toml"
 JUDGE_ON = {"straight": (2, 4, 9, 12), "left": (2, 3, 4, 5), "right": (2, 4, 5, 11)}
 
 
@@ -62,7 +59,7 @@ def main() -> None:
         found = harden(
             town,
             given.controller,
-            streets(TRAIN_ON),
+            [*streets(TRAIN_ON), *load_scenarios(CROSSINGS)],
             given.keep,
             judge_on=streets(JUDGE_ON),
             clean_on=builtin_scenarios(),

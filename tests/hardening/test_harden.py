@@ -20,6 +20,7 @@ from roadproof.hardening.budget import ALONE, HardeningBudget
 from roadproof.hardening.harden import STAGES, harden
 from roadproof.hardening.page import write_hardening
 from roadproof.hardening.plan import HardeningPlan
+from roadproof.hardening.result import Round, best_of
 from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import Tuning, training_step
 from roadproof.paint import PaintLimits
@@ -93,6 +94,12 @@ def planned(folder, budget):
 def stages_of(plan, town):
     ledger = Ledger(plan.folder, {}, STAGES)
     return HardeningStages(plan, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
+
+
+def test_the_round_is_kept_that_leaves_its_lane_least_often_and_then_deviates_least():
+    told = [(2.0, 0.0), (0.1, 0.5), (0.3, 0.25), (0.2, 0.25)]
+    rounds = [Round(number, {"near": metres}, left) for number, (metres, left) in enumerate(told)]
+    assert best_of(rounds) == 3
 
 
 def test_a_tuning_that_was_ended_after_its_weights_were_kept_leaves_nothing_else(town, tmp_path):

@@ -62,11 +62,14 @@ def test_judging_otherwise_is_the_same_hardening(tmp_path):
         ).made_of(TownSimulator(), RampFollower(), training_step)
         for budget in (
             usual,
-            replace(usual, clean_weathers=(Weather.RAINY_NOON,), unseen=TPE(calls=7), unseen_shape=Shape.TRIANGLE),
+            replace(usual, clean_weathers=(Weather.RAINY_NOON,), unseen=TPE(calls=7)),
             replace(usual, town_drives=7),
+            replace(usual, unseen_shape=Shape.TRIANGLE),
         )
     ]
     require_same(tmp_path, "a hardening", parts[0], parts[1], RoadproofError)
     assert parts[0]["budget"] == repr(replace(usual, judge=usual.attack)), "as before judging was left out"
     with pytest.raises(RoadproofError, match="holds a hardening with budget"):
         require_same(tmp_path, "a hardening", parts[0], parts[2], RoadproofError)
+    with pytest.raises(RoadproofError, match=r"holds a hardening with budget .*TRIANGLE"):
+        require_same(tmp_path, "a hardening", parts[0], parts[3], RoadproofError)

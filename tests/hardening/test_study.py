@@ -1,10 +1,13 @@
-"""The study of hardening: however often it says how far it is, each stage is one line, and its results are one file."""
+"""The study of hardening: each stage is one line, its results are one file, and its streets lie apart."""
 
 import runpy
 import sys
 from pathlib import Path
 
 import needs
+from roadproof.hardening.budget import check_streets
+from roadproof.roads.maps import load_map, scenario_route
+from roadproof.scenarios import load_scenarios
 from runs import hardened
 
 needs.town()
@@ -30,3 +33,16 @@ def test_the_study_says_each_stage_once_and_writes_its_results_where_asked(tmp_p
     assert (said.out + said.err).count("Round 1: learning") == 1
     assert found.judgement.verdict().sentence in said.out
     assert written.read_text() == (tmp_path / "hardening.json").read_text()
+
+
+def test_the_streets_of_the_study_lie_apart_and_its_crossings_are_painted_inside():
+    study = runpy.run_path(str(STUDY))
+    crossings = load_scenarios(study["CROSSINGS"])
+    training, judging = [*study["streets"](study["TRAIN_ON"]), *crossings], study["streets"](study["JUDGE_ON"])
+    assert (len(training), len(judging)) == (20, 12)
+    check_streets(training, judging)
+    for scenario in crossings:
+        route = scenario_route(scenario, load_map(scenario.map_name))
+        (crossing,) = route.crossings
+        at_m = route.locate(scenario.canvas.x_m, scenario.canvas.y_m).arclength_m
+        assert crossing.enters_m < at_m < crossing.leaves_m, scenario.name

@@ -82,7 +82,7 @@ def test_patterns_on_frames_of_the_town_climb_too_and_what_they_teach_holds_ther
 
     network = RampNet()
     tuning = Tuning(steps=20, repeats=3, batch=16, learning_rate=0.3)
-    tune(network, RampFollower(), [street], SPACE, SPACE.random((0,), seeded()), town, tuning, seed=0, step=step)
+    tune(network, RampFollower(), [street], [SPACE], SPACE.random((0,), seeded()), town, tuning, seed=0, step=step)
     first, again = (torch.cat([batch.frames[-8:] for batch in seen[k::3]]) for k in (0, 1))
     changed = (first != again).flatten(1).any(1)
     assert changed.any()

@@ -10,15 +10,16 @@ from hardening_road import SPACE, RampNet
 from painted_ground import RampFollower
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.errors import ControllerError, TrainingError
-from roadproof.hardening import Tuning, TuningBatch
+from roadproof.hardening import HardeningBudget, Tuning, TuningBatch, views
 from roadproof.hardening.tuning import training_step, tune
 
 TUNING = Tuning(steps=20, repeats=3, batch=16, learning_rate=0.3)
 
 
-def tuned(street, *, tuning=TUNING, seed=0, **options):
+def tuned(street, *, spaces=(SPACE,), tuning=TUNING, seed=0, **options):
     network, found = RampNet(), SPACE.random((4,), torch.Generator().manual_seed(5))
-    tune(network, RampFollower(), [street], SPACE, found, None, tuning, seed=seed, **options)
+    streets = street if isinstance(street, list) else [street]
+    tune(network, RampFollower(), streets, spaces, found, None, tuning, seed=seed, **options)
     return network
 
 
@@ -127,6 +128,26 @@ def test_a_batch_is_learnt_from_again_while_its_patterns_climb(street):
     changed = torch.cat([(one.frames != again.frames).flatten(1).any(1) for one, again in pairs])
     assert changed.any(), "patterns climb"
     assert not changed.all(), "what is bare stays bare"
+
+
+def test_every_second_pass_over_the_streets_paints_what_attacks_do_not(street, monkeypatch):
+    others, seen_shapes = HardeningBudget().learnt(SPACE)[1:], ["rectangle", "triangle", "diamond"]
+    assert [(each.family, each.shape) for each in others] == [("free", each) for each in seen_shapes]
+    drawn = []
+    composite = views.composite_own
+
+    def seen(pattern, *rest):
+        drawn.append(pattern)
+        return composite(pattern, *rest)
+
+    monkeypatch.setattr(views, "composite_own", seen)
+    tuned([street, street], spaces=(SPACE, *others), tuning=Tuning(steps=12, repeats=2, batch=16, learning_rate=1e-9))
+    boxes = [pattern.boxes.detach() for pattern in drawn]
+    # Published figures lie along the middle of the canvas.
+    assert [bool((each[..., 1] == 200).all()) for each in boxes] == ([True] * 4 + [False] * 4) * 3
+    assert [pattern.shapes[0] for pattern in drawn[4::8]] == seen_shapes
+    moved = [not torch.equal(one, again) for one, again in zip(boxes[::2], boxes[1::2], strict=True)]
+    assert all(moved), "those climb too"
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ class HardeningBudget:
             keep clean driving as it was; none are made in another simulator.
         judge: the fresh attack on each street for judging.
         unseen: a method that training did not use, for judging; its patterns are tried in the recorded world.
-        unseen_shape: a shape that training did not use, for judging.
+        unseen_shape: a shape that training does not use, for judging.
         clean_weathers: the weathers in which drives over the bare road are counted.
 
     Raises:
@@ -77,6 +77,12 @@ class HardeningBudget:
         """
         if isinstance(self.unseen, BlackBox):
             self.unseen.proposer(space, 0)
+
+    def learnt(self, space: SearchSpace) -> tuple[SearchSpace, ...]:
+        """What training paints from: the space of its attacks without limits, and free figures of each shape seen."""
+        own = space.unlimited
+        free = [replace(own, family="free", shape=shape) for shape in Shape if shape is not self.unseen_shape]
+        return own, *(each for each in free if each != own)
 
     def kinds(self, space: SearchSpace) -> dict[str, tuple[Method, SearchSpace]]:
         """What judging searches besides `judge`: method and search space by the name of the kind."""

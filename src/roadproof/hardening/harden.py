@@ -28,7 +28,7 @@ from roadproof.errors import TrainingError
 from roadproof.hardening.budget import HardeningBudget, check_streets
 from roadproof.hardening.judgement import Judgement
 from roadproof.hardening.plan import WEIGHTS, HardeningPlan
-from roadproof.hardening.result import Hardened
+from roadproof.hardening.result import Hardened, best_of
 from roadproof.hardening.stages import HardeningStages
 from roadproof.hardening.tuning import TrainingStep, require_loss
 from roadproof.hardening.tuning import training_step as usual_step
@@ -124,7 +124,7 @@ def harden(
         ledger = Ledger(folder, plan.made_of(simulator, teacher, training_step), STAGES, "a hardening")
         stages = HardeningStages(plan, simulator, teacher, training_step, factory, processes, ledger, on_progress)
         done = stages.rounds(rounds)
-        best = min(done[1:], key=lambda each: each.mean_m).number
+        best = best_of(done)
         weights = folder / WEIGHTS
         write_atomically(weights, lambda part: shutil.copyfile(plan.weights(best), part))
         judgement = None

@@ -89,7 +89,7 @@ class HardeningPlan:
     def made_of(self, simulator: Simulator, teacher: Controller, step: TrainingStep) -> dict[str, object]:
         """What identifies the hardening; judging may be asked for later."""
         view, usual, attack = simulator.input, HardeningBudget(), self.budget.attack
-        judging = {name: getattr(usual, name) for name in ("unseen", "unseen_shape", "clean_weathers")}
+        judging = {name: getattr(usual, name) for name in ("unseen", "clean_weathers")}
         return {
             "controller": self.spec,
             "world": world_of(simulator),
@@ -98,6 +98,7 @@ class HardeningPlan:
             "budget": without_addresses(repr(replace(self.budget, judge=attack, **judging))),
             "objective": own_objective(attack.objective),
             "space": repr(self.space),
+            "learnt": [repr(each) for each in self.budget.learnt(self.space)],
             "variation": repr(variation_of(attack.objective)),
             "seed": self.seed,
             "training step": f"{step.__module__}:{getattr(step, '__qualname__', type(step).__qualname__)}",

@@ -45,6 +45,11 @@ class Round:
         return Round(number, deviations, float(np.mean(left)))
 
 
+def best_of(rounds: Sequence[Round]) -> int:
+    """The number of the tuned round that leaves its lane least often; of equals, of the least mean deviation."""
+    return min(rounds[1:], key=lambda each: (each.left_lane, each.mean_m)).number
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Hardened:
     """What came of a hardening.
@@ -53,7 +58,7 @@ class Hardened:
         controller: the spec of the controller that it began with.
         hardened: the spec of the hardened controller, for `load_controller` and every verb.
         rounds: the re-tests on the streets for training, round 0 first.
-        best: number of the round whose controller is kept: the one after a tuning with the least mean deviation.
+        best: number of the round whose controller is kept (`best_of`).
         judgement: before and after on other streets; None where none were given.
         cost: cost of each stage since the hardening began, by its name.
     """

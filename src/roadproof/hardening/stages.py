@@ -89,9 +89,9 @@ class HardeningStages:
             path.unlink(missing_ok=True)
             return
         network, town = load_trainable(plan.spec_of(number - 1)), self.town(number)
-        # It learns from paint of all kinds, also where attacks are limited.
-        space = plan.space.unlimited
-        told: list[object] = [network, tuning, plan.seed_of(number), self.step, space.stated]
+        spaces = plan.budget.learnt(plan.space)
+        space = spaces[0]
+        told: list[object] = [network, tuning, plan.seed_of(number), self.step, *(each.stated for each in spaces)]
         streets: list[Street] = []
         found: list[torch.Tensor] = []
         for past, attacked in enumerate(tests):
@@ -110,7 +110,7 @@ class HardeningStages:
                 network,
                 self.teacher,
                 streets,
-                space,
+                spaces,
                 torch.cat(found),
                 town,
                 tuning,

@@ -2,10 +2,11 @@
 
 The teacher is the controller before. Every batch has pictures of one street and of drives through the town, most of
 them painted; the target is what the teacher answers to the same picture without paint, and far aside a steering that
-returns. On what stays bare this is distillation: clean driving stays. Some patterns are found ones, some random. A
-batch is learnt from several times in a row, and each time its patterns climb a step by the gradient of the very loss
-that the controller has just learnt from: they cost nothing, and it does not learn a handful of patterns by heart
-("free" adversarial training, Shafahi et al. 2019).
+returns. On what stays bare this is distillation: clean driving stays. Some patterns are found ones, some random; in
+every second pass over the streets they are random ones of another family. A batch is learnt from several times in a
+row, and each time its patterns climb a step by the gradient of the very loss that the controller has just learnt from:
+they cost nothing, and it does not learn a handful of patterns by heart ("free" adversarial training, Shafahi et al.
+2019).
 
 The controller is tuned in eval mode: dropout is off, and the statistics of batch normalisation stay as they were, as
 all buffers do.
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias, cast
 
 import torch
@@ -55,7 +56,7 @@ class Tuning:
         batch: how many pictures there are in a batch.
         learning_rate: AdamW's largest; it rises over the first steps and falls along a cosine to almost nothing.
         bare: share of the pictures that stay without paint; one is painted at the least.
-        found: share of the painted patterns that attacks found; the others are random.
+        found: share of the patterns that attacks found, where their own space is painted from; the others are random.
         climb: length of a pattern's step between two repeats, in units of each parameter's range.
 
     Raises:
@@ -110,7 +111,7 @@ def tune(
     network: nn.Module,
     teacher: Controller,
     streets: Sequence[Street],
-    space: SearchSpace,
+    spaces: Sequence[SearchSpace],
     found: Float[Tensor, "p k n"],
     town: Town | None,
     tuning: Tuning,
@@ -127,8 +128,9 @@ def tune(
         network: a controller whose parameters want gradients, on `device`.
         teacher: the controller before, on `device`.
         streets: the streets that pictures are drawn from, in turn; each already has ways (`Street.add_ways`).
-        space: the search space of the patterns.
-        found: patterns that attacks found, as points of the search space.
+        spaces: the search spaces of the patterns: the attacks' own in every second pass over the streets, and in the
+            passes between the others in turn.
+        found: patterns that attacks found, as points of the first search space.
         town: clean drives through the town, learnt from besides; None for none.
         tuning: how many batches there are, and what they are made of.
         seed: the seed of everything drawn.
@@ -147,18 +149,19 @@ def tune(
     network.to(device=place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
     parameters = [each for each in network.parameters() if each.requires_grad]
     optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
-    pictures = Pictures(teacher, space, found.to(device), tuning.found, tuning.bare)
+    passes = _passes(teacher, spaces, found.to(device), tuning)
     besides = () if town is None else (town,)
     count = tuning.batch // (1 + len(besides))
     total, begun = 0.0, 0 if checkpoint is None else _resume(parameters, optimiser, checkpoint)
     for number in range(begun, tuning.steps):
         draw = torch.Generator().manual_seed(seed * 1_000_003 + number)
+        pictures = passes[number // len(streets) % len(passes)]
         shown = [pictures.of(source, count, draw) for source in (streets[number % len(streets)], *besides)]
         for again in range(tuning.repeats):
             # After the last time they climb no more.
             climbs = again + 1 < tuning.repeats
             shown = [each._replace(unit=each.unit.detach().requires_grad_(climbs)) for each in shown]
-            painted = [each.painted(space.pattern(each.unit)) for each in shown]
+            painted = [each.painted(pictures.space.pattern(each.unit)) for each in shown]
             batch = TuningBatch(*(torch.cat(columns) for columns in zip(*painted, strict=True)))
             for group in optimiser.param_groups:
                 group["lr"] = tuning.rate(number * tuning.repeats + again)
@@ -168,12 +171,22 @@ def tune(
             nn.utils.clip_grad_norm_(parameters, 5.0)
             optimiser.step()
             total += float(loss.detach())
-            shown = [each.climbed(space, tuning.climb) for each in shown]
+            shown = [each.climbed(pictures.space, tuning.climb) for each in shown]
         if (number + 1) % 10 == 0 or number + 1 == tuning.steps:
             if checkpoint is not None:
                 _keep(parameters, optimiser, checkpoint, number + 1)
             on_step(number + 1, total / (number % 10 + 1) / tuning.repeats)
             total = 0.0
+
+
+def _passes(
+    teacher: Controller, spaces: Sequence[SearchSpace], found: Float[Tensor, "p k n"], tuning: Tuning
+) -> list[Pictures]:
+    """What one pass over the streets after the other draws from, in turn: every second from the attacks' own space."""
+    own = Pictures(teacher, spaces[0], found, tuning.found, tuning.bare)
+    # What was found are points of the attacks' space alone.
+    others = [replace(own, space=space, known=0.0) for space in spaces[1:]]
+    return [each for other in others for each in (own, other)] or [own]
 
 
 def _keep(parameters: Sequence[nn.Parameter], optimiser: torch.optim.AdamW, checkpoint: Checkpoint, steps: int) -> None:
