@@ -37,6 +37,19 @@ def test_kinds_that_are_not_asked_for_are_not_drawn(tmp_path: Path) -> None:
     assert count_of(tmp_path / "map.png", COLOURS["right"]) == 0
 
 
+def test_a_long_name_neither_covers_its_start_nor_leaves_the_map(tmp_path: Path) -> None:
+    left = find_scenario("left-03")
+    assert left.start.x_m > load_map("town").bounds_m[2] - 5.0
+    counts = []
+    for name in ("left-03", "left-of-a-name-that-is-long"):
+        draw_scenarios([replace(left, name=name)], load_map("town"), tmp_path / "map.png")
+        with Image.open(tmp_path / "map.png") as picture:
+            edge = np.asarray(picture.convert("RGB"))[:, -3:]
+        assert len(np.unique(edge.reshape(-1, 3), axis=0)) == 1, "nothing is cut off"
+        counts.append(count_of(tmp_path / "map.png", COLOURS["left"]))
+    assert counts[1] > counts[0] + 200, "all of it is there"
+
+
 def test_a_way_of_four_points_is_drawn(tmp_path: Path) -> None:
     scenario = find_scenario("straight-02")
     start, canvas = scenario.start, scenario.canvas

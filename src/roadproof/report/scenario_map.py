@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,9 @@ from roadproof.scenarios import Scenario
 COLOURS = {"straight": "#2166ac", "left": "#b2182b", "right": "#1b7837"}
 WIDTH_IN, DPI = 13.0, 110
 MARGIN_M = 15.0
+
+SHORT = 4
+"""A name of more characters reaches back to its start, or out of the map, from where a short one stands beside it."""
 
 
 def draw_scenarios(scenarios: Sequence[Scenario], road_map: RoadMap, path: Path) -> None:
@@ -58,8 +62,13 @@ def _draw_scenario(axes: Axes, scenario: Scenario, way: Points, taken: list[tupl
     axes.fill(*outline.T, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=1.0, zorder=4)
     x, y = _label_place(scenario, taken)
     taken.append((x, y))
-    name = scenario.name.replace("straight", "S").replace("left", "L").replace("right", "R").replace("-", "")
-    axes.text(x, y, name, color=colour, fontsize=8.5, fontweight="bold", ha="center", va="center", zorder=8)
+    name = re.sub(r"^(straight|left|right)-(?=\d+$)", lambda kind: kind[1][0].upper(), scenario.name)
+    ha = "center"
+    if len(name) > SHORT and abs(x - scenario.start.x_m) > 1.0:
+        # Beside the start, a long name goes from there to the middle of the map.
+        inwards = 1.0 if scenario.start.x_m < sum(axes.get_xlim()) / 2 else -1.0
+        x, ha = scenario.start.x_m + 6.0 * inwards, "left" if inwards > 0 else "right"
+    axes.text(x, y, name, color=colour, fontsize=8.5, fontweight="bold", ha=ha, va="center", zorder=8)
 
 
 def _label_place(scenario: Scenario, taken: Sequence[tuple[float, float]]) -> tuple[float, float]:
