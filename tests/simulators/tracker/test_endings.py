@@ -1,11 +1,13 @@
 """Drives end as the challenge ends them, and one object that is hit costs once."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
 import needs
+from carla_serving import straight_map
 from roadproof.datatypes import Control, Ending, EventKind, VehicleState
 from roadproof.driving.infractions import counted, infraction_points
 from roadproof.driving.rollout import rollout
@@ -58,6 +60,20 @@ def test_leaving_the_road_slowly_over_the_sidewalk_is_one_event():
         state, _ = place(10.0, left_m=-0.05 * step)
         found += judge.watch(state, 0.05 * step, (), np.zeros((0, 2)))
     assert [event.kind for event in found] == [EventKind.SIDEWALK]
+
+
+@pytest.mark.parametrize("width", ['a="2.5" b="0"', 'a="0" b="0.04"'], ids=["narrow", "widening"])
+def test_only_lanes_that_lead_the_other_way_are_wrong(tmp_path, width):
+    path = straight_map(tmp_path)
+    two_each_way = path.read_text().replace('type="sidewalk"', 'type="driving"').replace('a="2.5" b="0"', width)
+    path.write_text(two_each_way)
+    roads = load_map(str(path))
+    for x_m, right_m in ((x, right) for x in (30.0, 80.0, 130.0) for right in np.arange(0.1, 3.5, 0.1)):
+        for yaw, wrong in ((0.0, False), (math.pi, True)):
+            for side in (1.0, -1.0):
+                state = VehicleState(x_m, -side * right_m, 0.0, yaw + (0.0 if side > 0 else math.pi), 5.0)
+                kinds = [event.kind for event in Judge(roads).watch(state, 0.0, (), np.zeros((0, 2)))]
+                assert (EventKind.WRONG_LANE in kinds) == wrong, (state, kinds)
 
 
 def test_who_stands_for_no_reason_is_waited_for_half_a_minute():

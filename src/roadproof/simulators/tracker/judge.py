@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from roadproof.datatypes import RECOUNT_S, Ending, Event, EventKind, VehicleState
-from roadproof.roads.roadmap import RoadMap, Surface
+from roadproof.roads.polylines import interpolated
+from roadproof.roads.roadmap import LanePosition, RoadMap, Surface
 from roadproof.roads.routes import Route, RoutePosition
 from roadproof.traffic.agents import CAR_LENGTH_M, CAR_WHEELBASE_M, CAR_WIDTH_M
 
@@ -22,6 +23,7 @@ HEIGHT_M, TRACK_M = 1.45, 1.6
 
 PERSON_RADIUS_M = 0.3
 GOAL_M = 2.0
+EDGE_M = 0.05
 OFF_ROUTE_M = 15.0
 STANDS_MPS = 0.1
 STANDS_S = 3.0
@@ -91,11 +93,28 @@ class Judge:
         lane = self._roads.lanes[place.lane]
         if middle == Surface.DRIVING and lane.junction is None:
             backwards = abs(place.heading_error_rad) > math.pi / 2
-            if backwards or abs(place.lateral_m) > lane.width_at(place.arclength_m) / 2 + 0.05:
+            if backwards or not self._keeps_side(place):
                 found.append(
                     (EventKind.WRONG_LANE, f"{abs(place.lateral_m):.1f} m beside its lane on road {lane.road}")
                 )
         return found
+
+    def _keeps_side(self, place: LanePosition) -> bool:
+        """Whether a car is on the lane whose middle is nearest, or on another of its road that leads the same way."""
+        lane = self._roads.lanes[place.lane]
+        if abs(place.lateral_m) <= lane.width_at(place.arclength_m) / 2 + EDGE_M:
+            return True
+        heading = lane.at(place.arclength_m)[3]
+        leftwards = np.array([-math.sin(heading), math.cos(heading), 0.0])
+        for other in self._roads.lanes:
+            same_way = (other.road, other.section) == (lane.road, lane.section) and other.number * lane.number > 0
+            if same_way and other.kind == "driving":
+                # All lanes of a section have their points side by side.
+                borders = np.column_stack([(side - lane.centre) @ leftwards for side in (other.right, other.left)])
+                low, high = interpolated(place.arclength_m, lane.stations_m, borders).tolist()
+                if low - EDGE_M <= place.lateral_m <= high + EDGE_M:
+                    return True
+        return False
 
 
 class Endings:
