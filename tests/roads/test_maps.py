@@ -1,5 +1,6 @@
 """The built-in scenarios on their map, and what does not fit a map."""
 
+import contextlib
 import dataclasses
 import importlib.util
 import math
@@ -9,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carla_serving import straight_map
 from roadproof.datatypes import Command
 from roadproof.errors import ScenarioError
-from roadproof.roads.maps import builtin_map_file, canvas_points, load_map, scenario_route
+from roadproof.geometry import CanvasPlacement
+from roadproof.roads.maps import builtin_map_file, canvas_points, check_canvas, load_map, scenario_route
 from roadproof.scenarios import BUILTIN_FILE, Scenario, builtin_scenarios, find_scenario, load_scenarios, save_scenarios
 
 SCENARIOS = builtin_scenarios()
@@ -80,6 +83,7 @@ def test_scenarios_that_do_not_fit_are_refused() -> None:
             "straight-02: the canvas .* off the road at .* sidewalk",
         ),
         ({"canvas": dataclasses.replace(good.canvas, y_m=40.0)}, "no pavement"),
+        ({"canvas": dataclasses.replace(good.canvas, z_m=0.5)}, "z_m 0.50, but the road under it is 0.00 m high"),
         ({"canvas": dataclasses.replace(good.canvas, x_m=60.0)}, "not on the way from start to goal"),
         ({"goal_m": (150.0, 40.0)}, "goal .* from the nearest driving lane"),
         ({"start": dataclasses.replace(good.start, yaw_rad=math.pi / 2)}, "start .* is not along a driving lane"),
@@ -88,6 +92,26 @@ def test_scenarios_that_do_not_fit_are_refused() -> None:
         with pytest.raises(ScenarioError, match=said) as error:
             scenario_route(dataclasses.replace(good, **changes), road_map)
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("elevation", "z_m", "fits"),
+    [
+        ('a="3" b="0"', 3.0, True),
+        ('a="3" b="0"', 0.0, False),
+        ('a="3" b="0.01"', 3.4, True),
+        ('a="0" b="0.05"', 2.0, False),
+    ],
+    ids=["level", "below", "slight slope", "slope"],
+)
+def test_a_canvas_lies_on_its_road_and_not_above_or_below_it(
+    tmp_path: Path, elevation: str, z_m: float, fits: bool
+) -> None:
+    path = straight_map(tmp_path)
+    path.write_text(path.read_text().replace('<elevation s="0" a="0" b="0"', f'<elevation s="0" {elevation}'))
+    canvas = CanvasPlacement(x_m=40.0, y_m=0.0, z_m=z_m, width_m=6.0, length_m=9.5)
+    with contextlib.nullcontext() if fits else pytest.raises(ScenarioError, match=f"z_m {z_m:.2f}, but the road under"):
+        check_canvas(canvas, load_map(str(path)))
 
 
 def test_a_map_that_is_edited_is_read_again(tmp_path: Path) -> None:

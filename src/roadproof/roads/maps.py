@@ -20,6 +20,7 @@ from roadproof.scenarios import Scenario
 
 BUILTIN_MAPS = ("town", "second")
 CANVAS_NEAR_ROUTE_M = 4.0
+CANVAS_OVER_ROAD_M = 0.1
 
 
 @runtime_checkable
@@ -96,7 +97,7 @@ def require_route(simulator: object, scenario: Scenario) -> None:
 
 
 def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:
-    """Refuse a canvas of which some part lies beside the carriageway.
+    """Refuse a canvas of which some part lies beside the carriageway, above it or below it.
 
     Raises:
         ScenarioError: a part of the canvas lies off the road; the message says where, and what is there.
@@ -111,6 +112,14 @@ def check_canvas(canvas: CanvasPlacement, road_map: RoadMap) -> None:
             f"the canvas at ({canvas.x_m:.1f}, {canvas.y_m:.1f}) is off the road at ({x:.1f}, {y:.1f}), where there is "
             f"{'no pavement' if what == 'other' else what}; move, turn or shrink it"
         )
+    for x, y in points[[0, -1, len(points) // 2]].tolist():
+        road_m = road_map.height_m(x, y, canvas.yaw_rad)
+        if abs(canvas.z_m - road_m) > CANVAS_OVER_ROAD_M:
+            raise ScenarioError(
+                f"the canvas at ({canvas.x_m:.1f}, {canvas.y_m:.1f}) has z_m {canvas.z_m:.2f}, but the road under it "
+                f"is {road_m:.2f} m high at ({x:.1f}, {y:.1f}), expected within {CANVAS_OVER_ROAD_M} m; set its z_m, "
+                "or move it to where the road is level"
+            )
 
 
 def fitting_canvas(at: CanvasPlacement, tries: Iterable[tuple[float, float]], road_map: RoadMap) -> CanvasPlacement:

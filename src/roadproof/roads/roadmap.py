@@ -141,6 +141,11 @@ class RoadMap:
             heading_error_rad=float(error[k]),
         )
 
+    def height_m(self, x_m: float, y_m: float, yaw_rad: float) -> float:
+        """World z of the driving lane that a car there is most likely on, metres."""
+        place = self.nearest_lane(x_m, y_m, yaw_rad)
+        return self.lanes[place.lane].at(place.arclength_m)[2]
+
     def route(self, start: VehicleState, goal_m: tuple[float, float]) -> Route:
         """The shortest route from a pose to the place on a driving lane nearest to the goal, without lane changes.
 
