@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 
 import needs
+from carla_serving import straight_map
 from references import homography_jacobian
 from roadproof.datatypes import Command, Control, VehicleState, Weather
 from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.homographies import apply_homography
+from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario, builtin_scenarios, find_scenario
 from town_driving import drive, fingerprint
 
 needs.town()
 from roadproof.simulators.protocol import Simulator
 from roadproof.simulators.town import engine
+from roadproof.simulators.town.scenery import build_scenery
 from roadproof.simulators.town.simulator import TownSimulator
 
 SCENARIOS = builtin_scenarios()
@@ -391,3 +394,10 @@ def test_what_was_opened_in_vain_is_closed(monkeypatch):
     with pytest.raises(KeyboardInterrupt), town:
         pass
     assert closed == [town]
+
+
+def test_a_map_with_hills_is_refused_since_all_of_the_town_is_level(tmp_path):
+    path = straight_map(tmp_path)
+    path.write_text(path.read_text().replace('<elevation s="0" a="0" b="0"', '<elevation s="0" a="3" b="0"'))
+    with pytest.raises(ScenarioError, match=r"road 1 of the map is at height 3.00 m, but the town is level"):
+        build_scenery(load_map(str(path)))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
+from roadproof.errors import ScenarioError
 from roadproof.roads.lanes import Lane
 from roadproof.roads.polylines import interpolated, polyline_stations
 from roadproof.roads.roadmap import RoadMap
@@ -19,6 +20,7 @@ from roadproof.simulators.town.models import PAINTS, Body, car
 SEED = 40
 MARGIN_M = 45.0
 GRID_M = 0.5
+LEVEL_M = 0.02
 STOREY_M, SHOP_M = 3.1, 3.6
 FACADES, SHOPS, TREES = 7, 4, 5
 ROOFS: tuple[Rgb, ...] = ((0.62, 0.36, 0.27), (0.52, 0.30, 0.24), (0.36, 0.36, 0.38), (0.46, 0.34, 0.28))
@@ -108,7 +110,12 @@ class _Site:
 
 @lru_cache(maxsize=2)
 def build_scenery(roads: RoadMap) -> Scenery:
-    """Fill the land beside the roads of a map; kept, so that the next call is free."""
+    """Fill the land beside the roads of a map; kept, so that the next call is free.
+
+    Raises:
+        ScenarioError: a road is not at height 0, as all of the town is.
+    """
+    _check_level(roads)
     x0, y0, x1, y1 = roads.bounds_m
     low = np.array([x0 - MARGIN_M, y0 - MARGIN_M])
     size = (int((x1 - x0 + 2 * MARGIN_M) / GRID_M) + 1, int((y1 - y0 + 2 * MARGIN_M) / GRID_M) + 1)
@@ -131,6 +138,16 @@ def build_scenery(roads: RoadMap) -> Scenery:
         site.solids.append(Solid("tree", Pose(tree.x_m, tree.y_m), (0.2, 0.2), 3.0, casts_shadow=False))
     meshes = {name: builder.build() for name, builder in site.builders.items()}
     return Scenery(meshes, tuple(site.trees), tuple(site.solids), tuple(site.paved))
+
+
+def _check_level(roads: RoadMap) -> None:
+    for lane in roads.lanes:
+        heights = lane.centre[:, 2]
+        if abs(height := float(heights[np.abs(heights).argmax()])) > LEVEL_M:
+            raise ScenarioError(
+                f"road {lane.road} of the map is at height {height:.2f} m, but the town is level and draws roads at "
+                "height 0 alone; take <elevation> out of the map, or drive it in CARLA"
+            )
 
 
 def _outermost(roads: RoadMap) -> list[Lane]:
