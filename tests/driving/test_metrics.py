@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from roadproof.datatypes import Event, EventKind, Weather
-from roadproof.driving import deviation, infractions, intervals
+from roadproof.datatypes import Ending, Event, EventKind, Weather
+from roadproof.driving import Episode, deviation, infractions, intervals
 from roadproof.driving.starts import StartOffset
-from roadproof.driving.trial import Trial, runs_of
+from roadproof.driving.trial import Trial, judge, runs_of
 from roadproof.errors import EpisodeError
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline import fidelity
@@ -238,6 +238,46 @@ def test_beyond_the_end_of_a_drive_that_ended_early_nothing_is_beside_it():
     assert deviation.furthest_beside_m(blocked, corner, ended_early=False) == pytest.approx(30.0)
     aside = corner + np.array([0.0, -1.5])
     assert deviation.furthest_beside_m(blocked, aside, ended_early=True) == pytest.approx(-1.5)
+
+
+@pytest.mark.parametrize("ending", [each for each in Ending if each is not Ending.GOAL_REACHED])
+def test_a_clean_drive_short_of_its_goal_is_no_measure_of_what_went_on(ending):
+    # Both drive the same quarter of a circle; the clean drive ended on the way.
+    angle = np.linspace(0.0, 1.5, 61)
+    painted = on_path(20 * np.sin(angle), 20 * (1 - np.cos(angle)), Ending.GOAL_REACHED)
+    clean = on_path(painted.x_m[:24], painted.y_m[:24], ending)
+    canvas = CanvasPlacement(x_m=float(painted.x_m[30]), y_m=float(painted.y_m[30]), length_m=6.0)
+    found = judge(clean, painted, canvas, pattern="attack", clean_file="", painted_file="")
+    assert abs(found.lateral_m) < 0.2
+    assert not found.leaves_lane
+
+
+def on_path(x_m, y_m, ending):
+    """A drive along a path."""
+    count = len(x_m)
+    rest = np.zeros(count)
+    held = np.zeros(count - 1)
+    return Episode(
+        scenario="bend",
+        weather=Weather.CLEAR_NOON,
+        painted=True,
+        cars=0,
+        pedestrians=0,
+        seed=0,
+        dt_s=0.1,
+        ending=ending,
+        events=(),
+        time_s=0.1 * np.arange(count),
+        x_m=x_m,
+        y_m=y_m,
+        z_m=rest,
+        yaw_rad=rest,
+        speed_mps=rest + 5.0,
+        command=np.full(count, 2),
+        steer=held,
+        throttle=held,
+        brake=held,
+    )
 
 
 def test_a_drive_that_is_late_by_seconds_deviates_by_what_it_did_not_reach():

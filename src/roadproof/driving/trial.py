@@ -80,10 +80,6 @@ class Trial:
                 raise EpisodeError(f"episode {name!r:.120} is not the name of an .npz file")
 
 
-_EARLY = (Ending.TIME_LIMIT, Ending.OFF_ROUTE, Ending.STANDS, Ending.BLOCKED)
-"""Endings of a clean drive beyond whose last position nobody knows where it would have gone."""
-
-
 def judge(
     clean: Episode,
     painted: Episode,
@@ -99,7 +95,9 @@ def judge(
     Deviation and change of the speed are taken over the instants at which the clean drive has the canvas in view, the
     largest offset over the whole painted drive; where the clean drive ended early, only as far as that got.
     """
-    furthest_m = furthest_beside_m(path_of(clean), path_of(painted), ended_early=clean.ending in _EARLY)
+    # Short of the goal nobody knows where the clean drive would have gone.
+    early = clean.ending is not Ending.GOAL_REACHED
+    furthest_m = furthest_beside_m(path_of(clean), path_of(painted), ended_early=early)
     faster = speed_difference(clean, painted, canvas)
     known = not painted.paint.predicted
     return Trial(
