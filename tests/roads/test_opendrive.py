@@ -115,6 +115,10 @@ def test_a_road_is_placed_by_its_start_pose(tmp_path: Path) -> None:
             {"extra": '<lateralProfile><superelevation s="0" a="0.1" b="0" c="0" d="0"/></lateralProfile>'},
             "road 7: <superelevation>",
         ),
+        (
+            {"lanes": LANES.replace('id="-1"', 'id="1"')},
+            "road 7: <laneSection> at 0 m: two <lane> elements have the id 1",
+        ),
         ({"lanes": LANES.replace("<width", "<border")}, "road 7: lane 1: <border> is not supported"),
     ],
 )
@@ -144,3 +148,12 @@ def test_files_that_are_not_maps_are_refused(tmp_path: Path) -> None:
         read_opendrive(path)
     with pytest.raises(ScenarioError, match="cannot be read"):
         read_opendrive(tmp_path / "missing.xodr")
+
+
+@pytest.mark.parametrize("tag", ["road", "junction"])
+def test_what_has_the_id_of_another_does_not_take_its_place(tmp_path: Path, tag: str) -> None:
+    path = written(tmp_path, piece("<line/>"))
+    again = path.read_text()[len("<OpenDRIVE>") : -len("</OpenDRIVE>")] if tag == "road" else 2 * '<junction id="7"/>'
+    path.write_text(path.read_text().replace("</OpenDRIVE>", f"{again}</OpenDRIVE>"))
+    with pytest.raises(ScenarioError, match=f"two <{tag}> elements have the id 7, expected each once"):
+        read_opendrive(path)

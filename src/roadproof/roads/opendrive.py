@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from roadproof.errors import ScenarioError
 from roadproof.io.files import open_file
+from roadproof.io.tables import first_twice
 from roadproof.roads.records import (
     Clothoid,
     Connection,
@@ -61,13 +63,20 @@ def read_opendrive(path: Path) -> OpenDrive:
     if root.tag != "OpenDRIVE":
         raise ScenarioError(f"map {path} starts with <{root.tag}>, expected <OpenDRIVE>")
     try:
-        roads = {road.name: road for road in (_road(element) for element in root.iterfind("road"))}
-        junctions = dict(_junction(element) for element in root.iterfind("junction"))
+        roads = [_road(element) for element in root.iterfind("road")]
+        junctions = [_junction(element) for element in root.iterfind("junction")]
         if not roads:
             raise ScenarioError("no <road>, expected at least one")
+        _check_ids("road", (road.name for road in roads))
+        _check_ids("junction", (name for name, _ in junctions))
     except ScenarioError as error:
         raise ScenarioError(f"map {path}: {error}") from error
-    return OpenDrive(roads, junctions)
+    return OpenDrive({road.name: road for road in roads}, dict(junctions))
+
+
+def _check_ids(tag: str, ids: Iterable[str | int], where: str = "") -> None:
+    if (twice := first_twice(ids)) is not None:
+        raise ScenarioError(f"{where}two <{tag}> elements have the id {twice}, expected each once; rename one")
 
 
 def _road(element: ET.Element) -> Road:
@@ -152,6 +161,7 @@ def _sections(road: ET.Element, length_m: float, where: str) -> tuple[Section, .
         lanes = [
             _lane(lane, where) for side in ("left", "center", "right") for lane in element.iterfind(f"{side}/lane")
         ]
+        _check_ids("lane", (lane.number for lane in lanes), f"{where}: <laneSection> at {start:g} m: ")
         sections.append(Section(start, end, {lane.number: lane for lane in lanes}))
     return tuple(sections)
 
