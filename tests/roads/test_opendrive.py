@@ -30,6 +30,14 @@ def piece(shape: str, *, length: str = "50") -> str:
     return f'<geometry s="0" x="10" y="20" hdg="0.5" length="{length}">{shape}</geometry>'
 
 
+def pieces(*, y: str = "0", hdg: str = "0") -> str:
+    """A straight line of two pieces, of which the second begins aside or the first is turned."""
+    return (
+        f'<geometry s="0" x="0" y="0" hdg="{hdg}" length="20"><line/></geometry>'
+        f'<geometry s="20" x="20" y="{y}" hdg="{hdg}" length="30"><line/></geometry>'
+    )
+
+
 def test_an_arc_is_the_circle_it_should_be() -> None:
     ds = np.linspace(0.0, 40.0, 81)
     for curvature in (0.1, -0.1, 0.02):
@@ -106,6 +114,14 @@ def test_a_road_is_placed_by_its_start_pose(tmp_path: Path) -> None:
         ({"geometry": piece("<line/>", length="40")}, "road 7: <geometry> goes from 0.000 to 40.000 m"),
         ({"geometry": piece("<line/>", length="-3")}, "road 7: <geometry> has length -3.0 m"),
         ({"lanes": LANES.replace('s="0"', 's="60"')}, "road 7: <laneSection> starts outside"),
+        ({"lanes": LANES.replace('s="0"', 's="40"')}, "road 7: the first <laneSection> starts at 40.000 m"),
+        ({"lanes": LANES.replace('s="0"', 's="0" singleSide="true"')}, "road 7: <laneSection> with singleSide"),
+        (
+            {"lanes": LANES.replace('type="driving"', 'type="driving" direction="reversed"')},
+            "road 7: lane 1: direction 'reversed'",
+        ),
+        ({"geometry": pieces(y="5")}, "road 7: the <geometry> before 20.000 m ends 5.00 m from where the next"),
+        ({"geometry": pieces(hdg="90")}, "road 7: the <geometry> before 20.000 m ends 34.04 m"),
         ({"geometry": piece('<arc curvature="nan"/>')}, "road 7: <arc> has curvature='nan'"),
         ({"geometry": piece("<line/>", length="long")}, "road 7: <geometry> has length='long'"),
         ({"geometry": ""}, "road 7: <planView>"),

@@ -39,6 +39,7 @@ MAX_LENGTH_M = 50_000.0
 MAX_CURVATURE = 5.0
 MAX_WIDTH_M = 100.0
 GAP_M = 0.05
+LEAP_M = 0.5
 
 
 def read_opendrive(path: Path) -> OpenDrive:
@@ -104,7 +105,7 @@ def _road(element: ET.Element) -> Road:
             f"{where}: <geometry> goes from {starts[0]:.3f} to {reach:.3f} m, expected 0 to {length:.3f}"
         )
     junction = element.get("junction", "-1")
-    return Road(
+    road = Road(
         name=name,
         length_m=length,
         junction=None if junction == "-1" else junction,
@@ -115,6 +116,20 @@ def _road(element: ET.Element) -> Road:
         lane_offset=_cubics(element.findall("lanes/laneOffset"), "s", where),
         sections=_sections(element, length, where),
     )
+    _check_joints(road)
+    return road
+
+
+def _check_joints(road: Road) -> None:
+    """See that each piece of a reference line begins where the one before ends."""
+    onward = road.plan[1:]
+    ends, _ = road.reference(np.array([piece.s_m - 1e-6 for piece in onward]))
+    for piece, (x, y) in zip(onward, ends.tolist(), strict=True):
+        if (leap_m := math.dist((x, y), (piece.x_m, piece.y_m))) > LEAP_M:
+            raise ScenarioError(
+                f"road {road.name}: the <geometry> before {piece.s_m:.3f} m ends {leap_m:.2f} m from where the next "
+                f"one begins, expected at most {LEAP_M} m; check s, x, y, length, and hdg in radians"
+            )
 
 
 def _geometry(element: ET.Element, where: str) -> Geometry:
@@ -156,6 +171,12 @@ def _sections(road: ET.Element, length_m: float, where: str) -> tuple[Section, .
         raise ScenarioError(f"{where}: <laneSection> elements are not ordered by s")
     if starts[0] < 0.0 or starts[-1] > length_m:
         raise ScenarioError(f"{where}: <laneSection> starts outside the road's 0 to {length_m:.3f} m")
+    if starts[0] > GAP_M:
+        raise ScenarioError(f"{where}: the first <laneSection> starts at {starts[0]:.3f} m, expected at 0")
+    if any(element.get("singleSide") in ("true", "1") for element in elements):
+        raise ScenarioError(
+            f"{where}: <laneSection> with singleSide is not supported; expected the lanes of both sides in each"
+        )
     sections: list[Section] = []
     for element, start, end in zip(elements, starts, [*starts[1:], length_m], strict=True):
         lanes = [
@@ -169,6 +190,8 @@ def _sections(road: ET.Element, length_m: float, where: str) -> tuple[Section, .
 def _lane(element: ET.Element, where: str) -> LaneRecord:
     number = _integer(element, "id", where)
     where = f"{where}: lane {number}"
+    if element.get("type") == "driving" and (direction := element.get("direction", "standard")) != "standard":
+        raise ScenarioError(f"{where}: direction {direction!r} is not supported, expected 'standard' where cars drive")
     widths = element.findall("width")
     if number != 0 and not widths:
         hint = "<border> is not supported, " if element.find("border") is not None else ""
