@@ -90,6 +90,12 @@ def test_offsets_begin_at_zero_with_the_view_and_differ_by_seed():
     assert np.abs(first.offset_m - second.offset_m).max() > 0.02
 
 
+@pytest.mark.parametrize("side", [Side.RIGHT, Side.RANDOM])
+def test_nothing_swerves_over_a_canvas_that_is_seen_from_one_place(side):
+    with pytest.raises(RecordingError, match=r"the clean drive goes 0\.00 m .* expected 1 m or more to swerve over"):
+        offsets(side, 1.5, 10.0, 10.0, 60.0, np.random.default_rng(0))
+
+
 def test_a_weave_turns_the_car_both_ways_about_the_clean_path():
     path = CleanPath.of(episode(*drive(bend, 0.3)))
     length_m = float(path.arclength_m[-1])

@@ -31,7 +31,7 @@ from roadproof.recordings import Side
 _GAIN_PRIOR = 0.3
 """1/m: between a small car with a small steering angle (0.23) and CARLA's large ones (0.42)."""
 _GAIN_PRIOR_WEIGHT = 0.05
-_FINE_M = 0.25
+_FINE_M, _LEAST_M = 0.25, 1.0
 _WEAVE_M, _WEAVE_BEGINS_M = 12.0, 4.0
 """Metres from one side to the other and back: half a metre aside turns a car by a quarter of a radian."""
 _NOISE_BEFORE_END_S, _NOISE_S = 1.5, 2.1
@@ -136,7 +136,15 @@ def offsets(
         length_m: length of the path, metres.
         rng: random generator that draws where the offset rises and, for RANDOM, its sizes.
         weaves: whether the offset weaves from side to side, to the named side first.
+
+    Raises:
+        RecordingError: the car hardly moves while the canvas is in view.
     """
+    if to_m - from_m < _LEAST_M:
+        raise RecordingError(
+            f"the clean drive goes {to_m - from_m:.2f} m from the first to the last of its frames that show the "
+            f"canvas, expected {_LEAST_M:g} m or more to swerve over; keep more frames, or check the driver"
+        )
     s = np.arange(0.0, length_m + _FINE_M, _FINE_M)
     sign = 1.0 if side is Side.RIGHT else -1.0
     if weaves:
