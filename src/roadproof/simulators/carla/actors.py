@@ -11,6 +11,7 @@ import queue
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
+from roadproof.roads.roadmap import RoadMap
 from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.tracker.judge import Contact
 from roadproof.traffic.agents import Agents
@@ -86,13 +87,14 @@ class Crowd:
     So they are the same on every server, for the same seed, to the bit.
     """
 
-    def __init__(self, session: Session, traffic: Traffic) -> None:
+    def __init__(self, session: Session, roads: RoadMap, traffic: Traffic) -> None:
         """Spawn everybody.
 
         Raises:
             SimulatorError: the server refuses.
         """
-        self._session, self.traffic = session, traffic
+        self._session, self._roads, self.traffic = session, roads, traffic
+        self._level = not any(lane.centre[:, 2].any() for lane in roads.lanes)
         library = session.library()
         cars = [b for b in library.filter("vehicle.*") if _is_car(b)]
         people = list(library.filter("walker.pedestrian.*"))
@@ -107,7 +109,7 @@ class Crowd:
         """The commands that put everybody where they are now."""
         agents = ((self._cars, self.traffic.cars, 0.0), (self._people, self.traffic.pedestrians, PERSON_UP_M))
         return [
-            carla.command.ApplyTransform(actor, _place(group, i, up))
+            carla.command.ApplyTransform(actor, self._place(group, i, up))
             for ids, group, up in agents
             for i, actor in enumerate(ids)
         ]
@@ -125,11 +127,18 @@ class Crowd:
                 if colours:
                     blueprint.set_attribute("color", colours[look // len(blueprints) % len(colours)])
             still = carla.command.SetSimulatePhysics(carla.command.FutureActor, False)
-            commands.append(carla.command.SpawnActor(blueprint, _place(agents, i, up_m)).then(still))
+            commands.append(carla.command.SpawnActor(blueprint, self._place(agents, i, up_m)).then(still))
         ids = self._session.batch(what, commands, tick=True) if commands else []
         for actor in self._session.ask(what, lambda: self._session.world.get_actors(ids)) if ids else ():
             self._session.keep(actor)
         return ids
+
+    def _place(self, agents: Agents, i: int, up_m: float) -> carla.Transform:
+        """Where one of them is, so far above the road."""
+        at = float(agents.x_m[i]), float(agents.y_m[i])
+        yaw = float(agents.yaw_rad[i])
+        road_m = 0.0 if self._level else self._roads.height_m(*at, yaw)
+        return carla_transform(*at, road_m + up_m, yaw)
 
 
 class Collisions:
@@ -162,10 +171,6 @@ class Collisions:
                 contact = Contact("vehicle", f"{other.type_id} {other.id}" if index is None else f"car {index}")
             found[contact.name] = contact
         return [found[name] for name in sorted(found)]
-
-
-def _place(agents: Agents, i: int, up_m: float) -> carla.Transform:
-    return carla_transform(float(agents.x_m[i]), float(agents.y_m[i]), up_m, float(agents.yaw_rad[i]))
 
 
 def _is_car(blueprint: carla.ActorBlueprint) -> bool:

@@ -198,7 +198,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         drive.ego = spawn_driven(session, scenario.start)
         # The others stand where they were spawned while the car settles.
         drive.crowd = None
-        crowd = None if drive.traffic is None else Crowd(session, drive.traffic)
+        crowd = None if drive.traffic is None else Crowd(session, roads, drive.traffic)
         # Lights would go on from where the last drive left them; each drive has to find them alike.
         session.ask("its traffic lights anew", session.world.reset_all_traffic_lights)
         for _ in range(SETTLE_TICKS):
