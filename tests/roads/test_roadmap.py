@@ -261,6 +261,14 @@ def test_a_road_goes_on_into_the_next(tmp_path: Path) -> None:
     assert back_home.length_m == pytest.approx(70.0)
 
 
+@pytest.mark.parametrize("kind", ["shoulder", "biking", "bus", "bidirectional", "exit", "onRamp", "slipLane"])
+def test_lanes_with_asphalt_are_no_lawn_whoever_drives_there(tmp_path: Path, kind: str) -> None:
+    beside = f'<lane id="-2" type="{kind}"><width sOffset="0" a="2.5" b="0" c="0" d="0"/></lane></right>'
+    road_map = loaded(tmp_path, street(1, 0.0).replace("</right>", beside))
+    points = np.array([[20.0, -1.75], [20.0, -4.75], [20.0, -6.5]])
+    assert road_map.surface_at(points).tolist() == [Surface.DRIVING, Surface.SHOULDER, Surface.OTHER]
+
+
 def test_a_start_before_the_beginning_of_a_road_is_refused(tmp_path: Path) -> None:
     road_map = loaded(tmp_path, street(1, 0.0))
     with pytest.raises(ScenarioError, match=r"start .* is not along a driving lane \(the nearest is 20.0 m away"):

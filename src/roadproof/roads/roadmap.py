@@ -38,13 +38,16 @@ class Surface(IntEnum):
     DRIVING = 3
 
 
+PAVED = (
+    *("shoulder", "border", "parking", "stop", "biking", "bidirectional", "bus", "taxi", "HOV"),
+    *("entry", "exit", "mwyEntry", "mwyExit", "onRamp", "offRamp", "connectingRamp", "slipLane"),
+)
+"""OpenDRIVE's types of lanes with asphalt that no route follows."""
+
 SURFACE_OF_KIND = {
     "driving": Surface.DRIVING,
     "sidewalk": Surface.SIDEWALK,
-    "shoulder": Surface.SHOULDER,
-    "border": Surface.SHOULDER,
-    "parking": Surface.SHOULDER,
-    "stop": Surface.SHOULDER,
+    **dict.fromkeys(PAVED, Surface.SHOULDER),
 }
 
 
