@@ -26,6 +26,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.scenarios import find_scenario, identity
 
 needs.town()
+from roadproof.simulators.protocol import world_of
 from roadproof.simulators.town.simulator import TownSimulator
 
 MAGENTA = magenta(380.0)
@@ -326,6 +327,24 @@ def test_an_edited_function_makes_other_drives(town, street, tmp_path):
     names = [Episodes.of(town, each, street, {}, tmp_path).file(bare) for each in (*drivers, made(1))]
     assert len(set(names)) == 4
     assert names[-1] == names[0]
+
+
+class Slippery(TownSimulator):
+    """A simulator of a user's own."""
+
+    def __init__(self, friction):
+        super().__init__()
+        self.friction = friction
+
+
+def test_a_simulator_of_ones_own_with_other_settings_makes_other_drives(street, tmp_path):
+    bare = DriveConditions(paint=CLEAN, weather=Weather.CLEAR_NOON)
+    worlds = Slippery(1.0), Slippery(0.2), TownSimulator(), Slippery(1.0)
+    names = [Episodes.of(each, PaintShy(), street, {}, tmp_path).file(bare) for each in worlds]
+    assert len(set(names)) == 3
+    assert names[-1] == names[0]
+    assert len({world_of(each) for each in worlds}) == 3
+    assert world_of(TownSimulator()) == ""
 
 
 @pytest.mark.slow

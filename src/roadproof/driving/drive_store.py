@@ -31,7 +31,7 @@ from roadproof.io.known import without_addresses
 from roadproof.processes import Pool
 from roadproof.scenarios import Scenario
 from roadproof.scenarios import identity as identity_of_scenario
-from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator
+from roadproof.simulators.protocol import Identified, PaintKind, PatternImage, Simulator, own_digest
 
 CLEAN = "clean"
 
@@ -229,4 +229,6 @@ def _parts(simulator: Simulator, driver: AnyDriver, scenario: Scenario) -> dict[
         parts["paint"] = simulator.paint
     if isinstance(simulator, Identified) and simulator.identity:
         parts["world"] = simulator.identity
+    if own := own_digest(simulator):
+        parts["simulator_digest"] = own
     return parts

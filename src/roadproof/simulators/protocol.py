@@ -15,6 +15,8 @@ from jaxtyping import UInt8
 from roadproof.datatypes import Control, Observation, Obstacle, Weather
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homography
+from roadproof.io.identity import digest, stated
+from roadproof.io.known import known_by
 from roadproof.roads.routes import Route
 from roadproof.scenarios import Scenario
 from roadproof.traffic.agents import Agents
@@ -209,5 +211,15 @@ class Identified(Protocol):
 
 
 def world_of(simulator: object) -> str:
-    """What tells a world from others: its simulator's identity or type; empty for the town as software draws it."""
-    return simulator.identity if isinstance(simulator, Identified) else type(simulator).__qualname__
+    """What tells a world from others: its simulator's identity or type; empty for the town as software draws it.
+
+    A simulator of the user's own is known by its source and by what its constructor took as well.
+    """
+    named = simulator.identity if isinstance(simulator, Identified) else type(simulator).__qualname__
+    return f"{named} {own_digest(simulator)}".strip()
+
+
+def own_digest(simulator: object) -> str:
+    """What tells a simulator of the user's own from others of its class (`io.known.known_by`); empty for ours."""
+    ours = type(simulator).__module__.partition(".")[0] == __name__.partition(".")[0]
+    return "" if ours else digest(stated(known_by(simulator)))[:16]
