@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carla_serving import straight_map
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
 from roadproof.roads.maps import load_map
@@ -84,6 +85,19 @@ def test_a_busy_town_flows_without_collisions(name: str, ego: VehicleState) -> N
         assert moved.min() > 130.0  # nobody is stuck
     else:
         assert np.median(moved) > 130.0  # a parked car holds up its lane, not the town
+
+
+def test_cars_queue_at_a_dead_end_and_behind_the_driven_car_there(tmp_path: Path) -> None:
+    path = straight_map(tmp_path, 300.0)
+    ego = VehicleState(290.0, -1.75)
+    traffic = Traffic(load_map(str(path)), cars=8, pedestrians=0, seed=0, ego=ego)
+    for step in range(700):
+        traffic.step(0.1, ego)
+        x, y = np.append(traffic.cars.x_m, ego.x_m), np.append(traffic.cars.y_m, ego.y_m)
+        apart = np.hypot(x[:, None] - x, y[:, None] - y)[np.triu_indices(len(x), 1)]
+        assert apart.min() > CAR_WIDTH_M, f"two cars at one place at step {step}"
+    assert traffic.cars.speed_mps.max() < 0.1, "all wait"
+    assert ((traffic.cars.x_m > 2.0) & (traffic.cars.x_m < 298.0)).all(), "on the road"
 
 
 def test_cars_keep_their_lanes() -> None:

@@ -48,6 +48,7 @@ class Cars:
         self._map = road_map
         self._tracks = Tracks(road_map, "driving")
         self._conflict = self._tracks.conflicts(CLEAR_M)
+        self._dead_end: Bool[np.ndarray, " t"] = np.array([not after for after in self._tracks.successors], dtype=bool)
         self._choosers = [np.random.default_rng([seed, 1, car]) for car in range(count)]
         rng = np.random.default_rng([seed, 0])
         self._wanted = rng.uniform(6.0, 8.5, count)
@@ -125,8 +126,10 @@ class Cars:
         """Points along the way of each car, and the speed allowed there."""
         length = self._tracks.length_m[self._plan]
         ends = np.cumsum(length, axis=1)
+        # Beyond a dead end the way goes straight on.
+        onward = np.where(self._dead_end[self._plan], np.inf, ends)
         s = self._s_m[:, None] + AHEAD_M
-        step = (s[:, :, None] >= ends[:, None, :-1]).sum(axis=2)
+        step = (s[:, :, None] >= onward[:, None, :-1]).sum(axis=2)
         rows = np.arange(len(s))[:, None]
         return self._tracks.points(self._plan[rows, step], s - (ends - length)[rows, step])
 
@@ -141,7 +144,7 @@ class Cars:
         self._plan[car, -1] = self._choose(car, int(self._plan[car, -2]))
 
     def _junction_stops(self, now: Agents, ego: VehicleState) -> Float[np.ndarray, " n"]:
-        """How far each car may go before it must wait at a junction; inf where it need not."""
+        """How far each car may go before it must wait at a junction or a dead end; inf where it need not."""
         tracks = self._tracks
         current, following = self._plan[:, 0].tolist(), self._plan[:, 1].tolist()
         to_end = (tracks.length_m[self._plan[:, 0]] - self._s_m).tolist()
@@ -157,6 +160,9 @@ class Cars:
                 if self._s_m[car] < 0.5 * CAR_LENGTH_M + 0.5:
                     continue
                 self._claim[car] = claim = None
+            if self._dead_end[track]:
+                stops[car] = to_end[car] - 0.5 * CAR_LENGTH_M
+                continue
             if tracks.junction[following[car]] is None:
                 continue
             to_line = to_end[car] - 0.5 * CAR_LENGTH_M - STOP_LINE_M
