@@ -87,6 +87,7 @@ def test_scenarios_that_do_not_fit_are_refused() -> None:
         ({"canvas": dataclasses.replace(good.canvas, x_m=60.0)}, "not on the way from start to goal"),
         ({"goal_m": (150.0, 40.0)}, "goal .* from the nearest driving lane"),
         ({"start": dataclasses.replace(good.start, yaw_rad=math.pi / 2)}, "start .* is not along a driving lane"),
+        ({"start": dataclasses.replace(good.start, z_m=3.0)}, "start .* z_m 3.00, but the road there is 0.00 m high"),
         ({"start": dataclasses.replace(good.start, y_m=-20.0)}, "start .* is not along a driving lane"),
     ]:
         with pytest.raises(ScenarioError, match=said) as error:

@@ -20,7 +20,7 @@ from roadproof.scenarios import Scenario
 
 BUILTIN_MAPS = ("town", "second")
 CANVAS_NEAR_ROUTE_M = 4.0
-CANVAS_OVER_ROAD_M = 0.1
+CANVAS_OVER_ROAD_M, START_OVER_ROAD_M = 0.1, 1.0
 
 
 @runtime_checkable
@@ -68,14 +68,20 @@ def scenario_route(scenario: Scenario, road_map: RoadMap) -> Route:
     """The route of a scenario, once all of it is known to fit the map.
 
     Raises:
-        ScenarioError: the start is not along a lane, the goal cannot be reached, or the canvas is off the road or
-            away from the route.
+        ScenarioError: the start is not along a lane or far above or below it, the goal cannot be reached, or the canvas
+            is off the road or away from the route.
     """
     try:
         route = road_map.route(scenario.start, scenario.goal_m)
         check_canvas(scenario.canvas, road_map)
     except ScenarioError as error:
         raise ScenarioError(f"scenario {scenario.name}: {error}") from error
+    start, road_m = scenario.start, route.at(0.0)[2]
+    if abs(start.z_m - road_m) > START_OVER_ROAD_M:
+        raise ScenarioError(
+            f"scenario {scenario.name}: start ({start.x_m:.1f}, {start.y_m:.1f}) has z_m {start.z_m:.2f}, but the road "
+            f"there is {road_m:.2f} m high, expected within {START_OVER_ROAD_M:g} m; set its z_m"
+        )
     nearest = route.locate(scenario.canvas.x_m, scenario.canvas.y_m)
     if abs(nearest.lateral_m) > CANVAS_NEAR_ROUTE_M or not 0.0 < nearest.arclength_m < route.length_m:
         raise ScenarioError(
