@@ -114,6 +114,14 @@ def test_a_road_is_placed_by_its_start_pose(tmp_path: Path) -> None:
         ({"geometry": piece("<line/>", length="40")}, "road 7: <geometry> goes from 0.000 to 40.000 m"),
         ({"geometry": piece("<line/>", length="-3")}, "road 7: <geometry> has length -3.0 m"),
         ({"lanes": LANES.replace('s="0"', 's="60"')}, "road 7: <laneSection> starts outside"),
+        (
+            {"lanes": LANES.replace('<width sOffset="0"', '<width sOffset="9"')},
+            "lane 1: the first <width> has sOffset 9.0",
+        ),
+        (
+            {"lanes": LANES.replace("<roadMark", '<roadMark sOffset="20" type="solid"/><roadMark')},
+            "road 7: lane 0: <roadMark> elements are not ordered by sOffset",
+        ),
         ({"lanes": LANES.replace('s="0"', 's="40"')}, "road 7: the first <laneSection> starts at 40.000 m"),
         ({"lanes": LANES.replace('s="0"', 's="0" singleSide="true"')}, "road 7: <laneSection> with singleSide"),
         (

@@ -196,11 +196,18 @@ def _lane(element: ET.Element, where: str) -> LaneRecord:
     if number != 0 and not widths:
         hint = "<border> is not supported, " if element.find("border") is not None else ""
         raise ScenarioError(f"{where}: {hint}expected at least one <width>")
+    width = _cubics(widths, "sOffset", where) if number != 0 else None
+    if width is not None and width.starts_m[0] > GAP_M:
+        raise ScenarioError(f"{where}: the first <width> has sOffset {width.starts_m[0]:.3f} m, expected 0")
+    marks = tuple(_mark(mark, where) for mark in element.iterfind("roadMark"))
+    offsets = [mark.offset_m for mark in marks]
+    if offsets != sorted(offsets):
+        raise ScenarioError(f"{where}: <roadMark> elements are not ordered by sOffset")
     return LaneRecord(
         number=number,
         kind=element.get("type", "none"),
-        width=_cubics(widths, "sOffset", where) if number != 0 else None,
-        marks=tuple(_mark(mark, where) for mark in element.iterfind("roadMark")),
+        width=width,
+        marks=marks,
         predecessor=_lane_link(element.find("link/predecessor"), where),
         successor=_lane_link(element.find("link/successor"), where),
     )
