@@ -142,6 +142,14 @@ def test_what_obeys_already_is_left_as_it_is():
     torch.testing.assert_close(free.pattern(free.point(pattern)).boxes, box)
 
 
+def test_marks_that_are_far_from_the_canvas_leave_all_of_it_free():
+    beside = LaneMark(points_m=((-1.0, -4.0), (-1.0, 14.0)))
+    some = SearchSpace(figures=2, family="free", limits=PaintLimits(keep_out_m=0.3))
+    unit = torch.full((2, 8), 0.5)
+    boxes = some.on(Site(size_m=SIZE_M, marks=(beside,))).pattern(unit).boxes
+    torch.testing.assert_close(boxes, some.unlimited.pattern(unit).boxes)
+
+
 def test_gradients_of_limited_patterns_are_exact_where_figures_shrink():
     limited = space(PaintLimits(max_area_m2=3.0, keep_out_m=0.4, contrast=(0.1, 0.3), printable=True), "free")
     unit = (0.1 + 0.8 * torch.rand(2, 4, 8, generator=torch.Generator().manual_seed(5))).double()

@@ -134,5 +134,6 @@ def keep_out(site: Site, distance_m: float) -> KeepOut | None:
 def _nearest(cells: Float[np.ndarray, "r c 2"], free: Bool[np.ndarray, "r c"]) -> Float[np.ndarray, "r c 2"]:
     """For every cell, the nearest free cell."""
     places, found = cells[free], cells.copy()
-    found[~free] = [places[np.square(place - places).sum(-1).argmin()] for place in cells[~free]]
+    for row, column in np.argwhere(~free):
+        found[row, column] = places[np.square(cells[row, column] - places).sum(-1).argmin()]
     return found
