@@ -10,6 +10,7 @@ import torch
 from safetensors import SafetensorError
 
 from roadproof.attacks import (
+    CMAES,
     AttackResult,
     GradOpt,
     PathDeviation,
@@ -26,7 +27,7 @@ from roadproof.attacks.published import PublishedMeasure
 from roadproof.compositing import Variation, composite, view_canvas
 from roadproof.coverage import Shape
 from roadproof.datatypes import Control
-from roadproof.errors import ControllerError, OutputError, PatternError, RoadproofError
+from roadproof.errors import ControllerError, OutputError, PatternError, RecordingError, RoadproofError
 from roadproof.paint.site import LaneMark
 from roadproof.patterns import Pattern, boxes_from_published
 from roadproof.photometry import AffineResponse, ColourTransform
@@ -222,6 +223,19 @@ def test_a_search_goes_on_from_the_candidates_of_another():
     for number, name in enumerate(first.by_group):
         np.testing.assert_allclose(more.history[0, number, :2], found[name], atol=1e-3)
         assert abs(more.history[0, number, 2] - found[name][0]) > 1e-3, "the third start is a random one"
+
+
+def test_starts_none_of_which_is_of_a_group_that_is_attacked_are_refused():
+    recordings, controller, space = recording_set(), pull_to_the_right(), SearchSpace(figures=2)
+    pooled = attack(recordings, controller, space, method=CMAES(calls=2))
+    with pytest.raises(RecordingError, match=r"starts are of all, the groups are clean\+right, clean\+left; give"):
+        attack(recordings, controller, space, method=QUICK, starts=pooled.candidates)
+    for_right = [dataclasses.replace(each, group="clean+right") for each in pooled.candidates]
+    method = GradOpt(iterations=1, restarts=2, halving=False)
+    gone_on = attack(recordings, controller, space, method=method, starts=for_right)
+    surrogate = Surrogate(recordings, controller, (RIGHT_GROUP,))
+    begun = surrogate.values(space, torch.stack([space.point(each.pattern) for each in for_right])[None])
+    np.testing.assert_allclose(gone_on.history[0, 0], begun[0], atol=1e-6)
 
 
 def test_a_checkpoint_of_another_search_or_a_damaged_one_is_not_used(tmp_path):

@@ -45,7 +45,7 @@ from roadproof.attacks.speed import SpeedMeasure
 from roadproof.checks import Check
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
-from roadproof.errors import ControllerError, RoadproofError
+from roadproof.errors import ControllerError, RecordingError, RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, require_same
 from roadproof.io.identity import stated as as_text
@@ -91,7 +91,8 @@ def attack(
         seed: seed of everything random, 0 to 2³² − 1; 0 by default.
         device: torch device on which a search on recordings computes.
         random_patterns: number of random patterns per group for the self-check on recordings; 0 leaves that check out.
-        starts: candidates of an earlier search to start from, each in its own group, in place of as many random starts.
+        starts: candidates of an earlier search to start from, each in its own group, in place of as many random starts;
+            those of groups that are not attacked are left out.
         checkpoint: file that keeps the search after every step, so that an interrupted one goes on; None for none.
         pool: processes that are open, in which groups are searched side by side; None has threads do it, which are
             slower: they wait for each other.
@@ -99,7 +100,8 @@ def attack(
 
     Raises:
         ControllerError: the controller takes frames of another size, or answers NaN.
-        RecordingError: a group names drives that the set lacks, or two groups have one name.
+        RecordingError: a group names drives that the set lacks, two groups have one name, or starts are given and none
+            is of a group that is attacked.
         PatternError: the method cannot search these patterns, or the limits on paint leave none on this road.
         RoadproofError: the seed is out of range; the method needs gradients, which a simulator does not give; groups, a
             device or random patterns are given for one; or `rollout` fails there.
@@ -120,7 +122,7 @@ def attack(
         space,
         objective=objective,
         seed=seed,
-        starts=[_points(space, starts, group) for group in groups],
+        starts=_points(space, starts, groups),
         checkpoint=None if checkpoint is None else as_path(checkpoint),
         pool=pool,
         on_step=on_step,
@@ -303,10 +305,16 @@ def kept_attack(
     return AttackResult.load(folder)
 
 
-def _points(space: SearchSpace, starts: Sequence[Candidate], group: Group) -> Float[Tensor, "s k n"]:
-    """The start candidates of a group as points of the space; a group without sides, in a simulator, takes all."""
-    points = [start.point_in(space) for start in starts if not group.sides or start.group == str(group)]
-    return torch.stack(points) if points else torch.empty(0, space.figures, len(space.names))
+def _points(space: SearchSpace, starts: Sequence[Candidate], groups: Sequence[Group]) -> list[Float[Tensor, "s k n"]]:
+    """The start candidates of each group as points of the space; a group without sides, in a simulator, takes all."""
+    own = [[start for start in starts if not group.sides or start.group == str(group)] for group in groups]
+    if starts and not any(own):
+        raise RecordingError(
+            f"all starts are of {', '.join(sorted({start.group for start in starts}))}, the groups are "
+            f"{', '.join(map(str, groups))}; give the starts' groups, or replace(start, group=...) them"
+        )
+    none = torch.empty(0, space.figures, len(space.names))
+    return [torch.stack([start.point_in(space) for start in some]) if some else none for some in own]
 
 
 def _candidates(
