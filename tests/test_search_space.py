@@ -51,6 +51,23 @@ def test_projection_clips_but_a_free_rotation_wraps():
     assert free[0, :4].tolist() == [1.0] * 4
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        (
+            {"family": "Free"},
+            "family is 'Free', expected one of published, published-canvas-centre, published-bo, free",
+        ),
+        ({"family": "free", "shape": "triangle"}, "shape is 'triangle', expected one of rectangle, .* as a Shape"),
+    ],
+)
+def test_words_that_name_no_family_or_shape_are_refused(kwargs, message):
+    # As it is without the tests' checks of types.
+    unchecked = SearchSpace.__init__.__wrapped__
+    with pytest.raises(PatternError, match=message):
+        unchecked(object.__new__(SearchSpace), figures=2, **kwargs)
+
+
 def test_a_wrapped_rotation_is_the_same_figure():
     space = SearchSpace(figures=1, family="free", shape=Shape.ELLIPSE)
     point = torch.full((1, 8), 0.4)

@@ -98,6 +98,12 @@ class SearchSpace:
     def __post_init__(self) -> None:
         if not 1 <= self.figures <= MAX_FIGURES:
             raise PatternError(f"number of figures is {self.figures}, expected 1 to {MAX_FIGURES}")
+        if self.family not in FAMILIES:
+            raise PatternError(f"family is {self.family!r:.40}, expected one of {', '.join(FAMILIES)}")
+        if type(self.shape) is not Shape:
+            raise PatternError(
+                f"shape is {self.shape!r:.40}, expected one of {', '.join(map(str, list(Shape)))} as a Shape"
+            )
         if self.family != "free" and self.shape is not Shape.RECTANGLE:
             raise PatternError(f"the {self.family} family has rectangles only; use the free family for a {self.shape}")
         match self.albedo:
