@@ -6,6 +6,7 @@ import torch
 from references import rectangles_from_published
 from roadproof.coverage import Shape
 from roadproof.errors import PatternError
+from roadproof.patterns import Pattern
 from roadproof.search_space import SearchSpace
 
 
@@ -68,12 +69,16 @@ def test_words_that_name_no_family_or_shape_are_refused(kwargs, message):
         unchecked(object.__new__(SearchSpace), figures=2, **kwargs)
 
 
-def test_a_wrapped_rotation_is_the_same_figure():
-    space = SearchSpace(figures=1, family="free", shape=Shape.ELLIPSE)
+@pytest.mark.parametrize("shape", list(Shape))
+def test_a_wrapped_rotation_is_the_same_figure(shape):
+    space = SearchSpace(figures=1, family="free", shape=shape)
     point = torch.full((1, 8), 0.4)
     turned = point + torch.eye(8)[4]
     before, after = space.pattern(point).boxes, space.pattern(space.project(turned)).boxes
     torch.testing.assert_close(before, after, atol=1e-3, rtol=0)
+    whole_deg = torch.tensor([0.0, 0.0, 0.0, 0.0, 360.0])
+    again = space.point(Pattern((shape,), before - whole_deg, torch.full((1, 3), 0.4)))
+    torch.testing.assert_close(again, point, atol=1e-5, rtol=0)
 
 
 def test_paint_is_neither_darker_nor_brighter_than_its_albedo():

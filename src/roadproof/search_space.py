@@ -179,9 +179,9 @@ class SearchSpace:
         return self.pattern(self.random((count,), torch.Generator().manual_seed(seed)))
 
     def project(self, unit: Float[Tensor, "*b k n"]) -> Float[Tensor, "*b k n"]:
-        """The nearest point inside the bounds: clipped, but a free rotation wraps round (0° and 180° are the same)."""
+        """The nearest point inside the bounds: clipped, but a free rotation wraps round: both its ends are the same."""
         clipped = unit.clamp(0.0, 1.0)
-        if self.family != "free" or self.shape is Shape.TRIANGLE:
+        if self.family != "free":
             return clipped
         return torch.cat([clipped[..., :4], unit[..., 4:5] % 1.0, clipped[..., 5:]], -1)
 
