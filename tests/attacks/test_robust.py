@@ -10,6 +10,7 @@ import torch
 
 from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import GradOpt, PathDeviation, Published, SteeringShift, Surrogate, attack, method_of
+from roadproof.attacks.gradopt import Rung, gradopt
 from roadproof.attacks.groups import RIGHT_GROUP
 from roadproof.compositing import Variation
 from roadproof.errors import RoadproofError
@@ -94,6 +95,34 @@ def test_every_step_has_looks_of_its_own_from_the_seed_and_an_interrupted_search
     assert torch.equal(resumed.pattern.boxes, whole.pattern.boxes)
     assert whole.objective == "path deviation over variations"
     assert all(check.passed for check in whole.checks if check.name == "deterministic controller")
+
+
+def test_a_search_begun_once_more_compares_in_the_same_looks_whenever_it_was_interrupted(road, monkeypatch, tmp_path):
+    monkeypatch.setattr("roadproof.attacks.gradopt.DRAWN", 24)
+    climbed = (Rung(2, 1, 1e-3, every=2, screened=2), Rung(2, 1, 1e-3, every=3, offspring=12))
+    ladder = (*climbed, Rung(4, 1, needs=1e9))
+    objective = SteeringShift(variation=Variation(draws=1, exposure_stops=2.0, wear=0.9, shift_m=1.0))
+
+    def once(stop=0, checkpoint=None):
+        told = []
+
+        def interrupt(step, _):
+            told.append(step)
+            if len(told) == stop:
+                raise KeyboardInterrupt
+
+        measure = objective.measure(road, PullsToBrightPaint(), [RIGHT_GROUP], device="cpu")
+        running = {"seed": 3, "checkpoint": checkpoint, "on_step": interrupt}
+        found = gradopt(measure, SPACE, ladder, **running)
+        return found.history, measure.frames_evaluated
+
+    whole, frames = once()
+    for stop in (3, 4):  # before and after the first step of those that are climbed once more
+        with pytest.raises(KeyboardInterrupt):
+            once(stop, tmp_path / f"{stop}.safetensors")
+        resumed, resumed_frames = once(0, tmp_path / f"{stop}.safetensors")
+        assert torch.equal(resumed, whole)
+        assert resumed_frames == frames
 
 
 def test_black_boxes_compare_patterns_in_the_same_looks(road):

@@ -253,6 +253,7 @@ def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[
         looks_back = number > at and isinstance(measure, BatchedMeasure)
         goes_on = number > at and rung.goes_on(rungs[number - 1])
         if looks_back and (best := float(state["best"].max())) < rung.needs:
+            _as_at_first(climb.views[:number])
             apart: Running = {"seed": derived_seed(seed, 3 * 10**6), "starts": (), "checkpoint": again}
             apart["on_step"] = _standing_at(done, best, on_step)
             other, _ = _climbed(climb, rungs[:number], **{**running, **apart})
@@ -291,6 +292,16 @@ def _climbed(climb: _Climb, rungs: Ladder, **running: Unpack[Running]) -> tuple[
     if again is not None:
         again.unlink(missing_ok=True)
     return state, behind
+
+
+def _as_at_first(views: Sequence[RecordedMeasure]) -> None:
+    """Give measures the looks that they had before steps drew others: in these alone points are compared."""
+    for view in views:
+        if isinstance(view, BatchedMeasure):
+            # Not part of a search's cost: one that is resumed has them already.
+            counted = view.frames_evaluated
+            view.redraw(FIXED)
+            view.frames_evaluated = counted
 
 
 def _standing_at(number: int, best: float, on_step: Callable[[int, float], object]) -> Callable[[int, float], object]:
