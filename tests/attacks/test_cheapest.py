@@ -10,7 +10,7 @@ import torch
 from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import Cheapest, GradOpt, PathDeviation, attack, cheapest, site_of
 from roadproof.attacks.cheapest import cheapest_in_words
-from roadproof.attacks.groups import RIGHT_GROUP
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.paint import PaintLimits, conspicuousness
 from roadproof.recorded.vehicle import Vehicle
@@ -89,5 +89,7 @@ def test_deviations_out_of_range_and_canvases_of_unknown_size_are_one_line(searc
     road, found = searched
     with pytest.raises(RoadproofError, match=r"cheapest is 0\.0 m, expected metres"):
         cheapest(road, PullsToBrightPaint(), found, 0.0, groups=[RIGHT_GROUP])
+    with pytest.raises(RoadproofError, match=r"found for clean\+right, the groups are clean\+left; give"):
+        cheapest(road, PullsToBrightPaint(), found, 0.5, groups=[LEFT_GROUP])
     with pytest.raises((PatternError, RoadproofError), match="canvas"):
         cheapest(recording_set(frames=3), PullsToBrightPaint(), found, 0.5, groups=[RIGHT_GROUP])

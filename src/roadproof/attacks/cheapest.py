@@ -142,14 +142,19 @@ def cheapest(
         errors.
 
     Raises:
-        RoadproofError: `wanted_m` is out of its range, or the search before was for a speed change.
+        RoadproofError: `wanted_m` is out of its range, or the search before was for a speed change or another group.
         RecordingError: the recordings lack a canvas or tracks, or the vehicle cannot be identified from them.
         PatternError: the recordings do not say how large the canvas is.
     """
     check_wanted(wanted_m)
     if found.predicted_mps is not None:
         raise RoadproofError(f"cheapest is in metres of deviation, the search before was for the {found.objective}")
-    group = next(each for each in groups if str(each) == found.group)
+    group = next((each for each in groups if str(each) == found.group), None)
+    if group is None:
+        raise RoadproofError(
+            f"the pattern was found for {found.group}, the groups are {', '.join(map(str, groups))}; "
+            "give the groups of the search before"
+        )
     goal = objective if isinstance(objective, PathDeviation) else PathDeviation()
     measure = goal.measure(recordings, controller, [group], device=device)
     site = site_of(recordings)
