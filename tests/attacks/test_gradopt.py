@@ -13,6 +13,7 @@ from roadproof.attacks import (
     CMAES,
     AttackResult,
     GradOpt,
+    Method,
     PathDeviation,
     Published,
     SteeringShift,
@@ -20,7 +21,7 @@ from roadproof.attacks import (
     attack,
     kept_attack,
 )
-from roadproof.attacks.gradopt import Rung, dropping, gradopt, random_search
+from roadproof.attacks.gradopt import Rung, Search, dropping, gradopt, random_search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.methods import method_of
 from roadproof.attacks.published import PublishedMeasure
@@ -223,6 +224,23 @@ def test_a_search_goes_on_from_the_candidates_of_another():
     for number, name in enumerate(first.by_group):
         np.testing.assert_allclose(more.history[0, number, :2], found[name], atol=1e-3)
         assert abs(more.history[0, number, 2] - found[name][0]) > 1e-3, "the third start is a random one"
+
+
+class Drawn(Method):
+    """A method of a user's own, which is no dataclass."""
+
+    word = "drawn"
+
+    def search(self, measure, space, **running):
+        unit = space.random((len(measure.groups), 2), torch.Generator().manual_seed(running["seed"]))
+        best = measure.values(space, unit)
+        return Search(unit, best, best[None])
+
+
+def test_a_method_of_the_users_own_need_not_be_a_dataclass():
+    found = attack(recording_set(), pull_to_the_right(), SearchSpace(figures=2), method=Drawn())
+    assert found.surrogate_shift == max(found.by_group.values())
+    assert found.made_of["method"]["method"] == "drawn"
 
 
 def test_starts_none_of_which_is_of_a_group_that_is_attacked_are_refused():

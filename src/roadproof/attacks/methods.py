@@ -10,7 +10,7 @@ A method knows what to make large only by its measure; where a pattern's value c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, Unpack, cast
 
 import torch
@@ -23,6 +23,7 @@ from roadproof.attacks.objective import Measure, Objective, RecordedMeasure, Ste
 from roadproof.attacks.published import MASKS, PublishedMeasure
 from roadproof.controllers import Controller
 from roadproof.errors import PatternError, RoadproofError
+from roadproof.io.known import known_by
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
 
@@ -211,5 +212,7 @@ def method_of(word: str, **given: object) -> Method:
 
 
 def stored(method: Method) -> dict[str, Any]:
-    """A method as its word and its fields, as files store it."""
+    """A method as its word and its fields, as files store it; of one of the user's own, without fields, what it is."""
+    if not is_dataclass(method):
+        return {"method": method.word, "own": known_by(method)}
     return {"method": method.word, **asdict(cast("Any", method))}
