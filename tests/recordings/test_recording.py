@@ -120,6 +120,15 @@ def test_pixel_maps_travel_with_their_drive(tmp_path):
     assert torch.equal(loaded.visible, maps.visible)
 
 
+def test_a_set_of_which_some_drives_lost_their_pixel_maps_is_refused(tmp_path):
+    maps = PixelMaps(torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200, 3), torch.rand(2, 88, 200))
+    bare = recording_set(frames=2)
+    save_recordings(replace(bare, recordings=tuple(replace(each, maps=maps) for each in bare.recordings)), tmp_path)
+    (tmp_path / "right" / "shading.npz").unlink()
+    with pytest.raises(RecordingError, match=r"drive right has no pixel maps \(shading\.npz\), other drives have some"):
+        load_recordings(tmp_path)
+
+
 @pytest.mark.parametrize("shape", [(3, 88, 200, 3), (1, 88, 200, 3), (2, 87, 200, 3)])
 def test_pixel_maps_of_other_frames_are_refused(tmp_path, shape):
     save_recordings(recording_set(frames=2), tmp_path / "set")

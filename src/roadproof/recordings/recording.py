@@ -149,7 +149,7 @@ class RecordingSet:
 
     Raises:
         RecordingError: there is no drive, two have one name, the controller's input is cut from beyond the camera
-            picture, or frames have another size than it.
+            picture, frames have another size than it, or only some drives have pixel maps.
     """
 
     camera: CameraModel
@@ -179,6 +179,12 @@ class RecordingSet:
                     f"drive {recording.name} has frames of {width}×{height}, "
                     f"expected {self.view.width_px}×{self.view.height_px} as the set's crop and resize make them"
                 )
+        without = [recording.name for recording in self.recordings if recording.maps is None]
+        if 0 < len(without) < len(names):
+            raise RecordingError(
+                f"drive {without[0]} has no pixel maps (shading.npz), other drives have some, and one colour cannot "
+                "stand for both; calibrate it again, or leave it out"
+            )
 
     @property
     def clean(self) -> Recording | None:
