@@ -10,6 +10,7 @@ from painted_ground import CANVAS, RampFollower, recorded, recorded_road
 from roadproof.coverage import Shape
 from roadproof.errors import RecordingError, SimulatorError
 from roadproof.patterns import Pattern
+from roadproof.recorded.course import Course
 from roadproof.recorded.vehicle import Vehicle
 from roadproof.recorded.world import UNSURE, BiasedStart, RecordedWorld
 from roadproof.recordings import Side
@@ -180,6 +181,11 @@ def test_sets_too_thin_to_drive_in_are_one_clear_line():
     )
     with pytest.raises(RecordingError, match="no pose for frame"):
         dataclasses.replace(clean, track=few)
+    behind = dataclasses.replace(CANVAS, x_m=float(clean.track.x_m[0]), y_m=float(clean.track.y_m[0]))
+    with pytest.raises(
+        RecordingError, match=r"the clean drive's first frame, of step \d+, comes after the canvas' end"
+    ):
+        Course(clean.track, behind, int(clean.track.step[-1]))
     with pytest.raises(SimulatorError, match=r"the vehicle has steps of 0\.05 s, the recordings have 0\.1 s"):
         RecordedWorld(road, vehicle=dataclasses.replace(VEHICLE, dt_s=0.05))
 

@@ -58,7 +58,8 @@ class Course:
         device: torch device on which cars are compared with the path.
 
     Raises:
-        RecordingError: the drive is too short, does not move, or is not known all the way to the canvas' end.
+        RecordingError: the drive is too short, does not move, is not known all the way to the canvas' end, or its first
+            recorded frame lies beyond that.
     """
 
     def __init__(
@@ -86,6 +87,11 @@ class Course:
         self.seen, self.dt_s = seen, track.dt_s
         self.first = max(seen.start, begin - rows.start)
         self.count = seen.stop - self.first
+        if self.count < 1:
+            raise RecordingError(
+                f"the clean drive's first frame, of step {shown}, comes after the canvas' end on its track; "
+                "check where the set says that its canvas lies"
+            )
         self.canvas = canvas
 
         def on_device(values: Float[np.ndarray, " n"]) -> Float[Tensor, " n"]:
