@@ -203,6 +203,14 @@ def test_limits_out_of_their_range_are_refused(value, message):
         PaintLimits(**value)
 
 
+def test_lists_in_place_of_tuples_are_refused():
+    unchecked = PaintLimits.__init__.__wrapped__  # as it is without the tests' checks of types
+    with pytest.raises(PatternError, match=r"colours is \['#dededa'\], expected tuples in place of lists"):
+        unchecked(object.__new__(PaintLimits), colours=["#dededa"])
+    with pytest.raises(PatternError, match=r"contrast is \[0, 0\.25\], expected tuples"):
+        unchecked(object.__new__(PaintLimits), contrast=[0, 0.25])
+
+
 @pytest.mark.parametrize("points", [(), ((3.0, 3.0),), ((3.0, 3.0), (3.0, 3.0))])
 def test_a_lane_mark_without_length_is_refused(points):
     with pytest.raises(PatternError, match="expected two different ones or more, in metres on the canvas"):

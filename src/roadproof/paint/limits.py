@@ -6,7 +6,7 @@ becomes a pattern that obeys, so no step of any search ever leaves them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import torch
@@ -38,7 +38,7 @@ class PaintLimits:
         marks: lane marks of the road; those that the recordings carry by default.
 
     Raises:
-        PatternError: a value is out of its range.
+        PatternError: a value is out of its range, or a list where a tuple is expected.
     """
 
     max_area_m2: float | None = None
@@ -50,6 +50,12 @@ class PaintLimits:
     marks: tuple[LaneMark, ...] | None = None
 
     def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            try:
+                hash(value)
+            except TypeError:
+                raise PatternError(f"{each.name} is {value!r:.80}, expected tuples in place of lists") from None
         if self.max_area_m2 is not None and not 0.0 < self.max_area_m2 <= 1e4:
             raise PatternError(f"max_area_m2 is {self.max_area_m2}, expected square metres above 0, and 10,000 at most")
         if self.keep_out_m is not None and not 0.0 <= self.keep_out_m <= MOST_M:
