@@ -102,3 +102,10 @@ def test_an_input_that_fills_the_memory_is_refused():
 def test_a_picture_smaller_than_the_crop_is_refused():
     with pytest.raises(GeometryError, match="at least 800×510"):
         CIL_INPUT(np.zeros((100, 100, 3), np.uint8))
+
+
+def test_a_word_that_names_no_resampling_is_refused():
+    unchecked = CropResize.__init__.__wrapped__  # as it is without the tests' checks of types
+    box = {"left_px": 0, "top_px": 0, "right_px": 8, "bottom_px": 8, "width_px": 4, "height_px": 4}
+    with pytest.raises(GeometryError, match="resampling is 'bilinear', expected antialiased-bilinear or area"):
+        unchecked(object.__new__(CropResize), **box, resampling="bilinear")

@@ -177,6 +177,20 @@ def test_lenses_that_make_no_sense_are_refused_in_one_line(model, coefficients, 
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("model", "coefficients", "says"),
+    [
+        ("pinhole", (0.0,) * 4, "lens model is 'pinhole', expected brown-conrady or fisheye"),
+        ("fisheye", [0.0] * 4, r"coefficients \[0\.0, 0\.0, 0\.0, 0\.0\], expected a tuple: k1, k2, k3, k4"),
+        ("fisheye", np.zeros(4), r"coefficients array\(.*, expected a tuple"),
+    ],
+)
+def test_lenses_of_another_model_or_type_are_refused_in_one_line(model, coefficients, says):
+    unchecked = Lens.__init__.__wrapped__  # as it is without the tests' checks of types
+    with pytest.raises(GeometryError, match=says):
+        unchecked(object.__new__(Lens), model=model, coefficients=coefficients)
+
+
 def test_a_lens_that_folds_outside_the_picture_is_accepted():
     fold = Lens(model="brown-conrady", coefficients=(-0.3, 0.0, 0.0, 0.0, 0.0))
     assert fold.limit == pytest.approx(math.sqrt(1 / 0.9))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -168,7 +168,7 @@ class CropResize:
             wide as one).
 
     Raises:
-        GeometryError: the box or the input has no pixels, or the input has too many.
+        GeometryError: the box or the input has no pixels, the input has too many, or `resampling` is another word.
     """
 
     left_px: int
@@ -188,6 +188,8 @@ class CropResize:
                 f"controller input is {self.width_px}×{self.height_px}, expected at least 1×1 pixels and at most "
                 f"{MOST_PIXELS:,} in all"
             )
+        if self.resampling not in (known := get_args(Resampling)):
+            raise GeometryError(f"resampling is {self.resampling!r:.40}, expected {' or '.join(known)}")
 
     @property
     def input_from_camera(self) -> Homography:

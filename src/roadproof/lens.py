@@ -58,14 +58,22 @@ class Lens:
             order and values of OpenCV.
 
     Raises:
-        GeometryError: there are more or fewer coefficients than the model has, or one is not within ±1000.
+        GeometryError: the model is another word, the coefficients are no tuple or more or fewer than the model has, or
+            one is not within ±1000.
     """
 
     model: LensModel
     coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        if self.model not in _NAMES:
+            raise GeometryError(f"lens model is {self.model!r:.40}, expected {' or '.join(_NAMES)}")
         names = _NAMES[self.model]
+        if type(self.coefficients) is not tuple:
+            raise GeometryError(
+                f"{self.model} lens has the coefficients {self.coefficients!r:.80}, "
+                f"expected a tuple: {', '.join(names)}"
+            )
         if len(self.coefficients) != len(names):
             raise GeometryError(
                 f"{self.model} lens has {len(self.coefficients)} coefficients, "
