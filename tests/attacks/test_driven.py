@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from paint_shy import along_a_street
+from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import (
     CMAES,
     AttackResult,
     GradOpt,
     InSimulator,
     PathDeviation,
+    RandomSearch,
     SteeringShift,
     attack,
     usual_objective,
@@ -21,10 +23,11 @@ from roadproof.attacks import (
 from roadproof.attacks.driven import DrivenMeasure, effect_of
 from roadproof.attacks.groups import LEFT_GROUP
 from roadproof.controllers import load_controller
-from roadproof.datatypes import Weather
+from roadproof.datatypes import Control, Weather
 from roadproof.driving.rollout import rollout
 from roadproof.driving.trial import judge
 from roadproof.errors import RoadproofError
+from roadproof.recorded import RecordedSimulator
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.town.simulator import TownSimulator
@@ -61,6 +64,23 @@ def test_deviation_is_the_one_that_evaluations_report():
     clean, painted = driven(scenario), driven(scenario, 1.3, painted=True)
     trial = judge(clean, painted, scenario.canvas, pattern="attack", clean_file="a.npz", painted_file="b.npz")
     assert effect_of(clean, painted, scenario.canvas).deviation == trial.deviation_m > 0.1
+
+
+def test_drives_are_kept_in_a_file_named_by_a_text(tmp_path):
+    class Straight(torch.nn.Module):
+        input_size = (88, 200)
+
+        def steer(self, frames, speed_mps, command):
+            return frames.mean((1, 2, 3)) - 0.4
+
+        def act(self, frame, speed_mps, command):
+            return Control(steer=float(frame.mean()) / 255 - 0.4, throttle=0.05)
+
+    with RecordedSimulator(drivable_set(12.0), vehicle=VEHICLE) as world:
+        place = InSimulator(world, world.scenario, keep=str(tmp_path / "driven.json"))
+        twice = [attack(place, Straight(), SPACE, method=RandomSearch(calls=1)) for _ in range(2)]
+    assert [each.cost.simulator_calls for each in twice] == [2, 1]
+    assert twice[0].driven == twice[1].driven
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, rollout
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CanvasPlacement
+from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import Pattern, raster
@@ -68,7 +69,7 @@ class InSimulator:
     scenario: Scenario
     weather: Weather = Weather.CLEAR_NOON
     seed: int = 0
-    keep: Path | None = None
+    keep: AnyPath | None = None
 
 
 class DrivenMeasure:
@@ -93,6 +94,7 @@ class DrivenMeasure:
             )
         self._deviates = isinstance(objective, PathDeviation)
         self._place, self._known = place, dict[str, Effect]()
+        self._keep = None if place.keep is None else as_path(place.keep)
         paints: dict[str, PatternImage] = {}
         parts = dict(Episodes.of(place.simulator, driver, place.scenario, paints, Path()).parts)
         # Drives are as costly in the next version; what another one answers otherwise shows in the clean drive.
@@ -108,11 +110,11 @@ class DrivenMeasure:
 
         self._drive = drive
         self.clean = drive(None, None)
-        if place.keep is not None and place.keep.exists():
-            kept = _FILE.read(place.keep)
+        if self._keep is not None and self._keep.exists():
+            kept = _FILE.read(self._keep)
             if (kept.clean, kept.conditions) != (self._told(), self._conditions):
                 raise RoadproofError(
-                    f"{place.keep} holds drives over patterns by another controller, or elsewhere: its clean drive, "
+                    f"{self._keep} holds drives over patterns by another controller, or elsewhere: its clean drive, "
                     "scenario, canvas, weather, seed or simulator is another; give another file, or remove it"
                 )
             self._known = kept.drives
@@ -129,8 +131,8 @@ class DrivenMeasure:
         key = digest(paint)[:24]
         if key not in self._known:
             self._known[key] = effect_of(self.clean, self._drive(paint, self._enough()), self._place.scenario.canvas)
-            if self._place.keep is not None:
-                _FILE.write(self._place.keep, _Kept(self._known, self._told(), self._conditions))
+            if self._keep is not None:
+                _FILE.write(self._keep, _Kept(self._known, self._told(), self._conditions))
         return self._known[key]
 
     def fingerprint(self) -> str:
