@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from roadproof.attacks import GradOpt, attack
+from roadproof.attacks import GradOpt, RandomSearch, attack
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
 
@@ -26,8 +26,9 @@ class Rounded(LinearController):
         return super().steer((frames * 255).round() / 255, speed_mps, command)
 
 
-def checks(controller, random_patterns=0):
-    result = attack(recording_set(), controller, SearchSpace(figures=1), method=QUICK, random_patterns=random_patterns)
+def checks(controller, random_patterns=0, method=QUICK):
+    space = SearchSpace(figures=1)
+    result = attack(recording_set(), controller, space, method=method, random_patterns=random_patterns)
     return {check.name: check for check in result.checks}
 
 
@@ -58,6 +59,11 @@ def test_random_patterns_that_beat_the_search_are_noticed(monkeypatch):
     check = checks(linear(), random_patterns=5)["better than random search"]
     assert not check.passed
     assert "restarts" in check.advice
+
+
+def test_what_a_search_without_gradients_found_is_not_told_as_theirs():
+    finding = checks(linear(), random_patterns=2, method=RandomSearch(calls=2))["better than random search"].finding
+    assert finding.startswith("the search found ")
 
 
 def test_parameters_on_their_bounds_are_noticed(monkeypatch):

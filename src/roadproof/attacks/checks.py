@@ -142,6 +142,8 @@ def _check_against_random(
     return Check(
         "better than random search",
         passed,
-        f"gradients found {found:.3f}, the best of {patterns} random patterns a group has {chance:.3f}",
-        "" if passed else "use more restarts or a smaller learning rate; the controller's gradients may mislead",
+        f"the search found {found:.3f}, the best of {patterns} random patterns a group has {chance:.3f}",
+        ""
+        if passed
+        else "use more restarts or more calls; the controller's gradients, where they are used, may mislead",
     )
