@@ -226,6 +226,41 @@ def test_a_search_goes_on_from_the_candidates_of_another():
         assert abs(more.history[0, number, 2] - found[name][0]) > 1e-3, "the third start is a random one"
 
 
+class InDouble:
+    """The steering shift as a measure of a user's own, in double precision."""
+
+    def __init__(self, exact):
+        self.exact, self.groups, self.device, self.frames_evaluated = exact, exact.groups, exact.device, 0
+
+    def values(self, space, unit):
+        return self.exact.values(space, unit).double()
+
+    def values_and_gradients(self, space, unit):
+        value, gradient = self.exact.values_and_gradients(space, unit)
+        return value.double(), gradient.double()
+
+    def thinned(self, every):
+        return InDouble(self.exact.thinned(every))
+
+    def open_loop(self):
+        return self
+
+    def readings(self, space, unit):
+        return self.values(space, unit), None
+
+    def fingerprint(self):
+        return f"in double {self.exact.fingerprint()}"
+
+
+def test_a_measure_of_the_users_own_may_be_in_double_precision():
+    surrogate, space = Surrogate(recording_set(), pull_to_the_right(), (RIGHT_GROUP,)), SearchSpace(figures=2)
+    ladder = (Rung(3, 2, every=2, screened=1), Rung(2, 2, offspring=4), Rung(2, 2, 0.01))
+    own = gradopt(InDouble(surrogate), space, ladder, seed=2)
+    usual = gradopt(surrogate, space, ladder, seed=2)
+    assert torch.equal(own.best_unit, usual.best_unit)
+    assert torch.equal(own.history, usual.history)
+
+
 class Drawn(Method):
     """A method of a user's own, which is no dataclass."""
 

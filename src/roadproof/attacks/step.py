@@ -67,6 +67,8 @@ def stepped(
     """
     unit = state["unit"]
     value, gradient = measure.values_and_gradients(space, unit)
+    # A user's own measure may have more digits.
+    value, gradient = value.to(state["best"]), gradient.to(unit)
     finite = value.isfinite().all() & gradient.isfinite().all()
     better = value > state["best"]
     down = -gradient
