@@ -101,7 +101,8 @@ class AttackResult(Candidate):
         objective: what was made large: "steering shift", "path deviation", "speed change", or the name of the user's
             own.
         by_group: best value of every group, in the objective's unit: steer units per frame, metres, or m/s; for the
-            published method a sum over frames.
+            published method a sum over frames. Without gradients only the candidates count, which are the best for
+            whichever group, so that another group may have a lower value here than patterns that were tried.
         candidates: best pattern of every start, the strongest first, by the least predicted effect if there is one.
             The steering shift ranks only coarsely, so that driving over the first few finds a stronger one than the
             first.
