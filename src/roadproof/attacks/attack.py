@@ -305,7 +305,7 @@ def kept_attack(
     return AttackResult.load(folder)
 
 
-def _points(space: SearchSpace, starts: Sequence[Candidate], groups: Sequence[Group]) -> list[Float[Tensor, "s k n"]]:
+def _points(space: SearchSpace, starts: Sequence[Candidate], groups: Sequence[Group]) -> list[Float[Tensor, "_ k n"]]:
     """The start candidates of each group as points of the space; a group without sides, in a simulator, takes all."""
     own = [[start for start in starts if not group.sides or start.group == str(group)] for group in groups]
     if starts and not any(own):

@@ -152,7 +152,7 @@ class Running(TypedDict, total=False):
     """
 
     seed: Required[int]
-    starts: Sequence[Float[Tensor, "s k n"]]
+    starts: Sequence[Float[Tensor, "_ k n"]]
     checkpoint: Path | None
     objective: Objective
     on_step: Callable[[int, float], object]
@@ -310,7 +310,7 @@ def _standing_at(number: int, best: float, on_step: Callable[[int, float], objec
 
 
 def _starts(
-    measure: RecordedMeasure, space: SearchSpace, count: int, seed: int, given: Sequence[Float[Tensor, "s k n"]]
+    measure: RecordedMeasure, space: SearchSpace, count: int, seed: int, given: Sequence[Float[Tensor, "_ k n"]]
 ) -> Points:
     """Random points of every group, of which the first are replaced by the points given."""
     unit = space.random((len(measure.groups), count), torch.Generator().manual_seed(seed))
