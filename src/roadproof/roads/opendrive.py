@@ -80,6 +80,11 @@ def _check_ids(tag: str, ids: Iterable[str | int], where: str = "") -> None:
         raise ScenarioError(f"{where}two <{tag}> elements have the id {twice}, expected each once; rename one")
 
 
+def _check_order(tag: str, by: str, values: list[float], where: str) -> None:
+    if values != sorted(values):
+        raise ScenarioError(f"{where}: <{tag}> elements are not ordered by {by}")
+
+
 def _road(element: ET.Element) -> Road:
     name = _text(element, "id", "road")
     where = f"road {name}"
@@ -97,8 +102,7 @@ def _road(element: ET.Element) -> Road:
     if not plan:
         raise ScenarioError(f"{where}: <planView> has no <geometry> of some length")
     starts = [piece.s_m for piece in plan]
-    if starts != sorted(starts):
-        raise ScenarioError(f"{where}: <geometry> elements are not ordered by s")
+    _check_order("geometry", "s", starts, where)
     reach = plan[-1].s_m + plan[-1].length_m
     if abs(reach - length) > GAP_M or starts[0] > GAP_M:
         raise ScenarioError(
@@ -167,8 +171,7 @@ def _sections(road: ET.Element, length_m: float, where: str) -> tuple[Section, .
     if not elements:
         raise ScenarioError(f"{where}: no <laneSection>, expected at least one")
     starts = [_number(element, "s", where) for element in elements]
-    if starts != sorted(starts):
-        raise ScenarioError(f"{where}: <laneSection> elements are not ordered by s")
+    _check_order("laneSection", "s", starts, where)
     if starts[0] < 0.0 or starts[-1] > length_m:
         raise ScenarioError(f"{where}: <laneSection> starts outside the road's 0 to {length_m:.3f} m")
     if starts[0] > GAP_M:
@@ -200,9 +203,7 @@ def _lane(element: ET.Element, where: str) -> LaneRecord:
     if width is not None and width.starts_m[0] > GAP_M:
         raise ScenarioError(f"{where}: the first <width> has sOffset {width.starts_m[0]:.3f} m, expected 0")
     marks = tuple(_mark(mark, where) for mark in element.iterfind("roadMark"))
-    offsets = [mark.offset_m for mark in marks]
-    if offsets != sorted(offsets):
-        raise ScenarioError(f"{where}: <roadMark> elements are not ordered by sOffset")
+    _check_order("roadMark", "sOffset", [mark.offset_m for mark in marks], where)
     return LaneRecord(
         number=number,
         kind=element.get("type", "none"),
@@ -266,10 +267,11 @@ def _contact(element: ET.Element, where: str) -> Literal["start", "end"]:
 def _cubics(elements: list[ET.Element], start: str, where: str) -> Cubics:
     if not elements:
         return Cubics(np.zeros(1), np.zeros((1, 4)))
-    starts = np.array([_number(element, start, where) for element in elements])
-    if (np.diff(starts) < 0).any():
-        raise ScenarioError(f"{where}: <{elements[0].tag}> elements are not ordered by {start}")
-    return Cubics(starts, np.array([[_number(element, key, where) for key in "abcd"] for element in elements]))
+    starts = [_number(element, start, where) for element in elements]
+    _check_order(elements[0].tag, start, starts, where)
+    return Cubics(
+        np.array(starts), np.array([[_number(element, key, where) for key in "abcd"] for element in elements])
+    )
 
 
 def _text(element: ET.Element, name: str, where: str) -> str:
