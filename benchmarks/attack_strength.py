@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from roadproof.attacks import GradOpt, PathDeviation, SteeringShift
-from roadproof.attacks.gradopt import dropping, gradopt, random_search
+from roadproof.attacks.checks import random_search
+from roadproof.attacks.gradopt import dropping, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.controllers import load_controller
 from roadproof.io.files import write_json

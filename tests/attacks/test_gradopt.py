@@ -21,7 +21,8 @@ from roadproof.attacks import (
     attack,
     kept_attack,
 )
-from roadproof.attacks.gradopt import Rung, Search, dropping, gradopt, random_search
+from roadproof.attacks.checks import random_search
+from roadproof.attacks.gradopt import Rung, Search, dropping, gradopt
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP, parse_groups
 from roadproof.attacks.methods import method_of
 from roadproof.attacks.published import PublishedMeasure

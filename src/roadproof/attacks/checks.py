@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from roadproof.attacks.closed_loop import ClosedLoopMeasure
-from roadproof.attacks.gradopt import Search, random_search
+from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import Group
-from roadproof.attacks.objective import RecordedMeasure
+from roadproof.attacks.objective import Measure, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside
 from roadproof.checks import Check
 from roadproof.patterns import Pattern
@@ -147,3 +149,13 @@ def _check_against_random(
         if passed
         else "use more restarts or more calls; the controller's gradients, where they are used, may mislead",
     )
+
+
+def random_search(
+    measure: Measure | Beside, space: SearchSpace, *, patterns: int, seed: int
+) -> tuple[Float[Tensor, "g k n"], Float[Tensor, " g"]]:
+    """The best of a number of random patterns for every group: the least an attack has to beat."""
+    unit = space.random((1, patterns), torch.Generator().manual_seed(seed)).to(measure.device)
+    unit = unit.expand(len(measure.groups), -1, -1, -1)
+    best, index = measure.values(space, unit).max(1)
+    return unit[torch.arange(len(unit)), index], best

@@ -28,7 +28,7 @@ from roadproof.attacks.batched import BatchedMeasure
 from roadproof.attacks.captured import Replay, replay_of, steps_in_words
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.attacks.groups import Points, Values
-from roadproof.attacks.objective import Measure, Objective, RecordedMeasure
+from roadproof.attacks.objective import Objective, RecordedMeasure
 from roadproof.attacks.side_by_side import Beside, Sides
 from roadproof.attacks.step import State, begun, corrected, require_finite_step, state_at, stepped
 from roadproof.attacks.surrogate import FIXED
@@ -393,13 +393,3 @@ def _step(
     changed, value, finite = stepped(measure, space, momentum, rate, root, state)
     require_finite_step(finite)
     return changed | {"history": torch.cat([state["history"], value[None]]), "done": state["done"] + 1}
-
-
-def random_search(
-    measure: Measure | Beside, space: SearchSpace, *, patterns: int, seed: int
-) -> tuple[Float[Tensor, "g k n"], Float[Tensor, " g"]]:
-    """The best of a number of random patterns for every group: the least an attack has to beat."""
-    unit = space.random((1, patterns), torch.Generator().manual_seed(seed)).to(measure.device)
-    unit = unit.expand(len(measure.groups), -1, -1, -1)
-    best, index = measure.values(space, unit).max(1)
-    return unit[torch.arange(len(unit)), index], best
