@@ -1,7 +1,23 @@
 """The largest numbers that are taken, wherever they are given: on the command line, in a plan, in a file."""
 
+from __future__ import annotations
+
+from numbers import Integral
+
+from roadproof.errors import RoadproofError
+
 MAX_SEED = 2**32 - 1
 MAX_FIGURES = 64
 MAX_CROWD = 500
 MAX_PROCESSES = 256
 MANY = 1_000_000
+
+
+def check_seed(seed: object, what: str, error: type[RoadproofError]) -> None:
+    """See that a seed is a whole number in its range.
+
+    Raises:
+        error: it is none, or out of its range.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= MAX_SEED:
+        raise error(f"{what} is {seed!r:.40}, expected a whole number from 0 to {MAX_SEED:,}")

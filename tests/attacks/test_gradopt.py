@@ -495,10 +495,22 @@ def test_a_controller_for_other_frames_or_one_that_answers_nan_is_refused():
         Surrogate(recording_set(), LinearController(torch.full((3, 88, 200), torch.nan)), (RIGHT_GROUP,))
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32])
-def test_a_seed_out_of_range_is_one_line(seed):
-    with pytest.raises(RoadproofError, match=f"the seed is {seed}, expected 0 to 4,294,967,295"):
+@pytest.mark.parametrize("seed", [-1, 2**32, True])
+def test_a_seed_that_is_no_whole_number_in_its_range_is_one_line(seed):
+    with pytest.raises(RoadproofError, match=f"seed is {seed!r}, expected a whole number from 0 to 4,294,967,295"):
         attack(recording_set(), pull_to_the_right(), SearchSpace(figures=1), method=QUICK, seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"random_patterns": -3}, "random_patterns is -3, expected 0 or more"),
+        ({"device": "gpu"}, "device 'gpu' is unknown, expected cpu, cuda"),
+    ],
+)
+def test_what_an_attack_cannot_use_is_one_line(given, message):
+    with pytest.raises(RoadproofError, match=message):
+        attack(recording_set(), pull_to_the_right(), SearchSpace(figures=1), method=QUICK, **given)
 
 
 def test_methods_that_make_no_sense_are_refused():

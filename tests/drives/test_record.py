@@ -158,6 +158,12 @@ def test_a_driver_that_answers_nan_is_refused(town):
         record(town, lambda _: lambda _: Control(float("nan")), LEFT)
 
 
+def test_a_seed_that_is_none_is_refused_and_writes_nothing(town, tmp_path):
+    with pytest.raises(RecordingError, match="seed is -1, expected a whole number"):
+        record(town, expert, LEFT, **ASKED | {"seed": -1}, folder=tmp_path / "record")
+    assert not (tmp_path / "record").exists()
+
+
 def test_a_folder_that_cannot_be_written_is_named(town, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):

@@ -219,7 +219,7 @@ def test_conditions_that_make_no_sense_are_refused(town, street, tmp_path, messa
 def test_a_drive_is_told_of_once_however_often_it_is_asked_for(town, street, tmp_path):
     with pytest.raises(EpisodeError, match="weathers has clear-noon twice"):
         evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, weathers=(WEATHERS[0], WEATHERS[0]))
-    with pytest.raises(EpisodeError, match="the seed is -1, expected 0 or more"):
+    with pytest.raises(EpisodeError, match="seed is -1, expected a whole number from 0 to"):
         evaluate(town, PaintShy(), street, MAGENTA, folder=tmp_path, seed=-1)
     nowhere = StartRange(right_m=0.0, turned_rad=0.0, faster_mps=0.0)
     options = {"weathers": WEATHERS[:1], "starts": 3, "start_range": nowhere, "runs": 0}

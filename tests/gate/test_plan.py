@@ -90,7 +90,7 @@ MISTAKES = {
         "starts has 5 that differ among the 6 drawn",
     ),
     "start range": (("right_m = 0.05", "right_m = 3.0"), "right_m of the starts is 3.0, expected 0 to 1"),
-    "seed": (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds is -1, expected 0 to"),
+    "seed": (("seeds = [0, 1]", "seeds = [0, -1]"), "seeds is -1, expected a whole number from 0 to"),
     "seed twice": (("seeds = [0, 1]", "seeds = [1, 1]"), "seeds has 1 twice"),
     "no seed": (("seeds = [0, 1]", "seeds = []"), "seeds is empty"),
     "budget": (("version = 1", 'version = 1\nbudget = "huge"'), "budget is 'huge', expected one of smoke, full"),

@@ -100,6 +100,16 @@ def test_processes_that_have_no_simulator_are_refused_before_anything_is_driven(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [({"seed": -1}, "seed is -1, expected a whole number"), ({"device": "gpu"}, "'gpu' is unknown")],
+)
+def test_a_seed_or_device_that_is_none_is_refused_before_anything_is_driven(town, tmp_path, given, message):
+    with pytest.raises(RoadproofError, match=message):
+        run(town, tmp_path / "run", **given)
+    assert not (tmp_path / "run").exists()
+
+
 def test_budgets_say_what_they_spend():
     published = BUDGETS["published"]
     assert published.trajectories.count == 3

@@ -45,13 +45,14 @@ from roadproof.attacks.speed import SpeedMeasure
 from roadproof.checks import Check
 from roadproof.controllers import Controller
 from roadproof.controllers.identity import parts_of
+from roadproof.controllers.loading import device_of
 from roadproof.errors import ControllerError, RecordingError, RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, require_same
 from roadproof.io.identity import stated as as_text
 from roadproof.io.known import known_by
 from roadproof.io.records import plain
-from roadproof.limits import MAX_SEED
+from roadproof.limits import check_seed
 from roadproof.paint import Site, conspicuousness
 from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
@@ -103,11 +104,11 @@ def attack(
         RecordingError: a group names drives that the set lacks, two groups have one name, or starts are given and none
             is of a group that is attacked.
         PatternError: the method cannot search these patterns, or the limits on paint leave none on this road.
-        RoadproofError: the seed is out of range; the method needs gradients, which a simulator does not give; groups, a
-            device or random patterns are given for one; or `rollout` fails there.
+        DeviceError: there is no such device.
+        RoadproofError: the seed or the number of random patterns is out of range; the method needs gradients, which a
+            simulator does not give; groups, a device or random patterns are given for one; or `rollout` fails there.
     """
-    if not 0 <= seed <= MAX_SEED:
-        raise RoadproofError(f"the seed is {seed}, expected 0 to {MAX_SEED:,}")
+    check_seed(seed, "seed", RoadproofError)
     method = method or GradOpt()
     objective = objective or usual_objective(recordings, method)
     method.check_space(space)
@@ -179,6 +180,9 @@ def _begun(
     if isinstance(recordings, InSimulator):
         _refuse_in_simulator(method, groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
         return site_at(recordings.simulator, recordings.scenario), DrivenMeasure(recordings, controller, objective)
+    device_of(str(device))
+    if random_patterns < 0:
+        raise RoadproofError(f"random_patterns is {random_patterns}, expected 0 or more")
     groups = groups or method.groups(recordings, objective)
     require_names(groups)
     return site_of(recordings), method.measure(objective, recordings, controller, groups, device=device)

@@ -24,6 +24,7 @@ from roadproof.controllers.asking import (
     require_size,
     steer_of,
 )
+from roadproof.controllers.loading import device_of
 from roadproof.controllers.protocol import (
     Commands,
     Controller,
@@ -130,7 +131,9 @@ def require_usable(
     Raises:
         ControllerError: the controller takes another frame size, raises, answers wrongly, writes into its frames, or
             has no finite gradient.
+        DeviceError: there is no such device.
     """
+    device_of(device)
     require_size(controller, size, "here they have", "use a controller for these, or record for this one")
     few = _Drive(*(values[:2] for values in _made_up_drive(size, device, seed=0)))
     leaf = few.frames.clone().requires_grad_()

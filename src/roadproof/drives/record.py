@@ -26,6 +26,7 @@ from roadproof.errors import GeometryError, RecordingError, RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.homographies import Homography
 from roadproof.io.files import AnyPath, as_path
+from roadproof.limits import check_seed
 from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Side, evenly
 from roadproof.scenarios import Scenario
@@ -75,6 +76,7 @@ def record(
         SimulatorError, ScenarioError, ControllerError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
+    check_seed(seed, "seed", RecordingError)
     folder = None if folder is None else as_path(folder)
     settings = Settings(
         scenario=scenario,

@@ -19,6 +19,7 @@ from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import each_once
+from roadproof.limits import check_seed
 from roadproof.patterns import Pattern, raster
 from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
@@ -80,6 +81,7 @@ def evaluate(
         OutputError: the folder cannot be written.
     """
     folder = as_path(folder)
+    check_seed(seed, "seed", EpisodeError)
     _check_numbers(weathers, starts, runs, cars, pedestrians, processes)
     # A range of nothing draws one start again and again.
     begins = tuple(dict.fromkeys(start_range.draw(starts, seed))) if starts else (NOMINAL,)

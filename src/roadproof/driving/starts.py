@@ -10,6 +10,7 @@ import numpy as np
 
 from roadproof.errors import EpisodeError
 from roadproof.io.tables import check_range
+from roadproof.limits import check_seed
 from roadproof.scenarios import Scenario
 
 MOST = {"right_m": 1.0, "turned_rad": 0.3, "faster_mps": 5.0}
@@ -72,10 +73,9 @@ class StartRange:
         """Draw `count` starts; the same for the same seed.
 
         Raises:
-            EpisodeError: the seed is below 0.
+            EpisodeError: the seed is out of range.
         """
-        if seed < 0:
-            raise EpisodeError(f"the seed is {seed}, expected 0 or more")
+        check_seed(seed, "seed", EpisodeError)
         low, high = np.array([-self.right_m, -self.turned_rad, 0.0]), np.array(list(asdict(self).values()))
         drawn = np.random.default_rng((seed, 0x57A27)).uniform(low, high, (count, 3)).round(4)
         return tuple(StartOffset(right_m=r, turned_rad=t, faster_mps=f) for r, t, f in drawn.tolist())

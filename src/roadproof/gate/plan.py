@@ -16,7 +16,7 @@ from roadproof.gate.verdict import Change, Kind, least_drives
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import build, check_range, each_once
 from roadproof.io.text import read_toml
-from roadproof.limits import MAX_FIGURES, MAX_SEED
+from roadproof.limits import MAX_FIGURES, check_seed
 from roadproof.paint import PaintLimits
 from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
 from roadproof.scenarios import BUILTIN_FILE, Scenario, load_scenarios
@@ -168,7 +168,7 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
     each_once(stated.scenarios, "scenarios", CheckError)
     each_once(stated.seeds, "seeds", CheckError)
     for seed in stated.seeds:
-        check_range(seed, "seeds", 0, MAX_SEED, CheckError)
+        check_seed(seed, "seeds", CheckError)
     if budget is not None:
         _one_of(budget, "budget", BUDGETS)
     chosen: BudgetName = "full" if (budget or stated.budget) == "full" else "smoke"

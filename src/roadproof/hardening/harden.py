@@ -34,8 +34,7 @@ from roadproof.hardening.tuning import TrainingStep, require_loss
 from roadproof.hardening.tuning import training_step as usual_step
 from roadproof.io.files import AnyPath, as_path, write_atomically
 from roadproof.io.locks import working_in
-from roadproof.io.tables import check_range
-from roadproof.limits import MAX_SEED
+from roadproof.limits import check_seed
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.pipeline.stages import OnProgress, check_paint
 from roadproof.processes import require_opened
@@ -97,7 +96,7 @@ def harden(
         raise TrainingError(f"rounds is {rounds}, expected 1 or more")
     if clean_on and not judge_on:
         raise TrainingError("clean_on is driven where the result is judged; give judge_on too, or leave it out")
-    check_range(seed, "seed", 0, MAX_SEED, TrainingError)
+    check_seed(seed, "seed", TrainingError)
     budget, space = budget or HardeningBudget(), space or SearchSpace(figures=5)
     if judge_on:
         budget.require_libraries(space)

@@ -33,6 +33,7 @@ from roadproof.errors import RoadproofError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import html_of, table
 from roadproof.io.locks import working_in
+from roadproof.limits import check_seed
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
 from roadproof.pipeline.fidelity import Fidelity
@@ -159,6 +160,7 @@ def stress_test(
         ControllerError: the controller raises, answers wrongly or gives no gradient; nothing is driven then.
     """
     folder = as_path(folder)
+    check_seed(seed, "seed", RoadproofError)
     require_opened(processes, factory)
     stages = Stages(
         simulator=simulator,

@@ -18,7 +18,7 @@ from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest, stated
 from roadproof.io.tables import build, check_range, each_once
 from roadproof.io.text import read_toml
-from roadproof.limits import MAX_CROWD, MAX_FIGURES, MAX_SEED
+from roadproof.limits import MAX_CROWD, MAX_FIGURES, check_seed
 from roadproof.paint import PaintLimits
 from roadproof.plans import beside, chosen_scenarios, refuse_untrusted, take_head
 from roadproof.scenarios import BUILTIN_FILE, Scenario, identity, load_scenarios
@@ -167,7 +167,7 @@ class Study(Conditions):
                     f"figures has {figures!r}, expected 1 to {MAX_FIGURES}, or {BLACK!r} for one black figure"
                 )
         for seed in self.seeds:
-            check_range(seed, "seeds", 0, MAX_SEED, StudyError)
+            check_seed(seed, "seeds", StudyError)
             self.starts.check_drawn([seed])
         check_spec(self.simulator)
         self._check_paint()
