@@ -4,6 +4,7 @@ import dataclasses
 import json
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
@@ -91,9 +92,10 @@ def planned(folder, budget):
     )
 
 
-def stages_of(plan, town):
-    ledger = Ledger(plan.folder, {}, STAGES)
-    return HardeningStages(plan, town, load_controller("pilotnet"), training_step, None, 1, ledger, lambda *_: None)
+def stages_of(plan, town, *, processes=1, on_progress=lambda *_: None):
+    ledger, factory = Ledger(plan.folder, {}, STAGES), partial(TownSimulator, dt_s=0.2)
+    teacher = load_controller("pilotnet")
+    return HardeningStages(plan, town, teacher, training_step, factory, processes, ledger, on_progress)
 
 
 def test_the_round_is_kept_that_leaves_its_lane_least_often_and_then_deviates_least():
@@ -124,11 +126,33 @@ def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):
     assert not (asked.round(1) / "town").exists()
     both = stages.town(2).draw(500, torch.Generator().manual_seed(0), to_paint=False)
     assert stages.ledger.cost["town"].simulator_calls == 2
-    drives = [Shard.load(asked.town(number) / "drive-00000.npz") for number in (0, 1)]
+    drives = [Shard.load(asked.town_drive(number, 0)) for number in (0, 1)]
     seen = [{int(frame.sum()) for frame in drive.frames} for drive in drives]
     shown = [{round(255 * float(frame.double().sum())) for frame in views.frames} for views in (first, both)]
     assert shown[0] <= seen[0]
     assert shown[1] & (seen[1] - seen[0]), "where the controller of round 1 went"
+
+
+@pytest.mark.slow
+def test_two_processes_drive_through_the_town_and_over_the_bare_road_as_one_does(town, tmp_path):
+    streets = [street(tmp_path, "near", 15.0), street(tmp_path, "far", 115.0)]
+    budget = dataclasses.replace(TINY, town_drives=2)
+    plans = [dataclasses.replace(planned(tmp_path, budget), folder=tmp_path / name) for name in ("one", "two")]
+    told = []
+    for plan, processes in zip(plans, (1, 2), strict=True):
+        plan.folder.mkdir()
+        stages = stages_of(plan, town, processes=processes, on_progress=lambda *each: told.append(each))
+        stages.town(1)
+        assert [each.drives for each in stages.drive_clean(0, [*streets, streets[0]])] == [2, 2]
+    for path in sorted(plans[0].folder.rglob("*.npz")):
+        other = plans[1].folder / path.relative_to(plans[0].folder)
+        with np.load(path) as one, np.load(other) as two:
+            assert one.files == two.files
+            assert all(
+                np.array_equal(one[name], two[name], equal_nan=one[name].dtype.kind == "f") for name in one.files
+            )
+    assert ("Round 0: driving through the town", 2, 2, "drives") in told
+    assert {each[3] for each in told if each[0] == "Bare road, before"} >= {"streets", "streets, far is done"}
 
 
 @pytest.mark.slow

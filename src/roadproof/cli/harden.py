@@ -110,7 +110,9 @@ def _workload(
     """Attacks, tuning and judging, from numbers of streets; clean drives, on all streets for 0, are made twice."""
     from roadproof.pipeline.workload import Workload, frame_seconds, of_drives, of_evaluation, of_run, of_search
 
-    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who)) + of_drives(budget.town_drives)
+    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who)) + of_drives(
+        budget.town_drives, processes=processes
+    )
     whole = of_run(budget.attack, who, film=False).times(training, at_once=processes).times(rounds + 1)
     whole += learnt.times(rounds)
     if judging:
@@ -122,5 +124,6 @@ def _workload(
         # The one after also drives over what was found against the one before.
         for each in (before, before + driven):
             whole += each.times(judging, at_once=processes)
-        whole += of_drives(2 * len(budget.clean_weathers) * (clean or training + judging))
+        bare = 2 * len(budget.clean_weathers) * (clean or training + judging)
+        whole += of_drives(bare, processes=processes)
     return whole

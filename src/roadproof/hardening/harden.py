@@ -81,7 +81,7 @@ def harden(
         seed: the seed of everything random, 0 to 2³² − 1; judging has fresh ones.
         device: the torch device on which to search and learn, such as "cpu" or "cuda".
         factory: opens one more simulator of the same kind; needed for several processes.
-        processes: how many streets are attacked at once, each in a process with a simulator of its own.
+        processes: how many streets are attacked or driven at once, each in a process with a simulator of its own.
         on_progress: called at every step with the stage's name, the steps done, their number, and a word on them.
 
     Raises:

@@ -49,9 +49,9 @@ class HardeningPlan:
         """The folder of a round; 0 is the controller as it came."""
         return self.folder / f"round-{number}"
 
-    def town(self, number: int) -> Path:
-        """The folder of the drives through the town by a round's controller."""
-        return (self.round(number) if number else self.folder) / "town"
+    def town_drive(self, number: int, drive: int) -> Path:
+        """The file of a drive through the town by a round's controller."""
+        return (self.round(number) if number else self.folder) / "town" / f"drive-{drive:05d}.npz"
 
     def judged(self, number: int, scenario: Scenario) -> Path:
         """The folder of the judgement of a round's controller on one street."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import torch
 from torch import nn
@@ -36,8 +36,10 @@ from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.training.collection import CollectionPlan, record_drive
 from roadproof.training.dataset import Dataset
 
-StreetWork: TypeAlias = Callable[[HardeningPlan, int, Simulator, Scenario], object]
-"""What is done on a street with a round's controller, in a process with a simulator of its own; the folder keeps it."""
+Work = TypeVar("Work", Scenario, int)
+RoundWork: TypeAlias = Callable[[HardeningPlan, int, Any, Work], object]
+"""What a round's controller does on a street, or in a drive, in a process with a simulator of its own; the folder keeps
+it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,15 +141,17 @@ class HardeningStages:
 
     def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[BareDrives, BareDrives]:
         """Drive over the bare road with the controllers before and after."""
+        scenarios = list(dict.fromkeys(scenarios))  # no two processes drive into one folder
         with self.ledger.stage("bare road"):
+            for number, when in ((0, "before"), (best, "after")):
+                self._together(f"Bare road, {when}", _drive_clean, number, scenarios)
             before, after = (
-                clean_drives(
+                _drive_over(
+                    self.plan,
+                    number,
                     self.simulator,
-                    self.plan.controller(number),
                     scenarios,
-                    self.plan.budget.clean_weathers,
-                    self.plan.round(number) / "clean",
-                    on_drive=lambda done, total, when=when: self.tell(f"Bare road, {when}", done, total, "drives"),
+                    lambda done, total, when=when: self.tell(f"Bare road, {when}", done, total, "drives"),
                 )
                 for number, when in ((0, "before"), (best, "after"))
             )
@@ -165,25 +169,25 @@ class HardeningStages:
         paths: list[Path] = []
         with self.ledger.stage("town"):
             for past in range(number):
-                driver = plan.controller(past)
-                seed = plan.seed_of(past) if past else plan.seed
-                drawn = CollectionPlan(drives=drives, seed=seed, controller=plan.spec_of(past))
+                title = f"Round {past}: driving through the town"
+                own = [plan.town_drive(past, k) for k in range(drives)]
+                self._together(title, _drive_in_town, past, [k for k, path in enumerate(own) if not path.exists()])
                 for k in range(drives):
-                    paths.append(plan.town(past) / f"drive-{k:05d}.npz")
-                    if not paths[-1].exists():
-                        record_drive(self.simulator, drawn, k, driver).save(paths[-1])
-                    self.tell(f"Round {past}: driving through the town", k + 1, drives, "drives")
+                    _drive_in_town(plan, past, self.simulator, k)
+                    self.tell(title, k + 1, drives, "drives")
+                paths += own
             self.ledger.calls("town", len(paths))
         return Town(Dataset.load(paths), self.simulator.camera, self.simulator.input, device=plan.device)
 
-    def _together(self, title: str, work: StreetWork, number: int, scenarios: Sequence[Scenario]) -> None:
-        """Let several processes work on a street each, where they are asked for; the folder keeps all of it."""
-        if self.processes > 1 and len(scenarios) > 1 and self.factory is not None:
-            self.tell(title, 0, len(scenarios), "streets")
-            on_street = partial(work, self.plan, number)
-            done = spread(on_street, scenarios, self.factory, processes=self.processes)
-            for count, (scenario, _) in enumerate(done, 1):
-                self.tell(title, count, len(scenarios), f"streets, {scenario.name} is done")
+    def _together(self, title: str, work: RoundWork[Work], number: int, works: Sequence[Work]) -> None:
+        """Let several processes do a street or drive each, where they are asked for; the folder keeps all of it."""
+        if self.processes > 1 and len(works) > 1 and self.factory is not None:
+            what = "streets" if isinstance(works[0], Scenario) else "drives"
+            self.tell(title, 0, len(works), what)
+            done = spread(partial(work, self.plan, number), works, self.factory, processes=self.processes)
+            for count, (each, _) in enumerate(done, 1):
+                named = f", {each.name} is done" if isinstance(each, Scenario) else ""
+                self.tell(title, count, len(works), f"{what}{named}")
 
     def _under(self, title: str) -> OnProgress:
         """Progress of the stages of one attack, told under one title."""
@@ -192,6 +196,30 @@ class HardeningStages:
 
 def _attack_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
     plan.attack(simulator, number, scenario, _go_on)
+
+
+def _drive_clean(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
+    _drive_over(plan, number, simulator, [scenario], lambda done, total: _go_on("", done, total, ""))
+
+
+def _drive_over(
+    plan: HardeningPlan,
+    number: int,
+    simulator: Simulator,
+    scenarios: Sequence[Scenario],
+    on_drive: Callable[[int, int], object],
+) -> BareDrives:
+    weathers, folder = plan.budget.clean_weathers, plan.round(number) / "clean"
+    return clean_drives(simulator, plan.controller(number), scenarios, weathers, folder, on_drive=on_drive)
+
+
+def _drive_in_town(plan: HardeningPlan, number: int, town: TownSimulator, drive: int) -> None:
+    path = plan.town_drive(number, drive)
+    if not path.exists():
+        seed = plan.seed_of(number) if number else plan.seed
+        drawn = CollectionPlan(drives=plan.budget.town_drives, seed=seed, controller=plan.spec_of(number))
+        record_drive(town, drawn, drive, plan.controller(number)).save(path)
+    _go_on("", drive, drive, "")
 
 
 def _judge_street(plan: HardeningPlan, number: int, simulator: Simulator, scenario: Scenario) -> None:
