@@ -94,6 +94,15 @@ def test_scenario_by_scenario_medians_stand_with_their_range_and_what_left_the_l
     assert "of 16 cases of scenario, K and weather: GradOpt 12, BO 8." in whole.note  # left-01 is a tie
 
 
+def test_the_median_of_two_seeds_is_the_mean_of_theirs():
+    rows = [
+        row("left-01", seed=seed, deviation_m=d)
+        for seed, found in ((0, (0.1, 0.2, 0.3)), (1, (1.0, 3.0)))
+        for d in found
+    ]
+    assert rows_of(tables_of(rows, [GRADOPT])["scenarios"])[0][5] == "1.10"
+
+
 def test_scenarios_are_compared_only_over_the_seeds_that_every_method_has():
     found = {"GradOpt": (1.0, 1.0), "BO": (1.2, 0.2)}
     rows = [

@@ -96,7 +96,7 @@ def scenarios_table(results: Results) -> Table:
     most = [sum(row[number] >= max(row) - EQUAL for row in compared) for number in range(len(names))]
     said = [
         f"Deviation in m, {'in traffic' if traffic else 'alone on the road'}; all of it driven.",
-        f"Medians over starts and {counted(len(results.seeds), 'seed')}, with the least and most at {home}.",
+        f"Medians over starts, their mean over {counted(len(results.seeds), 'seed')}, least and most drive at {home}.",
         "Simulator calls and seconds: mean of one search, without judging its pattern.",
         "Leave the lane, and penalty in points (median): of the same drives, all weathers together.",
     ]
@@ -139,12 +139,17 @@ def _rows_of(found: _Found, figures: str, names: Sequence[str]) -> list[tuple[Ce
 
 
 def _median(drives: Frame, weather: str, home: str) -> Estimate | None:
-    """The median deviation in a weather, between the least and the most where patterns were found."""
-    values = drives[drives["weather"] == weather]["deviation_m"]
-    if values.empty:
+    """The median deviation in a weather, between the least and the most where patterns were found.
+
+    It is the mean over seeds of each one's median: of two patterns, one of which does nothing, the median of all drives
+    would lie where none is.
+    """
+    there = drives[drives["weather"] == weather]
+    if there.empty:
         return None
+    values, middle = there["deviation_m"], there.groupby("seed")["deviation_m"].median().mean()
     ends = (float(values.min()), float(values.max())) if weather == home else (None, None)
-    return Estimate(float(values.median()), *ends, len(values))
+    return Estimate(float(middle), *ends, len(values))
 
 
 def _costs(drives: Frame) -> tuple[str, str]:
