@@ -110,6 +110,8 @@ def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, d
     step = town.step
 
     class Counted(TownSimulator):
+        __module__ = TownSimulator.__module__  # one of a user's own would be another simulator
+
         def __getattribute__(self, name):
             if name in ("_open", "step", "__class__"):
                 steps.append(name)
@@ -123,6 +125,13 @@ def test_replays_that_are_kept_are_not_driven_again_and_damaged_ones_are(town, d
         np.testing.assert_array_equal(one.image_from_canvas, two.image_from_canvas)
         assert torch.equal(one.maps.gain, two.maps.gain)
     assert step.__self__ is town
+
+
+def test_drives_of_another_simulator_are_not_calibrated_here(town, drives, tmp_path):
+    settings = dataclasses.replace(drives.settings, world="egl")
+    with pytest.raises(CalibrationError, match="recorded in another simulator: egl and the town as software draws it"):
+        calibrate(town, dataclasses.replace(drives, settings=settings), folder=tmp_path / "calibration")
+    assert not (tmp_path / "calibration").exists()
 
 
 def test_the_set_and_its_report_survive_their_files(two_paint, tmp_path):

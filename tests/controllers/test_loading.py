@@ -65,6 +65,20 @@ def test_other_precisions_answer_alike_in_the_dtype_of_the_frames(cil, tmp_path,
     assert check_controller(loaded, tolerance=tolerance).passed
 
 
+def test_a_network_with_convolutions_over_time_is_loaded(tmp_path, monkeypatch):
+    (tmp_path / "over_time.py").write_text(
+        "from torch import nn\n"
+        "from roadproof.controllers import CIL\n"
+        "class OverTime(CIL):\n"
+        "    def __init__(self):\n"
+        "        super().__init__(width=0.1)\n"
+        "        self.over_time = nn.Conv3d(3, 3, 3, padding=1)\n"
+        "    def folded(self):\n        return self\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert load_controller("over_time:OverTime").over_time.weight.ndim == 5
+
+
 def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):
     (tmp_path / "my_driver.py").write_text(
         "from roadproof.controllers import CIL\n"

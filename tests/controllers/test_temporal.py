@@ -69,6 +69,15 @@ def driven(controller, values, elapsed_s):
     return steer
 
 
+@pytest.mark.parametrize("elapsed_s", [1 / 30, 0.02, 0.07, 0.0])
+def test_moments_that_are_no_whole_ticks_apart_are_refused(elapsed_s):
+    kept = kept_after(None, "a", 0.0, 3)
+    with pytest.raises(
+        ControllerError, match=f"the moments of the drive are {elapsed_s:g} s apart, expected a multiple"
+    ):
+        kept_after(kept, "b", elapsed_s, 3)
+
+
 def test_places_are_a_tick_apart_newest_first():
     kept = None
     for k in range(6):

@@ -10,9 +10,11 @@ from safetensors.torch import load_file, save_file
 from roadproof.controllers import (
     CIL,
     ControllerCard,
+    CruiseControl,
     FramePreparation,
     SteeringController,
     load_controller,
+    pilotnet_controller,
     save_controller,
 )
 from roadproof.errors import ControllerError, OutputError
@@ -30,6 +32,16 @@ def test_a_card_beside_bare_weights_says_the_rest(pilotnet_data, tmp_path):
     assert isinstance(controller, SteeringController)
     assert controller.preparation == rows
     assert controller.network.activation == "relu"
+
+
+def test_a_card_in_the_file_counts_also_where_the_architecture_is_named(tmp_path):
+    path = tmp_path / "net.safetensors"
+    made = pilotnet_controller(activation="relu", cruise=CruiseControl(target_mps=9.0))
+    save_controller(made, path)
+    again = load_controller(f"pilotnet:{path}")
+    assert (again.network.activation, again.cruise.target_mps) == ("relu", 9.0)
+    with pytest.raises(ControllerError, match="says that it is 'pilotnet', not 'cil'; give the path alone"):
+        load_controller(f"cil:{path}")
 
 
 def test_bare_cil_weights_are_the_published_size(tmp_path):
@@ -70,6 +82,8 @@ def test_what_cannot_be_saved_is_said(cil, tmp_path):
     with pytest.raises(ControllerError, match="cannot save a Identity"):
         controller = SteeringController(torch.nn.Identity(), preparation=FramePreparation())
         save_controller(controller, tmp_path / "x.safetensors")
+    with pytest.raises(ControllerError, match=r"a card cannot hold CruiseControl\(.*hold=0\.1\), expected"):
+        save_controller(pilotnet_controller(cruise=CruiseControl(hold=0.1)), tmp_path / "x.safetensors")
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         save_controller(cil, tmp_path / "file" / "x.safetensors")

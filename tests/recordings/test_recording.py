@@ -129,6 +129,17 @@ def test_a_set_of_which_some_drives_lost_their_pixel_maps_is_refused(tmp_path):
         load_recordings(tmp_path)
 
 
+@pytest.mark.parametrize("kind", [">f4", "longdouble", "uint16", "int64"])
+def test_pixel_maps_of_any_kind_of_number_are_read(tmp_path, kind):
+    save_recordings(recording_set(frames=2), tmp_path / "set")
+    maps = {
+        name: np.ones((2, 88, 200, *depth), kind) for name, depth in (("gain", (3,)), ("offset", (3,)), ("visible", ()))
+    }
+    for drive in (tmp_path / "set").glob("*/"):
+        np.savez(drive / "shading.npz", **maps)
+    assert load_recordings(tmp_path / "set").recordings[0].maps.gain.dtype == torch.float32
+
+
 @pytest.mark.parametrize("shape", [(3, 88, 200, 3), (1, 88, 200, 3), (2, 87, 200, 3)])
 def test_pixel_maps_of_other_frames_are_refused(tmp_path, shape):
     save_recordings(recording_set(frames=2), tmp_path / "set")

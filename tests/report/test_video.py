@@ -53,6 +53,16 @@ def test_a_film_has_as_many_frames_as_observations_and_their_speed(tmp_path, par
     assert [p.name for p in tmp_path.iterdir()] == ["drive.mp4"]
 
 
+def test_a_film_that_would_take_the_place_of_a_folder_is_one_line(tmp_path):
+    (tmp_path / "drive.mp4").mkdir()
+    with (
+        pytest.raises(OutputError, match=r"cannot write .*drive\.mp4"),
+        film_file(tmp_path / "drive.mp4", SIZE, 0.05) as add,
+    ):
+        add(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    assert [p.name for p in tmp_path.iterdir()] == ["drive.mp4"]
+
+
 def test_the_frame_is_shown_where_there_is_no_picture(parts):
     film = DriveView(**parts)
     page = film.compose(observation(picture=False), Control(0.0))

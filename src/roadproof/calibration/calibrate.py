@@ -37,7 +37,7 @@ from roadproof.processes import Pool, open_or_here
 from roadproof.recordings import Recording, RecordingSet, load_recordings, save_recordings
 from roadproof.roads.marks import LaneMark, marks_of
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import Simulator, obstacles_of
+from roadproof.simulators.protocol import Simulator, obstacles_of, world_of
 
 WORST_PX = 3.0
 LEAST_SHARE = 0.5
@@ -189,6 +189,11 @@ def calibrate(
         raise CalibrationError(
             "the simulator has another camera, crop or time step than when the drives were recorded; set it up as it "
             "was then"
+        )
+    if world_of(simulator) != settings.world:
+        told = " and ".join(each or "the town as software draws it" for each in (settings.world, world_of(simulator)))
+        raise CalibrationError(
+            f"the drives were recorded in another simulator: {told}; calibrate where they were recorded"
         )
     on_call(0)
     began = time.perf_counter()

@@ -78,7 +78,9 @@ class Replays:
             CalibrationError: the replay goes another way than the drive.
         """
         path = None if self._folder is None else self._folder / f"{drive.name}-{target.name}.npz"
-        made_of = digest(repr((self._drives.settings, drive.name)), *told_apart(drive), target.paint)
+        made_of = digest(
+            repr((self._drives.settings, drive.name, str(self._simulator.paint))), *told_apart(drive), target.paint
+        )
         kept = None if path is None else _read(path, made_of)
         if kept is None:
             kept = self._drive_again(drive, target)

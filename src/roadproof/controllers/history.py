@@ -36,10 +36,19 @@ def kept_after(before: tuple[Kept, ...] | None, now: Kept, elapsed_s: float, tic
         now: what the new moment gives.
         elapsed_s: seconds between the two moments.
         ticks: how many ticks back the last place lies.
+
+    Raises:
+        ControllerError: the moments are not a whole number of ticks apart, so that what is kept is older or newer than
+            what the network learnt from.
     """
     if before is None:
         return (now,) * (ticks + 1)
-    passed = max(1, round(elapsed_s / TICK_S))
+    passed = round(elapsed_s / TICK_S)
+    if passed < 1 or abs(passed * TICK_S - elapsed_s) > 1e-3:
+        raise ControllerError(
+            f"the moments of the drive are {elapsed_s:g} s apart, expected a multiple of {TICK_S} s for a controller "
+            "that remembers; give the simulator or the recordings that time step"
+        )
     return now, *(before[max(k - passed, 0)] for k in range(1, ticks + 1))
 
 

@@ -221,7 +221,10 @@ def _placed(controller: Controller | nn.Module, device: torch.device, dtype: tor
     if isinstance(controller, nn.Module):
         controller.eval().requires_grad_(False)
         # Measured on two processors: convolutions by channels-last weights run 1.3 times as fast, gradients included.
-        cast("Any", controller).to(device=device, dtype=dtype, memory_format=torch.channels_last)
+        # Torch has it for pictures alone, not for weights over time as well.
+        flat = all(each.ndim != 5 for each in (*controller.parameters(), *controller.buffers()))
+        order = {"memory_format": torch.channels_last} if flat else {}
+        cast("Any", controller).to(device=device, dtype=dtype, **order)
     assert isinstance(controller, Controller)
     return controller
 

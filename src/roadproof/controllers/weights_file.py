@@ -19,7 +19,7 @@ from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet
 from roadproof.controllers.steering import CruiseControl, NetworkController
 from roadproof.controllers.temporal import TemporalNet, temporal_controller
 from roadproof.controllers.trajectory import TrajectoryController
-from roadproof.controllers.waypoint import WaypointNet, waypoint_controller
+from roadproof.controllers.waypoint import WAYPOINT_CRUISE, WaypointNet, waypoint_controller
 from roadproof.errors import ControllerError
 from roadproof.io.files import AnyPath, as_path, write_tensors
 
@@ -69,7 +69,8 @@ def save_controller(
         origin: what the weights were made from, in words, for the card.
 
     Raises:
-        ControllerError: the controller is another network, or a folded one; save it as it was trained.
+        ControllerError: the controller is another network, or a folded one, which is to be saved as it was trained; or
+            it keeps its speed as no card says.
         OutputError: the file cannot be written; an older file of that name stays whole.
     """
     network: nn.Module = controller
@@ -94,6 +95,10 @@ def save_controller(
             f"cannot save a {type(network).__name__}, expected CIL, PilotNet, a waypoint or a temporal network; export "
             "it instead"
         )
+    if not isinstance(controller, CIL | ConditionalPilotNet):
+        usual = CruiseControl(target_mps=card.target_speed_mps) if card.architecture == "pilotnet" else WAYPOINT_CRUISE
+        if controller.cruise != usual:
+            raise ControllerError(f"a card cannot hold {controller.cruise}, expected {usual}; save it with that")
     kept = torch.float16 if dtype == "float16" else torch.float32
     tensors = {name: tensor.detach().cpu().to(kept).contiguous() for name, tensor in network.state_dict().items()}
     write_tensors(as_path(path), tensors, {_METADATA_KEY: replace(card, origin=origin).to_json()})
@@ -104,14 +109,21 @@ def from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
 
     Args:
         path: the weights file.
-        card: what the network is; None to read it in the file's header or beside the file.
+        card: what the network is, where the file's own header does not say; None to read it beside the file then.
 
     Raises:
         ControllerError: the file is missing or damaged, nothing says of which network it is, or it does not fit that.
     """
     state, header = _read(existing(path))
-    if card is None:
-        card = read_card(header, str(path)) if header is not None else card_beside(path)
+    if header is not None:
+        own = read_card(header, str(path))
+        if card is not None and own.architecture != card.architecture:
+            raise ControllerError(
+                f"{path} says that it is {own.architecture!r}, not {card.architecture!r}; give the path alone"
+            )
+        card = own
+    elif card is None:
+        card = card_beside(path)
     if card is None or card.architecture not in ARCHITECTURES:
         found = "nothing" if card is None or card.architecture is None else repr(card.architecture)
         raise ControllerError(

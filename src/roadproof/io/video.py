@@ -63,7 +63,7 @@ def film_file(
         with writing(path):
             container.mux(stream.encode())
             container.close()
-        part.replace(path)
+            part.replace(path)
     finally:
         with suppress(OSError):
             container.close()

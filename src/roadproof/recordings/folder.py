@@ -238,9 +238,9 @@ def _read_track(path: Path, frame_number: np.ndarray) -> Track | None:
 def _read_maps(path: Path) -> PixelMaps | None:
     if not path.exists():
         return None
-    gain, offset, visible = read_archive(path, ("gain", "offset", "visible"), RecordingError, _AGAIN).values()
+    maps = read_archive(path, ("gain", "offset", "visible"), RecordingError, _AGAIN).values()
     try:
-        return PixelMaps(torch.tensor(gain), torch.tensor(offset), torch.tensor(visible))
+        return PixelMaps(*(torch.from_numpy(np.asarray(each, np.float32)) for each in maps))
     except ColourError as error:
         raise RecordingError(f"{path}: {error}") from None
 

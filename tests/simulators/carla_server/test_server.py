@@ -273,6 +273,8 @@ def test_a_camera_that_cannot_be_served_is_refused_and_leaves_nothing(world):
     rolled = carla.Transform(carla.Location(z=2.0), carla.Rotation(roll=20.0))
     with pytest.raises(RuntimeError, match="rolled by 20"):
         sensor(world, ego, "camera.rgb", rolled)
+    with pytest.raises(RuntimeError, match="pitched by 400"):
+        sensor(world, ego, "camera.rgb", carla.Transform(carla.Location(z=2.0), carla.Rotation(pitch=400.0)))
     with pytest.raises(RuntimeError, match="out of range"):
         sensor(world, ego, "camera.rgb", fov=170)
     world.tick()

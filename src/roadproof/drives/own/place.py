@@ -165,9 +165,10 @@ def fitted_camera(camera: CameraModel, ground: Sequence[GroundPoint], *, fov_kno
         shown[:, 2] = np.maximum(shown[:, 2], 1e-3)
         return (tried.distorted(shown) - seen).T.ravel()
 
-    widest_deg = math.degrees(2 * math.atan2(camera.width_px / 2, camera.least_focal_px))
+    widest_deg = min(170.0, math.degrees(2 * math.atan2(camera.width_px / 2, camera.least_focal_px)))
+    narrowest_deg = min(5.0, 0.5 * min(widest_deg, camera.fov_deg))
     begin = np.array([getattr(camera, name) for name in names])
-    bounds = np.array([[0.1, -80.0, 5.0], [10.0, 45.0, min(170.0, widest_deg)]])[:, : len(names)]
+    bounds = np.array([[0.1, -80.0, narrowest_deg], [10.0, 45.0, widest_deg]])[:, : len(names)]
     found = cast("Any", optimize).least_squares(
         missed, begin.clip(*bounds), bounds=bounds, x_scale=(0.1, 1.0, 1.0)[: len(names)]
     )

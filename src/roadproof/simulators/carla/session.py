@@ -202,12 +202,13 @@ class Session:
         with contextlib.suppress(SimulatorError):
             if lost:
                 self.client.set_timeout(FAREWELL_S)
-                self.client.apply_batch(commands)
+                self.ask("the end of a drive", lambda: self.client.apply_batch(commands))
             elif commands:
                 self.batch("the end of a drive", commands)
         with contextlib.suppress(SimulatorError):
             if self.painted and not lost:
                 self.reload()
+        self.lost = False
         with contextlib.suppress(SimulatorError):
             self.ask("its settings", lambda: self.world.apply_settings(self._found))
         self.lost = True
@@ -216,8 +217,10 @@ class Session:
         """Commands that destroy all actors; sensors no longer listen."""
         actors, self._actors = self._actors, []
         for actor in actors:
-            if isinstance(actor, carla.Sensor) and actor.is_listening:
-                actor.stop()
+            # One that is gone raises; all others and the settings come after it.
+            with contextlib.suppress(RuntimeError):
+                if isinstance(actor, carla.Sensor) and actor.is_listening:
+                    actor.stop()
         return [carla.command.DestroyActor(actor.id) for actor in reversed(actors)]
 
     def _load(self, name: str) -> None:

@@ -180,8 +180,8 @@ class CarlaSimulator(RouteSimulator[_Drive]):
     def _close(self) -> None:
         self._ground = None
         if self._session is not None:
-            self._session.close()
-            self._session = None
+            session, self._session = self._session, None
+            session.close()
 
     def _begin(self, request: Request) -> _Drive:
         session, scenario = self.session, request.scenario
