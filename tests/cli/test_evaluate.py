@@ -63,6 +63,12 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
     assert (again.returncode, again.stderr) == (0, "")
     assert answered(again.stdout) == stored(run / "evaluation" / "evaluation.json")
     assert Evaluation.load(run / "evaluation").trials == evaluation.trials
+    assert (run / "evaluation" / "film.mp4").exists()
+    (run / "evaluation" / "fidelity.npz").touch()
+    other = roadproof("evaluate", "magenta.png", *options, "--no-film", folder=workplace)
+    assert (other.returncode, other.stderr) == (0, "")
+    shown = {path.name for path in (run / "evaluation").iterdir()}
+    assert not shown & {"film.mp4", "film.jpg", "strip.npz", "fidelity.npz"}, "of the paint before"
 
 
 MISTAKES = {

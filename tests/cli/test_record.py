@@ -116,6 +116,9 @@ def test_a_kept_command_does_not_say_where_a_server_stood_or_how_much_was_said(t
     verbs.keep_command(tmp_path)
     line = (tmp_path / commands.FILE).read_text()
     assert line == "roadproof evaluate 'a b.json' --simulator 'carla://HOST:PORT?paint=native'\n"
+    monkeypatch.setattr(verbs, "words_given", lambda: ("roadproof", "evaluate", "--simulator=carla://10.0.0.7:2001"))
+    verbs.keep_command(tmp_path / "other")
+    assert (tmp_path / "other" / commands.FILE).read_text() == "roadproof evaluate --simulator=carla://HOST:PORT\n"
 
 
 def test_a_second_call_goes_on_where_the_first_ended(run, call):

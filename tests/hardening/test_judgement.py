@@ -1,5 +1,7 @@
 """The verdict is of the strongest attack on each street, with an interval over streets, and minds clean driving."""
 
+from dataclasses import replace
+
 import pytest
 
 from roadproof.driving.starts import StartOffset
@@ -86,3 +88,13 @@ def test_starts_that_were_left_out_on_one_side_are_not_compared():
     none = verdict(("a", "k", [1.0, 1.4], [0.2], ([0, 1], [2])))
     assert (none.outcome, none.change_m.low) == ("not shown", None)
     assert none.change_m.value == pytest.approx(-1.0)
+
+
+def test_a_car_that_no_longer_comes_to_the_canvas_was_not_helped():
+    kept = judged("a", "k", [0.5, 0.5, 0.0, 0.0], [0.3, 0.29], ([0, 1, 2, 3], [0, 1]))
+    kept[1] = replace(kept[1], left_out=2)
+    clean = BareDrives(4, 4, ())
+    told = Judgement(tuple(kept), (clean, clean)).verdict()
+    assert (told.outcome, told.lost) == ("not shown", 2)
+    assert (told.before_m, told.after_m) == pytest.approx((0.5, 0.295)), "over the starts of both"
+    assert told.sentence.endswith("; in 2 more drives it never came to the canvas.")

@@ -94,6 +94,14 @@ def test_scenario_by_scenario_medians_stand_with_their_range_and_what_left_the_l
     assert "of 16 cases of scenario, K and weather: GradOpt 12, BO 8." in whole.note  # left-01 is a tie
 
 
+def test_no_mean_is_marked_over_other_cases_than_those_of_the_others(records):
+    rows = [
+        row(f"left-0{k}", method=name, deviation_m=k + (name == "BO")) for k in (1, 2) for name in ("GradOpt", "BO")
+    ]
+    assert [cells[5].best for cells in tables_of(rows)["methods"].rows] == [False, True]
+    assert not any(cells[5].best for cells in tables_of(rows[:3])["methods"].rows)
+
+
 def test_the_median_of_two_seeds_is_the_mean_of_theirs():
     rows = [
         row("left-01", seed=seed, deviation_m=d)

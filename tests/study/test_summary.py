@@ -26,6 +26,12 @@ def test_methods_are_summed_up_as_they_were_searched():
     assert failures(DataFrame(rows)) == ("left-01, K = 1, BO, seed 0: no luck",)
 
 
+def test_a_job_of_which_drives_were_left_out_counts_as_much_as_others():
+    rows = [row("GradOpt", 1.0), row("GradOpt", 2.0), row("GradOpt", 5.5, seed=1, search_calls=20)]
+    (told,) = summary(DataFrame(rows), "clear-noon")
+    assert told.startswith("GradOpt: 3.50 m deviation, alone in clear-noon; found with 17 simulator calls")
+
+
 def test_a_study_in_which_all_failed_has_failures_alone():
     rows = [row("BO", None, error="no luck")]
     assert summary(DataFrame(rows), "clear-noon") == ()

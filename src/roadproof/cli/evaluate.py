@@ -79,8 +79,8 @@ def evaluate(
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange
     from roadproof.patterns import read_paint
-    from roadproof.pipeline.fidelity import measure_fidelity
-    from roadproof.pipeline.film import film_drives
+    from roadproof.pipeline.fidelity import FIDELITY, measure_fidelity
+    from roadproof.pipeline.film import FILM, POSTER, STRIP, film_drives
     from roadproof.pipeline.workload import of_evaluation
     from roadproof.recorded.simulator import check_recorded_canvas
     from roadproof.recordings import load_recordings
@@ -105,6 +105,7 @@ def evaluate(
         raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
     begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
+    before = _shown_in(out)
     with where.open() as (world, driven):
         with stages() as show:
             evaluation = run(
@@ -125,6 +126,9 @@ def evaluate(
                 processes=processes,
                 on_drive=lambda done, total: show(f"Driving {driven.name}", done, total, "drives"),
             )
+        if _shown_in(out) != before:
+            for name in (FILM, POSTER, STRIP, FIDELITY):
+                (out / name).unlink(missing_ok=True)
         if film:
             shown = evaluation.shown()
             film_drives(world, shown.start.of(driven), (shown.clean, shown.painted), paint, out)
@@ -135,6 +139,16 @@ def evaluate(
     _summarise(evaluation, fidelity, out, compared=recorded is not None)
     surrogate = {} if fidelity is None else {"surrogate": {"agreement": asdict(fidelity.agreement)}}
     answer(stored(out / "evaluation.json") | surrogate)
+
+
+def _shown_in(out: Path) -> tuple[object, ...]:
+    """The drives and the paint of an evaluation, which the pictures beside it show; nothing without one."""
+    from roadproof.driving.evaluation import Evaluation, load_paint
+
+    try:
+        return Evaluation.load(out).trials, load_paint(out).tobytes()
+    except RoadproofError:
+        return ()
 
 
 def _figures(pattern: Path, *, needed: bool) -> Pattern | None:

@@ -128,5 +128,9 @@ def keep_command(folder: Path) -> None:
 
     How much it said is left out, and so is where a server stood, which is nobody's to keep.
     """
-    kept = [re.sub(r"^carla://[^?]*", "carla://HOST:PORT", word) for word in words_given() if word not in _LOUD]
+    kept = [
+        re.sub(r"^((?:--simulator=)?)carla://[^?]*", r"\1carla://HOST:PORT", word)
+        for word in words_given()
+        if word not in _LOUD
+    ]
     write_command(folder, kept)

@@ -49,6 +49,7 @@ class JudgedAttack:
         left_lane: whether each drive over the pattern left its lane.
         starts: where each drive began; of drives in several weathers the same again.
         simulator_calls: number of simulator drives that the attack and these drives took.
+        left_out: number of drives that were not made, since without paint the car never came to the canvas.
     """
 
     scenario: str
@@ -58,6 +59,7 @@ class JudgedAttack:
     left_lane: tuple[bool, ...]
     starts: tuple[StartOffset, ...]
     simulator_calls: int
+    left_out: int = 0
 
     @property
     def mean_m(self) -> float:
@@ -100,6 +102,7 @@ class HardeningVerdict:
         left_lane_before: share of the strongest attacks' drives that leave the lane before hardening, 0 to 1.
         left_lane_after: share of the strongest attacks' drives that leave the lane after hardening, 0 to 1.
         clean_worse: whether fewer drives over the bare road are clean after hardening.
+        lost: how many more drives than before could not be judged, since the car never came to the canvas.
     """
 
     outcome: str
@@ -110,6 +113,7 @@ class HardeningVerdict:
     left_lane_before: float
     left_lane_after: float
     clean_worse: bool
+    lost: int = 0
 
     @property
     def sentence(self) -> str:
@@ -118,6 +122,7 @@ class HardeningVerdict:
         between = f" ({c.low:+.2f} to {c.high:+.2f} m, 95 % over {self.over})" if c.low is not None else ""
         outcome = {"helped": "It helped", "did not help": "It did not help", "not shown": "That it helped is not shown"}
         worse = "; fewer drives over the bare road are clean" if self.clean_worse else ""
+        worse += f"; in {self.lost} more drives it never came to the canvas" if self.lost else ""
         paint_alone = self.clean_worse and c.high is not None and c.high < 0
         begin = "It helped against paint but not on the whole" if paint_alone else outcome[self.outcome]
         return (
@@ -143,29 +148,29 @@ class Judgement:
         """The verdict on each street's strongest attack: attackers choose the kind; a mean over kinds would flatter."""
         names = list(dict.fromkeys(each.scenario for each in self.judged))
         before, after = ([self._strongest(name, after=after) for name in names] for after in (False, True))
+        pairs = [_compared(one, two) for one, two in zip(before, after, strict=True)]
         if len(names) > 1:
-            changes, over = [b.mean_m - a.mean_m for a, b in zip(before, after, strict=True)], "streets"
+            changes, over = [float(np.mean(two) - np.mean(one)) for one, two in pairs], "streets"
         else:
-            # Drives may have been left out on one side alone.
-            first, then = before[0].by_start(), after[0].by_start()
-            common = [then[start] - first[start] for start in first if start in then]
-            changes, over = common or [after[0].mean_m - before[0].mean_m], "starts"
+            changes, over = [two - one for one, two in zip(*pairs[0], strict=True)], "starts"
         change = mean_95(changes)
         worse = self.clean[1].clean < self.clean[0].clean
+        lost = sum(each.left_out for each in after) - sum(each.left_out for each in before)
         low, high = change.low, change.high
         if worse or (low is not None and low > 0):
             outcome = "did not help"
         else:
-            outcome = "helped" if high is not None and high < 0 else "not shown"
+            outcome = "helped" if high is not None and high < 0 and lost <= 0 else "not shown"
         return HardeningVerdict(
             outcome=outcome,
             change_m=change,
             over=over,
-            before_m=float(np.median([each.mean_m for each in before])),
-            after_m=float(np.median([each.mean_m for each in after])),
+            before_m=float(np.median([np.mean(one) for one, _ in pairs])),
+            after_m=float(np.median([np.mean(two) for _, two in pairs])),
             left_lane_before=_share(before),
             left_lane_after=_share(after),
             clean_worse=worse,
+            lost=max(lost, 0),
         )
 
     def _strongest(self, scenario: str, *, after: bool) -> JudgedAttack:
@@ -252,7 +257,17 @@ class StreetJudge:
             left_lane=tuple(trial.leaves_lane for trial in trials),
             starts=tuple(trial.start for trial in trials),
             simulator_calls=calls,
+            left_out=evaluation.left_out,
         )
+
+
+def _compared(before: JudgedAttack, after: JudgedAttack) -> tuple[list[float], list[float]]:
+    """The deviations from the starts of both, metres; of all drives where they have none in common."""
+    first, then = before.by_start(), after.by_start()
+    common = [start for start in first if start in then]
+    if not common:
+        return [before.mean_m], [after.mean_m]
+    return [first[start] for start in common], [then[start] for start in common]
 
 
 def clean_drives(

@@ -27,6 +27,8 @@ from roadproof.recordings import Recording, RecordingSet
 from roadproof.scenarios import Scenario
 from roadproof.simulators.protocol import PatternImage, Simulator
 
+FIDELITY = "fidelity.npz"
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Agreement:
@@ -116,6 +118,7 @@ def measure_fidelity(
         OutputError: the folder cannot be written.
     """
     recorded = recordings.clean
+    (folder / FIDELITY).unlink(missing_ok=True)  # perhaps of other paint
     if recorded is None:
         return None
     if clean is None:
@@ -126,7 +129,7 @@ def measure_fidelity(
         asked = partial(_rendered, scenario, clean, recorded.frame_number)
         ((_, rendered),) = rendering.each(asked, [raster(pattern)])
     fidelity = compare_with_rendered(pattern, recordings, controller, rendered, drive=recorded.name, device=device)
-    fidelity.save(folder / "fidelity.npz")
+    fidelity.save(folder / FIDELITY)
     return fidelity
 
 

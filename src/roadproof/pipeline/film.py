@@ -149,6 +149,7 @@ def film_drives(
     poster = _page(sides, beside_m, int(np.abs(beside_m[: last + 1]).argmax()) // each * each)
     write_atomically(folder / POSTER, lambda part: poster.save(part, format="JPEG", quality=82))
     if not can_film():
+        (folder / FILM).unlink(missing_ok=True)  # of other drives
         return False
     for quality in QUALITIES:
         film = film_file(folder / FILM, poster.size, each * clean.dt_s, quality=quality)

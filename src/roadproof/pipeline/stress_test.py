@@ -36,7 +36,7 @@ from roadproof.io.locks import working_in
 from roadproof.limits import check_seed
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
-from roadproof.pipeline.fidelity import Fidelity
+from roadproof.pipeline.fidelity import FIDELITY, Fidelity
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
@@ -102,7 +102,7 @@ class StressTest:
         folder = as_path(folder)
         place, less = folder / "selection", folder / CHEAPEST
         selection = Selection.load(place) if place.is_dir() else None
-        prediction, fidelity = folder / "prediction.npz", folder / "evaluation" / "fidelity.npz"
+        prediction, fidelity = folder / "prediction.npz", folder / "evaluation" / FIDELITY
         return StressTest(
             attack=AttackResult.load(folder / "attack"),
             selection=selection,

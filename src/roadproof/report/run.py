@@ -26,7 +26,7 @@ from roadproof.errors import RoadproofError
 from roadproof.io.commands import read_commands
 from roadproof.io.files import bytes_of, check_closed
 from roadproof.patterns import Pattern, load_pattern
-from roadproof.pipeline.fidelity import Fidelity
+from roadproof.pipeline.fidelity import FIDELITY, Fidelity
 from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.selection import Selection
@@ -205,7 +205,7 @@ def _judged(folder: Path) -> ShownEvaluation:
     shown = evaluation.shown()
     alone = evaluation.of(traffic=False)
     pairs = tuple(_driven(folder, trial) for trial in alone)
-    fidelity = folder / "fidelity.npz"
+    fidelity = folder / FIDELITY
     return ShownEvaluation(
         evaluation=evaluation,
         paint=load_paint(folder),

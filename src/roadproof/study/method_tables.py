@@ -24,9 +24,7 @@ def methods_table(results: Results) -> Table:
     names = [method.name for method in results.methods]
     rows: list[tuple[Cell, ...]] = []
     for figures in results.figures:
-        shown = [
-            marked([mean_over_scenarios(results.values(block, name, figures)) for name in names]) for block in blocks
-        ]
+        shown = [_marked([results.values(block, name, figures) for name in names]) for block in blocks]
         for number, name in enumerate(names):
             searches = results.drives[(results.drives["method"] == name) & (results.drives["figures"] == figures)]
             rows.append((
@@ -150,6 +148,12 @@ def _median(drives: Frame, weather: str, home: str) -> Estimate | None:
     values, middle = there["deviation_m"], there.groupby("seed")["deviation_m"].median().mean()
     ends = (float(values.min()), float(values.max())) if weather == home else (None, None)
     return Estimate(float(middle), *ends, len(values))
+
+
+def _marked(values: Sequence[Values]) -> list[Cell]:
+    """Means over scenarios, of which the highest is marked where all methods have the same cases."""
+    alike = len({frozenset(each.index) for each in values}) == 1
+    return marked([mean_over_scenarios(each) for each in values], compared=alike)
 
 
 def _costs(drives: Frame) -> tuple[str, str]:

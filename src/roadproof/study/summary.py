@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from roadproof.study.rows import Frame, JobId
 
+_OTHERS = [name for name in JobId._fields if name != "method"]
+
 
 def summary(rows: Frame, home: str) -> tuple[str, ...]:
     """A line for each method: means over its jobs, driven alone in the weather the patterns were found in.
@@ -17,7 +19,8 @@ def summary(rows: Frame, home: str) -> tuple[str, ...]:
         return ()
     alone = good[~good["traffic"].astype(bool) & (good["weather"] == home)]
     numbers = ["deviation_m", "search_calls", "search_seconds"]
-    means = alone.astype(dict.fromkeys(numbers, float)).groupby("method", sort=False)[numbers].mean()
+    of_jobs = alone.astype(dict.fromkeys(numbers, float)).groupby(["method", *_OTHERS], sort=False)[numbers].mean()
+    means = of_jobs.groupby(level="method", sort=False).mean()
     return tuple(
         f"{method}: {deviation_m:.2f} m deviation, alone in {home}; found with {calls:.0f} simulator calls in "
         f"{seconds:.0f} s"
