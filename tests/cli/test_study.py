@@ -83,6 +83,10 @@ def test_a_study_is_run_summed_up_found_done_and_transferred(study, plan, tmp_pa
     assert code == 2
     assert f"roadproof: no pattern could be driven over; the first of 1: {failure}\n" in printed.err
     assert list(read_table(tmp_path / "out", "transfer.parquet")["controller"]) == ["cil"]
+    monkeypatch.setattr("roadproof.study.transfer.evaluate", evaluate)
+    assert study("transfer", plan, "--controllers", "pilotnet", "--out", tmp_path / "out")[0] == 0
+    # Those of an earlier call stay.
+    assert list(read_table(tmp_path / "out", "transfer.parquet")["controller"]) == ["cil", "pilotnet"]
 
 
 def test_a_dry_run_counts_traffic_in_the_weathers_that_have_some(study, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 import needs
 from roadproof.controllers import CIL, ConditionalPilotNet, TrajectoryController, load_controller, save_controller
 from roadproof.errors import TrainingError
-from roadproof.training.recipe import Recipe, follow, gather
+from roadproof.training.recipe import Recipe, _claim, follow, gather
 
 needs.town()
 
@@ -58,6 +58,16 @@ def test_a_folder_of_another_recipe_is_refused(tmp_path):
     (tmp_path / "recipe.json").write_text(json.dumps({"format": "roadproof-recipe", "version": 1, "recipe": begun}))
     with pytest.raises(TrainingError, match="holds a training with drives 7, now it is 1"):
         follow(TINY, tmp_path)
+
+
+def test_a_folder_that_began_with_other_weights_of_the_same_name_is_refused(tmp_path):
+    begun = replace(TINY, start=str(tmp_path / "start.safetensors"))
+    save_controller(CIL(width=0.05, seed=11), tmp_path / "start.safetensors")
+    _claim(begun, tmp_path)
+    _claim(begun, tmp_path)
+    save_controller(CIL(width=0.05, seed=12), tmp_path / "start.safetensors")
+    with pytest.raises(TrainingError, match="holds a training with weights of start"):
+        _claim(begun, tmp_path)
 
 
 def test_a_recipe_may_start_from_weights(tmp_path):

@@ -21,9 +21,11 @@ from roadproof.io.locks import working_in
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.folder import is_done, pandas
+from roadproof.study.folder import is_done, pandas, read_table
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobId, TransferRow, drive_columns, job_columns
+
+FILE = "transfer.parquet"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +33,7 @@ class Transfer:
     """What came of the patterns of a study under other controllers.
 
     Args:
-        rows: a row for each pattern and drive of a controller.
+        rows: a row for each pattern and drive of a controller, also of those that were tried before.
         failures: a line for each pattern that a controller could not be judged on, with the controller and the reason.
     """
 
@@ -81,7 +83,11 @@ def transfer(
     if not rows:
         raise StudyError(f"no pattern could be driven over; the first of {len(failures)}: {failures[0]}")
     frame = pandas().DataFrame(rows)
-    write_atomically(folder / "transfer.parquet", lambda part: frame.to_parquet(part, index=False))
+    if (folder / FILE).exists():
+        before = read_table(folder, FILE)
+        others = before["job"].isin([job.key for job in found]) & ~before["controller"].isin(list(drivers))
+        frame = pandas().concat([before[others], frame], ignore_index=True) if others.any() else frame
+    write_atomically(folder / FILE, lambda part: frame.to_parquet(part, index=False))
     return Transfer(frame, tuple(failures))
 
 

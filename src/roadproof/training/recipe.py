@@ -27,7 +27,7 @@ from roadproof.controllers.shipped import shipped_weights
 from roadproof.controllers.weights_file import load_network
 from roadproof.errors import TrainingError
 from roadproof.io.files import write_json
-from roadproof.io.identity import require_same
+from roadproof.io.identity import digest, require_same
 from roadproof.io.text import read_json
 from roadproof.training.collection import CollectionPlan, collect
 from roadproof.training.dataset import Dataset
@@ -110,14 +110,17 @@ class Recipe:
         fresh = FRESH[self.network](seed=self.seed, **width)
         if self.start is None:
             return fresh
-        named = not self.start.endswith(".safetensors")
-        begun = load_network(shipped_weights(self.start) if named else Path(self.start))
+        begun = load_network(_weights(self.start))
         if type(begun) is not type(fresh):
             raise TrainingError(
                 f"start {self.start} is a {type(begun).__name__}, network {self.network} a {type(fresh).__name__}; "
                 "give the network that it goes on with"
             )
         return begun
+
+    def weights_of_start(self) -> str:
+        """What tells the weights that are gone on from, whatever their name; empty for fresh ones."""
+        return "" if self.start is None else digest(_weights(self.start).read_bytes())[:16]
 
     def expert_plans(self) -> dict[str, CollectionPlan]:
         """The plans of the expert's drives, by the name of their folder."""
@@ -230,11 +233,17 @@ def _trained(
     checkpoint.unlink(missing_ok=True)
 
 
+def _weights(start: str) -> Path:
+    return Path(start) if start.endswith(".safetensors") else shipped_weights(start)
+
+
 def _claim(recipe: Recipe, folder: Path) -> None:
     """Write the recipe into its folder, or refuse a folder that was begun with another."""
-    path, asked = folder / "recipe.json", asdict(recipe)
+    path, asked = folder / "recipe.json", asdict(recipe) | {"weights of start": recipe.weights_of_start()}
     if path.exists():
         kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe", {})
-        require_same(folder, "a training", kept, asked, TrainingError)
+        # Folders are older than these words.
+        before = {"weights of start": asked["weights of start"]} | kept if isinstance(kept, dict) else kept
+        require_same(folder, "a training", before, asked, TrainingError)
     else:
         write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked})
