@@ -21,7 +21,7 @@ def test_the_plan_of_the_docs_is_the_example_and_can_be_followed(tmp_path):
     (tmp_path / "check.toml").write_text(text, encoding="utf-8")
     save_pattern(BAR, tmp_path / "patterns" / "bar.json")
     found = load_check(tmp_path / "check.toml", budget="full")
-    assert len(found.keys) == 5 * 2 * 4
+    assert len(found.keys) == 5 * 2 * 5
     assert found.reference == tmp_path / "reference" / "full" / "check.json"
     with pytest.raises(CheckError, match="no recording of left-03 at clear-noon"):
         load_check(tmp_path / "check.toml")
@@ -49,7 +49,9 @@ def test_a_plan_is_read_with_all_that_it_names(team):
 def test_a_full_check_needs_no_recordings_and_adds_an_attack(team):
     text = PLAN.replace("[smoke]\nrecordings", "[full]\n# ") + "fresh = { deviation_m = 1.0 }\n"
     found = load_check(plan(team, text), budget="full", trust=True)
-    assert found.keys[-1] == ("test-road", Weather.CLEAR_NOON, Kind.FRESH, "fresh attack")
+    assert found.keys[-2:] == tuple(
+        ("test-road", Weather.CLEAR_NOON, Kind.FRESH, f"fresh attack, seed {seed}") for seed in (0, 1)
+    ), "one for each pattern: drives over one say nothing of what the other finds"
     assert not found.recordings
 
 

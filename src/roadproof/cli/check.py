@@ -79,7 +79,7 @@ def _workload(plan: CheckPlan, who: Controller, processes: int) -> Workload:
 
     seeds, full = len(plan.seeds), plan.budget == "full"
     stored = sum(map(len, plan.stored.values()))
-    each_start = len(plan.scenarios) * (1 + full) + stored
+    each_start = len(plan.scenarios) * (1 + full * seeds) + stored
     drives = len(plan.weathers) * seeds * (each_start * plan.starts.count + len(plan.scenarios) * plan.random)
     driven = of_drives(drives, processes=processes)
     if not full:

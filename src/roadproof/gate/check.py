@@ -31,7 +31,7 @@ from roadproof.driving.starts import NOMINAL
 from roadproof.errors import CheckError
 from roadproof.gate.outputs import WORST, write_junit, write_summary, write_worst
 from roadproof.gate.places import Place, command_of, places_of
-from roadproof.gate.plan import FRESH, CheckPlan, Key
+from roadproof.gate.plan import CheckPlan, Key, fresh
 from roadproof.gate.result import FILE, Case, CheckResult, JudgedDrive, load_reference, worst_of
 from roadproof.gate.stretch import Paint, Stretch, known_paints, measures_of
 from roadproof.gate.verdict import Kind, Status, judge
@@ -151,12 +151,12 @@ class _Check:
         plan = self.plan
         with place.factory() as world:
             size = (world.input.height_px, world.input.width_px)
-            fresh = plan.budget == "full"
-            require_usable(self.controller, size=size, device=self.device, gradients=fresh)
+            attacks = plan.budget == "full"
+            require_usable(self.controller, size=size, device=self.device, gradients=attacks)
             scenario = begun_in(world, place.scenario)
             site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
             paints = known_paints(plan, scenario, site, self.folder / "patterns" / scenario.name)
-            if fresh:
+            if attacks:
                 paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
             images = {paint.name: raster(paint.pattern) for paint in paints}
             drives = self.folder / "drives" / scenario.name
@@ -232,8 +232,8 @@ class _Check:
         )
         path = self.folder / "patterns" / scenario.name / f"{name}.json"
         save_pattern(found.pattern, path)
-        drives = tuple((seed, k) for k in range(plan.starts.count))
-        return Paint(name, Kind.FRESH, FRESH, found.pattern, path, drives)
+        drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
+        return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
 
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
         """Leave a picture, and say which case it shows.

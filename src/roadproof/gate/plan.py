@@ -25,13 +25,21 @@ from roadproof.simulators.loading import check_spec
 Key: TypeAlias = tuple[str, Weather, Kind, str]
 """What tells a case from the others: scenario, weather, and kind and name of the paint."""
 
-BARE, RANDOM, FRESH = "bare road", "random patterns", "fresh attack"
+BARE, RANDOM = "bare road", "random patterns"
 FORMAT = "roadproof-check"
 FORMAT_VERSION = 1
 BudgetName = Literal["smoke", "full"]
 BUDGETS: tuple[BudgetName, ...] = get_args(BudgetName)
 RANGES = {"deviation_m": (0.01, 100.0), "left_lane": (0.0, 1.0), "failed": (0.0, 1.0)}
 MEASURES = {kind: ("failed",) if kind is Kind.BARE else ("deviation_m", "left_lane") for kind in Kind}
+
+
+def fresh(seed: int) -> str:
+    """The name of the case of a fresh attack.
+
+    Each is one of its own: drives over one pattern say nothing of what attacks with other seeds find.
+    """
+    return f"fresh attack, seed {seed}"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,7 +91,7 @@ class CheckPlan:
         for scenario in self.scenarios:
             painted = [(Kind.STORED, each.name) for each in self.stored.get(scenario.name, ())]
             painted += [(Kind.RANDOM, RANDOM)] if self.random else []
-            painted += [(Kind.FRESH, FRESH)] if self.budget == "full" else []
+            painted += [(Kind.FRESH, fresh(seed)) for seed in self.seeds] if self.budget == "full" else []
             found += [
                 (scenario.name, weather, *each) for weather in self.weathers for each in ((Kind.BARE, BARE), *painted)
             ]
