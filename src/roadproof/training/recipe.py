@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 from roadproof.controllers import CIL, ConditionalPilotNet, save_controller, temporal_controller, waypoint_controller
 from roadproof.controllers.shipped import shipped_weights
@@ -241,9 +242,11 @@ def _claim(recipe: Recipe, folder: Path) -> None:
     """Write the recipe into its folder, or refuse a folder that was begun with another."""
     path, asked = folder / "recipe.json", asdict(recipe) | {"weights of start": recipe.weights_of_start()}
     if path.exists():
-        kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe", {})
+        kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe")
+        if not isinstance(kept, dict):
+            raise TrainingError(f"{path} has no recipe; remove it, or choose another folder")
         # Folders are older than these words.
-        before = {"weights of start": asked["weights of start"]} | kept if isinstance(kept, dict) else kept
+        before = {"weights of start": asked["weights of start"]} | cast("dict[str, object]", kept)
         require_same(folder, "a training", before, asked, TrainingError)
     else:
         write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked})
