@@ -110,9 +110,8 @@ def _workload(
     """Attacks, tuning and judging, from numbers of streets; clean drives, on all streets for 0, are made twice."""
     from roadproof.pipeline.workload import Workload, frame_seconds, of_drives, of_evaluation, of_run, of_search
 
-    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who)) + of_drives(
-        budget.town_drives, processes=processes
-    )
+    learnt = Workload(seconds=budget.tuning.pictures * frame_seconds(who))
+    learnt += of_drives(budget.town_drives, processes=processes)
     whole = of_run(budget.attack, who, film=False).times(training, at_once=processes).times(rounds + 1)
     whole += learnt.times(rounds)
     if judging:

@@ -122,12 +122,10 @@ def tables(
     out: Annotated[Path | None, unset("Folder for the results.", default="FOLDER/tables")] = None,
 ) -> None:
     """Make a study's tables and figures: tables.html, tables.md, a .tex of each table, figures as PNG."""
-    from roadproof.study.folder import read_table
+    from roadproof.study.folder import read_table, read_transfers
     from roadproof.study.page import write_tables
 
-    rows = read_table(folder)
-    driven = read_table(folder, "transfer.parquet") if (folder / "transfer.parquet").exists() else None
-    page = write_tables(rows, folder, out or folder / "tables", driven)
+    page = write_tables(read_table(folder), folder, out or folder / "tables", read_transfers(folder))
     say(f"The tables are {page}, as Markdown and LaTeX beside it; figures in {page.parent / 'figures'}")
 
 

@@ -40,7 +40,7 @@ from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
-from roadproof.pipeline.film import FILM, STRIP, film_drives
+from roadproof.pipeline.film import STRIP, film_drives
 from roadproof.pipeline.stress_test import OnProgress, stress_test
 from roadproof.processes import require_picklable
 from roadproof.recorded.simulator import RecordedSimulator
@@ -247,7 +247,6 @@ class _Check:
         case, worst = max(wrong or painted, key=lambda each: each[1].deviation_m)
         place = next(p for p in places if p.scenario.name == case.scenario and case.weather in p.weathers)
         drives = self.folder / "drives" / case.scenario
-        (drives / FILM).unlink(missing_ok=True)
         paint = read_paint(Path(worst.paint))
         with place.factory() as world:
             start = worst.start.of(begun_in(world, place.scenario))

@@ -129,6 +129,7 @@ def film_drives(
         OutputError: the folder cannot be written.
     """
     clean, painted = load_episodes(folder, files)
+    (folder / FILM).unlink(missing_ok=True)  # perhaps of other drives
     predicted = ", predicted" if painted.paint.predicted else ""
     last = min(len(clean), len(painted)) - 1
     steps = sorted(set(passage_steps(clean, painted, start.canvas, MOMENTS)))
@@ -149,7 +150,6 @@ def film_drives(
     poster = _page(sides, beside_m, int(np.abs(beside_m[: last + 1]).argmax()) // each * each)
     write_atomically(folder / POSTER, lambda part: poster.save(part, format="JPEG", quality=82))
     if not can_film():
-        (folder / FILM).unlink(missing_ok=True)  # of other drives
         return False
     for quality in QUALITIES:
         film = film_file(folder / FILM, poster.size, each * clean.dt_s, quality=quality)

@@ -28,6 +28,7 @@ from roadproof.io.text import read_json
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobResult, Row
 
+TRANSFERRED = "transfer.parquet"
 ROWS = ("roadproof-study-rows", 1)
 STUDY = ("roadproof-study-run", 1)
 
@@ -127,6 +128,15 @@ def read_table(folder: Path, name: str = "rows.parquet") -> Frame:
         return library.read_parquet(path)
     except (OSError, ValueError) as error:
         raise StudyError(f"{path} is damaged ({error}); run the study again, finished jobs are kept") from None
+
+
+def read_transfers(folder: Path) -> Frame | None:
+    """The rows of a study's patterns under other controllers; None before the first `study transfer`.
+
+    Raises:
+        StudyError: as `read_table` does.
+    """
+    return read_table(folder, TRANSFERRED) if (folder / TRANSFERRED).exists() else None
 
 
 def pandas() -> Any:  # noqa: ANN401  # the module

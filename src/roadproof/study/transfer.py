@@ -21,11 +21,9 @@ from roadproof.io.locks import working_in
 from roadproof.patterns import load_pattern
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import Simulator
-from roadproof.study.folder import is_done, pandas, read_table
+from roadproof.study.folder import TRANSFERRED, is_done, pandas, read_transfers
 from roadproof.study.plan import Job, Study
 from roadproof.study.rows import Frame, JobId, TransferRow, drive_columns, job_columns
-
-FILE = "transfer.parquet"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,11 +81,11 @@ def transfer(
     if not rows:
         raise StudyError(f"no pattern could be driven over; the first of {len(failures)}: {failures[0]}")
     frame = pandas().DataFrame(rows)
-    if (folder / FILE).exists():
-        before = read_table(folder, FILE)
+    before = read_transfers(folder)
+    if before is not None:
         others = before["job"].isin([job.key for job in found]) & ~before["controller"].isin(list(drivers))
         frame = pandas().concat([before[others], frame], ignore_index=True) if others.any() else frame
-    write_atomically(folder / FILE, lambda part: frame.to_parquet(part, index=False))
+    write_atomically(folder / TRANSFERRED, lambda part: frame.to_parquet(part, index=False))
     return Transfer(frame, tuple(failures))
 
 

@@ -243,10 +243,9 @@ def _claim(recipe: Recipe, folder: Path) -> None:
     path, asked = folder / "recipe.json", asdict(recipe) | {"weights of start": recipe.weights_of_start()}
     if path.exists():
         kept = read_json(path, FORMAT, FORMAT_VERSION, TrainingError).get("recipe")
-        if not isinstance(kept, dict):
-            raise TrainingError(f"{path} has no recipe; remove it, or choose another folder")
-        # Folders are older than these words.
-        before = {"weights of start": asked["weights of start"]} | cast("dict[str, object]", kept)
-        require_same(folder, "a training", before, asked, TrainingError)
+        if isinstance(kept, dict):
+            # Folders are older than these words.
+            kept = {"weights of start": asked["weights of start"]} | cast("dict[str, object]", kept)
+        require_same(folder, "a training", kept, asked, TrainingError)
     else:
         write_json(path, {"format": FORMAT, "version": FORMAT_VERSION, "recipe": asked})
