@@ -233,11 +233,17 @@ def test_composites_and_renders_are_compared_in_the_paint_and_outside_it():
 def test_beyond_the_end_of_a_drive_that_ended_early_nothing_is_beside_it():
     # A right angle; the clean drive was blocked five metres before it.
     corner = np.concatenate([line(), np.column_stack([np.full(60, 40.0), 0.5 * np.arange(1, 61)])])
-    blocked = corner[:70]
-    assert deviation.furthest_beside_m(blocked, corner, ended_early=True) == pytest.approx(0.0, abs=1e-9)
-    assert deviation.furthest_beside_m(blocked, corner, ended_early=False) == pytest.approx(30.0)
-    aside = corner + np.array([0.0, -1.5])
-    assert deviation.furthest_beside_m(blocked, aside, ended_early=True) == pytest.approx(-1.5)
+    whole = on_path(*corner.T, Ending.GOAL_REACHED)
+    blocked = on_path(*corner[:70].T, Ending.BLOCKED)
+    known = deviation.beside_m(blocked, whole)
+    assert len(known) == 74  # two metres more, at half a metre an observation
+    np.testing.assert_allclose(known, 0.0, atol=1e-9)
+    arrived = deviation.beside_m(dataclasses.replace(blocked, ending=Ending.GOAL_REACHED), whole)
+    assert arrived.max() == pytest.approx(30.0)
+    aside = deviation.beside_m(blocked, on_path(*(corner + np.array([0.0, -1.5])).T, Ending.GOAL_REACHED))
+    np.testing.assert_allclose(aside, -1.5)
+    beyond = deviation.beside_m(blocked, on_path(*corner[100:].T, Ending.GOAL_REACHED))
+    assert len(beyond) == 1
 
 
 @pytest.mark.parametrize("ending", [each for each in Ending if each is not Ending.GOAL_REACHED])

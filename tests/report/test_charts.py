@@ -1,13 +1,15 @@
 """Charts take their colours from the page, and are drawn where things are."""
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from roadproof.driving.deviation import path_of
+from roadproof.datatypes import Ending
+from roadproof.driving.deviation import beside_m, path_of
 from roadproof.driving.intervals import Estimate
 from roadproof.patterns import raster
 from roadproof.report import charts
@@ -84,6 +86,20 @@ def test_marks_lie_on_the_lines_that_they_move_along(drives):
         for _, x, y in marks:
             off = min(np.hypot(*(points - (float(x), float(y))).T).min() for points in on_lines)
             assert off < 2.0
+
+
+def test_beyond_the_end_of_a_clean_drive_that_was_blocked_no_offset_is_drawn(drives):
+    clean, painted = drives
+    count = len(clean) // 2
+    sides = {name: getattr(clean, name)[: count - 1] for name in ("steer", "throttle", "brake")}
+    names = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "command")
+    blocked = replace(clean, ending=Ending.BLOCKED, **sides, **{name: getattr(clean, name)[:count] for name in names})
+    known = len(beside_m(blocked, painted))
+    assert count < known < len(painted) // 1.5
+    steps = np.array([known - 1, len(painted) - 1])
+    chart = charts.offsets([("clear-noon", blocked, painted)], SCENARIO.canvas, steps)
+    marks = re.findall(r'<circle class="at m\d painted" r="5" (cx="[\d.]+" cy="[\d.]+")/>', chart.svg)
+    assert len(set(marks)) == 1 and len(marks) == 2
 
 
 def test_marks_beyond_the_axes_are_left_out(drives):

@@ -99,22 +99,23 @@ def lateral_m(reference: Path2D, positions: Float[np.ndarray, "m 2"]) -> Float[n
     return _beside(reference, positions)[0]
 
 
-def furthest_beside_m(clean: Path2D, painted: Float[np.ndarray, "m 2"], *, ended_early: bool) -> float:
-    """The largest signed distance of a drive beside another's path, left positive, metres.
+def beside_m(clean: Episode, painted: Episode) -> Float[np.ndarray, " m"]:
+    """Signed distance of a drive beside another's path, left positive, metres, as far as that path is known.
+
+    Where the clean drive ended short of its goal nobody knows where it would have gone on: then the first observation
+    that is more than `PAST_END_M` beyond its end, and all after it, have no distance. The very first always has one.
 
     Args:
-        clean: path of the drive without paint, (n, 2).
-        painted: positions of the drive with paint, (m, 2).
-        ended_early: whether nobody knows where the clean drive would have gone on; positions from the first one that is
-            more than `PAST_END_M` beyond its end are then left out.
+        clean: episode of the drive without paint.
+        painted: episode of the drive with it.
 
     Raises:
         EpisodeError: a path is empty or not finite, or the clean one does not move.
     """
-    beside, past_end_m = _beside(clean, painted)
+    beside, past_end_m = _beside(path_of(clean), path_of(painted))
     past = np.flatnonzero(past_end_m > PAST_END_M)
-    known = beside[: max(int(past[0]), 1)] if ended_early and len(past) else beside
-    return float(known[np.abs(known).argmax()])
+    unknown = clean.ending is not Ending.GOAL_REACHED and len(past) > 0
+    return beside[: max(int(past[0]), 1)] if unknown else beside
 
 
 def _beside(

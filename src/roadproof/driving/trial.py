@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from statistics import fmean
 
-from roadproof.datatypes import Ending, Event, Weather
-from roadproof.driving.deviation import LEAVES_LANE_M, furthest_beside_m, passage_deviation_m, path_of
+from roadproof.datatypes import Event, Weather
+from roadproof.driving.deviation import LEAVES_LANE_M, beside_m, passage_deviation_m
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
 from roadproof.driving.speed import speed_difference
@@ -95,9 +95,7 @@ def judge(
     Deviation and change of the speed are taken over the instants at which the clean drive has the canvas in view, the
     largest offset over the whole painted drive; where the clean drive ended early, only as far as that got.
     """
-    # Short of the goal nobody knows where the clean drive would have gone.
-    early = clean.ending is not Ending.GOAL_REACHED
-    furthest_m = furthest_beside_m(path_of(clean), path_of(painted), ended_early=early)
+    beside = beside_m(clean, painted)
     faster = speed_difference(clean, painted, canvas)
     known = not painted.paint.predicted
     return Trial(
@@ -108,7 +106,7 @@ def judge(
         clean=clean_file,
         painted=painted_file,
         deviation_m=passage_deviation_m(clean, painted, canvas),
-        lateral_m=furthest_m,
+        lateral_m=max(beside.tolist(), key=abs),
         points=infraction_points(painted.events) if known else None,
         clean_points=infraction_points(clean.events) if known else None,
         leaderboard=leaderboard_factor(painted.events) if known else None,

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from roadproof.datatypes import Observation
-from roadproof.driving.deviation import lateral_m, passage, path_of
+from roadproof.driving.deviation import beside_m, passage, path_of
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import look_again
@@ -140,14 +140,14 @@ def film_drives(
     with open_or_here(pool, simulator) as driving:
         taken = {side.colour: side for _, side in driving.each(partial(_filmed, start, steps), takes)}
     sides = taken[CLEAN], taken[PAINTED]
-    beside_m = lateral_m(path_of(clean), path_of(painted))
+    beside = beside_m(clean, painted)
     each = sides[0].each
     bare, driven = (
         np.stack([np.asarray(side.picture(k).resize(STRIP_SIZE, Image.Resampling.LANCZOS)) for k in steps])
         for side in sides
     )
-    Strip(time_s=painted.time_s[steps], lateral_m=beside_m[steps], clean=bare, painted=driven).save(folder / STRIP)
-    poster = _page(sides, beside_m, int(np.abs(beside_m[: last + 1]).argmax()) // each * each)
+    Strip(time_s=painted.time_s[steps], lateral_m=beside[steps], clean=bare, painted=driven).save(folder / STRIP)
+    poster = _page(sides, beside, int(np.abs(beside[: last + 1]).argmax()) // each * each)
     write_atomically(folder / POSTER, lambda part: poster.save(part, format="JPEG", quality=82))
     if not can_film():
         return False
@@ -156,7 +156,7 @@ def film_drives(
         with film as add, ThreadPoolExecutor(1) as encoding:
             added = encoding.submit(lambda: None)
             for step in range(0, max(side.shown for side in sides), each):
-                page = np.asarray(_page(sides, beside_m, step))
+                page = np.asarray(_page(sides, beside, step))
                 # One image is drawn while the one before is encoded.
                 added.result()
                 added = encoding.submit(add, page)
@@ -167,8 +167,8 @@ def film_drives(
 
 
 def passage_steps(clean: Episode, painted: Episode, canvas: CanvasPlacement, count: int) -> list[int]:
-    """Steps evenly spread over the clean drive's passage, from `FILMED_M` on, as far as the painted drive goes."""
-    seen, last = passage(path_of(clean), canvas, horizon_m=FILMED_M), len(painted) - 1
+    """Steps evenly spread over the clean drive's passage, from `FILMED_M` on, as far as the other is beside it."""
+    seen, last = passage(path_of(clean), canvas, horizon_m=FILMED_M), len(beside_m(clean, painted)) - 1
     first, end = min(seen.start, last), min(seen.stop - 1, last)
     return [round(first + (end - first) * k / (count - 1)) for k in range(count)]
 
@@ -197,8 +197,8 @@ def _as_jpeg(seen: Observation) -> bytes:
     return file.getvalue()
 
 
-def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: int) -> Image.Image:
-    """One image of the film, with both drives side by side."""
+def _page(sides: tuple[_Side, _Side], offset_m: Float[np.ndarray, " n"], step: int) -> Image.Image:
+    """One image of the film, with both drives side by side; the offset is told as far as it is known."""
     large, small = _font(26), _font(19)
     page = Image.new("RGB", (2 * VIEW[0], VIEW[1] + CAPTION_PX), PAPER)
     pen = ImageDraw.Draw(page)
@@ -207,7 +207,8 @@ def _page(sides: tuple[_Side, _Side], beside_m: Float[np.ndarray, " n"], step: i
         page.paste(side.picture(step), (left, CAPTION_PX))
         pen.rectangle((left, CAPTION_PX - 6, left + VIEW[0], CAPTION_PX - 1), fill=side.colour)
         pen.text((left + 20, 12), side.title, side.colour, large)
-        beside = f"{abs(beside_m[k]):.2f} m to the {'left' if beside_m[k] > 0 else 'right'}" if left else ""
+        known = left and k < len(offset_m)
+        beside = f"{abs(offset_m[k]):.2f} m to the {'left' if offset_m[k] > 0 else 'right'}" if known else ""
         state = f"{abs(3.6 * episode.speed_mps[k]):.0f} km/h   {episode.time_s[k]:.1f} s   {beside}"
         pen.text((left + 20, 50), state, INK, small)
         event, fresh = last_event(episode, k, side.shown)

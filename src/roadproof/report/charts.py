@@ -18,7 +18,7 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from roadproof.driving.deviation import HORIZON_M, lateral_m, path_of
+from roadproof.driving.deviation import HORIZON_M, beside_m, lateral_m, path_of
 from roadproof.driving.episode import Episode
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
@@ -175,12 +175,13 @@ def offsets(
     labels = {name: in_words(name) for name in names}
     marks: list[Mark] = []
     for name, clean, painted in drives:
-        beside = -lateral_m(path_of(clean), path_of(painted))
+        beside = -beside_m(clean, painted)
         k, label = names.index(name), labels.pop(name, None)
-        where, colour = metres_past(painted, canvas), SERIES[k % len(SERIES)]
+        where, colour = metres_past(painted, canvas)[: len(beside)], SERIES[k % len(SERIES)]
         axes.plot(where, beside, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=width, label=label)
         if not marks:
-            marks = [Mark("painted", np.stack([where[steps], beside[steps]], 1))]
+            shown = np.minimum(steps, len(beside) - 1)
+            marks = [Mark("painted", np.stack([where[shown], beside[shown]], 1))]
     predicted = any(painted.paint.predicted for _, _, painted in drives)
     words = f"Distance from the clean path along the drive, alone on the road{', predicted' if predicted else ''}"
     return _finished(figure, axes, "offsets", words, marks=marks)
