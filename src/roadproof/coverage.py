@@ -98,6 +98,11 @@ class Footprints:
     def __len__(self) -> int:
         return self.centre.shape[-2]
 
+    @property
+    def side(self) -> float:
+        """Side, in picture px, of the square of equal variance."""
+        return (2 * self.variance) ** 0.5
+
 
 def in_figure_axes(
     box: Float[Tensor, "*b 5"], footprints: Footprints
@@ -206,8 +211,7 @@ def _polygon_coverage(vertices: Float[Tensor, "*b n 2"], footprints: Footprints)
     In units of the footprint it is the square [−½, ½]²; the area is, by Green's theorem, the sum over the edges of
     the integral of the edge's height clamped to the square. Exact for thin slivers and corners alike.
     """
-    side = (2 * footprints.variance) ** 0.5
-    picture_from_canvas = cast("Tensor", torch.linalg.inv(footprints.jacobian)) / side
+    picture_from_canvas = cast("Tensor", torch.linalg.inv(footprints.jacobian)) / footprints.side
     offset = vertices[..., None, :, :] - footprints.centre[..., None, :]
     points = torch.einsum("...pij,...pnj->...pni", picture_from_canvas, offset)
     following = points.roll(-1, dims=-2)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from roadproof.compiling import Kernel
-from roadproof.compositing.compiled import interval_share
+from roadproof.compositing.tents import interval_share
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.homographies import Homographies
 

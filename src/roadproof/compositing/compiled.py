@@ -1,11 +1,12 @@
-"""Painting rectangles on a CPU: one pass over the canvas' pixels to paint them, one to go back, compiled by Numba.
+"""Painting figures on a CPU: one pass over the canvas' pixels to paint them, one to go back, compiled by Numba.
 
 The same values as `composite.blend` over `coverage`. Operation by operation a pixel is read and written some hundred
 times on its way there and back; here it is read once, and a figure that does not reach it costs a look at how far off
-it is. Masks are worked out anew on the way back. Pixels are taken in blocks, by as many threads as torch has, and each
-block adds up its own share of the gradients: the same numbers are added in the same order whoever takes them.
+it is. Masks are worked out anew on the way back: those of rectangles here, on the way, those of other shapes by a pass
+of their own (`compositing.masks`). Pixels are taken in blocks, by as many threads as torch has, and each block adds up
+its own share of the gradients: the same numbers are added in the same order whoever takes them.
 
-With S̃(t) = t (1 − |t|/2) on [−1, 1] and its slope S̃′(t) = 1 − |t| (zero where t was clamped), the edges of a figure
+With S̃(t) = t (1 − |t|/2) on [−1, 1] and its slope S̃′(t) = 1 − |t| (zero where t was clamped), the edges of a rectangle
 along one axis at distances d = w/2 ± u from a pixel, and σ across them,
 
     C_u = S̃(t₁) + S̃(t₂),   t = d/σ_u,   M = C_u C_v
@@ -15,11 +16,11 @@ along one axis at distances d = w/2 ± u from a pixel, and σ across them,
 and for the visibilities V_k = M_k T_k, with D_k = ∂L/∂V_k and what is seen through figure k, S_{k+1} = D_k M_k +
 (1 − M_k) S_k, S_0 = 0, each adjoint is ∂L/∂M_k = T_k (D_k − S_k): compositing again, from the bottom up.
 
-A figure comes as twelve numbers (`CanvasPixels.rectangles`), pixels as their `CanvasPixels` have them, with a leading
+A figure comes as twelve numbers (`CanvasPixels.figures`), pixels as their `CanvasPixels` have them, with a leading
 dimension of 1, or of B where each pattern has pixels of its own.
 """
 
-# ruff: noqa: ANN001, ANN201, ANN202
+# ruff: noqa: ANN001, ANN202
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
 from __future__ import annotations
@@ -34,13 +35,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from roadproof.compiling import Kernel, inline, run
+from roadproof.compositing.masks import BLOCK, COVERS
+from roadproof.compositing.tents import interval_share, slope, tent
 from roadproof.compositing.view import CanvasPixels
-from roadproof.coverage import MIN_VARIANCE
+from roadproof.coverage import MIN_VARIANCE, Shape
 from roadproof.errors import PatternError
 from roadproof.patterns import Pattern
-
-BLOCK = 1 << 14
-"""Pixels that are taken at once."""
 
 _ZERO, _HALF, _ONE, _LEAST = np.float32(0), np.float32(0.5), np.float32(1), np.float32(MIN_VARIANCE)
 _NAN, _NUMBERS = np.float32(np.nan), 12
@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
 
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
-    """Colours of the canvas' pixels with rectangles painted, differentiable as in `painted_into`."""
+    """Colours of the canvas' pixels with figures painted, differentiable as in `painted_into`."""
     batch, many = pattern.boxes.shape[:-2], view.clean.shape[-2]
     colours = view.clean.new_empty(batch.numel(), many, 3)
     rows = view.clean.shape[:-2].numel()
@@ -78,7 +78,7 @@ def painted_into(
     views: Sequence[CanvasPixels],
     places: Sequence[Place],
 ) -> Float[Tensor, "n 3 q"]:
-    """Pictures with rectangles painted in the canvas' pixels of some views, differentiable once in boxes and colours.
+    """Pictures with figures painted in the canvas' pixels of some views, differentiable once in boxes and colours.
 
     Widths and lengths are above 0, and what is known of the pixels is finite.
 
@@ -91,37 +91,82 @@ def painted_into(
     Raises:
         PatternError: a view has another number of pictures, or of rows of pixels, than its patterns need.
     """
-    figures, pixels = list[Tensor](), list[tuple[Tensor, ...]]()
+    figures, shapes = list[Tensor](), list[Shape]()
     for pattern, view, place in zip(patterns, views, places, strict=True):
-        count, many = len(pattern.shapes), view.clean.shape[-2]
-        figures.append(view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3)))
+        figures.append(view.figures(pattern))
+        shapes.append(pattern.shapes[0])
         rows = view.clean.shape[:-2].numel()
         end, room = place.first + len(figures[-1]) * place.each, len(pictures)
         if end > room or rows not in (1, len(figures[-1])):
             raise PatternError(f"{len(figures[-1])} patterns do not fit {room} pictures with {rows} rows of pixels")
-        features = view.footprints.features.reshape(-1, 6, many)
-        pixels.append((features, *(each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias))))
-    return cast("Tensor", _Painted.apply(_Canvases(pictures, pixels, places), *figures))
+    canvases = [_Canvas(*each) for each in zip(shapes, views, places, strict=True)]
+    return cast("Tensor", _Painted.apply((pictures, canvases), *figures))
 
 
-class _Canvases(NamedTuple):
-    """What is painted on, out of sight of what takes the gradients."""
+class _Canvas(NamedTuple):
+    """What is painted on with figures of one shape."""
 
-    pictures: Float[Tensor, "n 3 q"]
-    pixels: Sequence[tuple[Tensor, ...]]
-    places: Sequence[Place]
+    shape: Shape
+    view: CanvasPixels
+    place: Place
+
+    @property
+    def blocks(self) -> int:
+        """How many parts its pixels are taken in."""
+        return -(-self.place.pixel.shape[1] // BLOCK)
+
+    @property
+    def outlines(self) -> tuple[Tensor | float, ...]:
+        """What kernels of masks are told of its pixels."""
+        many, footprints = self.view.clean.shape[-2], self.view.footprints
+        features, jacobian = footprints.features.reshape(-1, 6, many), footprints.jacobian.reshape(-1, many, 4)
+        return features.contiguous(), jacobian.contiguous(), self.place.counted, footprints.side
+
+    def masks(self, figures: Tensor) -> Float[Tensor, "b k p"]:
+        """The figures' masks; empty where they are rectangles."""
+        if self.shape is Shape.RECTANGLE:
+            return figures.new_empty(len(figures), 0, 0)
+        masks = figures.new_empty(*figures.shape[:2], self.place.pixel.shape[1])
+        run(COVERS[self.shape][0], (figures.contiguous(), *self.outlines, masks), self.blocks)
+        return masks
+
+    def told(self, figures: Tensor, masks: Tensor, pictures: Float[Tensor, "n 3 q"]) -> tuple[Tensor | int, ...]:
+        """What a kernel is told; pictures as one row of numbers, and how far apart those of each dimension are.
+
+        A kernel is compiled once for all orders of a picture's numbers: channels first as channels last.
+        """
+        view, many = self.view, self.view.clean.shape[-2]
+        pixels = (
+            view.footprints.features.reshape(-1, 6, many),
+            *(each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias)),
+        )
+        strides = pictures.stride()
+        extent = sum((size - 1) * stride for size, stride in zip(pictures.shape, strides, strict=True)) + 1
+        row = pictures.detach().as_strided((extent if pictures.numel() else 0,), (1,))
+        given = (each.contiguous() for each in (figures, masks, *pixels, self.place.pixel, self.place.counted))
+        return *given, self.place.first, self.place.each, row, pictures.shape[2], *strides
+
+    def gradient(self, figures: Tensor, on_pictures: Float[Tensor, "n 3 q"]) -> Float[Tensor, "b k 12"]:
+        """The gradient of the figures' numbers from that of the pictures."""
+        masks = self.masks(figures)
+        shares = torch.empty(self.blocks, *figures.shape, dtype=torch.float64)
+        run(_unpaint, (*self.told(figures, masks, on_pictures), shares), self.blocks)
+        if masks.numel():
+            # They hold their own gradient now.
+            run(COVERS[self.shape][1], (figures.contiguous(), *self.outlines, masks, shares), self.blocks)
+        return shares.sum(0).to(figures.dtype)
 
 
 class _Painted(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, on: _Canvases, *figures: Tensor) -> Tensor:  # noqa: ANN401
-        ctx.on = on
+    def forward(ctx: Any, on: tuple[Tensor, Sequence[_Canvas]], *figures: Tensor) -> Tensor:  # noqa: ANN401
+        # What is painted on is out of sight of what takes the gradients.
+        pictures, ctx.canvases = on
         ctx.save_for_backward(*figures)
-        for each, pixels, place in zip(figures, on.pixels, on.places, strict=True):
-            told = _told(each, pixels, place, on.pictures)
-            run(_paint, told, _blocks(place))
-        torch.autograd.graph.increment_version(on.pictures)
-        return on.pictures.detach()
+        for each, canvas in zip(figures, ctx.canvases, strict=True):
+            run(_paint, canvas.told(each, canvas.masks(each), pictures), canvas.blocks)
+        torch.autograd.graph.increment_version(pictures)
+        return pictures.detach()
 
     @staticmethod
     @once_differentiable
@@ -129,55 +174,9 @@ class _Painted(torch.autograd.Function):
         ctx: Any,  # noqa: ANN401
         *grad_outputs: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        gradients = list[Tensor | None]([None])
-        wanted = ctx.needs_input_grad[1:]
-        for each, pixels, place, wants in zip(ctx.saved_tensors, ctx.on.pixels, ctx.on.places, wanted, strict=True):
-            if not wants:
-                gradients.append(None)
-                continue
-            shares = torch.empty(_blocks(place), *each.shape, dtype=torch.float64)
-            run(_unpaint, (*_told(each, pixels, place, grad_outputs[0]), shares), len(shares))
-            gradients.append(shares.sum(0).to(each.dtype))
-        return tuple(gradients)
-
-
-def _blocks(place: Place) -> int:
-    """How many parts the pixels of a view are taken in."""
-    return -(-place.pixel.shape[1] // BLOCK)
-
-
-def _told(
-    figures: Tensor, pixels: tuple[Tensor, ...], place: Place, pictures: Float[Tensor, "n 3 q"]
-) -> tuple[Tensor | int, ...]:
-    """What a kernel is told of a view; pictures as one row of numbers, and how far apart those of each dimension are.
-
-    A kernel is compiled once for all orders of a picture's numbers: channels first as channels last.
-    """
-    strides = pictures.stride()
-    extent = sum((size - 1) * stride for size, stride in zip(pictures.shape, strides, strict=True)) + 1
-    row = pictures.detach().as_strided((extent if pictures.numel() else 0,), (1,))
-    given = (figures, *pixels, place.pixel, place.counted)
-    return *(each.contiguous() for each in given), place.first, place.each, row, pictures.shape[2], *strides
-
-
-@inline
-@no_type_check
-def _tent(t):
-    t = min(_ONE, max(-_ONE, t))
-    return t * (_ONE - _HALF * abs(t))
-
-
-@inline
-@no_type_check
-def interval_share(off, half, reach):
-    """Share of a tent, so far off the middle and of that half-width, that lies inside [−half, half]."""
-    return _tent((half - off) / reach) + _tent((half + off) / reach)
-
-
-@inline
-@no_type_check
-def _slope(t):
-    return max(_ONE - abs(t), _ZERO)
+        wanted = zip(ctx.needs_input_grad[1:], ctx.saved_tensors, ctx.canvases, strict=True)
+        gradients = (canvas.gradient(each, grad_outputs[0]) if wants else None for wants, each, canvas in wanted)
+        return None, *gradients
 
 
 # Numbers are asked for one by one: a view of a row of them would be counted at every pixel, which takes longer than
@@ -197,7 +196,7 @@ def _in_figure(figures, b, k, x, y, xx, xy, yy):
 @inline
 @no_type_check
 def _mask(figures, b, k, x, y, xx, xy, yy):
-    """How much of a pixel a figure covers."""
+    """How much of a pixel a rectangle covers."""
     u, v, variance_u, variance_v = _in_figure(figures, b, k, x, y, xx, xy, yy)
     half_u, half_v = figures[b, k, 7], figures[b, k, 8]
     deep_u, deep_v = half_u - abs(u), half_v - abs(v)
@@ -211,14 +210,14 @@ def _mask(figures, b, k, x, y, xx, xy, yy):
 
 @inline
 @no_type_check
-def _laid(figures, b, x, y, xx, xy, yy, masks, above):
+def _laid(figures, masked, given, b, p, x, y, xx, xy, yy, masks, above):
     """Lay the figures over each other from the top: colours and share of the paint that is seen in a pixel.
 
     What each figure covers of it, and what of that is not under others, is written down for the way back.
     """
     through, red, green, blue = _ONE, _ZERO, _ZERO, _ZERO
     for k in range(len(masks) - 1, -1, -1):
-        mask = _mask(figures, b, k, x, y, xx, xy, yy)
+        mask = given[b, k, p] if masked else _mask(figures, b, k, x, y, xx, xy, yy)
         masks[k], above[k] = mask, through
         if mask != _ZERO:
             shown = mask * through
@@ -252,9 +251,11 @@ def _are_numbers(figures, b):
 @Kernel
 @no_type_check
 def _paint(
-    figures, features, clean, gain, bias, pixels, counted, first, each, row, size, to_next, to_channel, to_pixel, block
+    figures, given, features, clean, gain, bias, pixels, counted, first, each, row, size, to_next, to_channel, to_pixel,
+    block,
 ):  # fmt: skip
     """Colours of a block of pixels, clipped to [0, 1]; NaN where a figure is."""
+    masked = given.shape[1] > 0
     masks, above = np.empty(figures.shape[1], np.float32), np.empty(figures.shape[1], np.float32)
     for b in range(figures.shape[0]):
         w = b if clean.shape[0] > 1 else 0
@@ -262,7 +263,7 @@ def _paint(
         for p in range(block * BLOCK, min(counted[w], (block + 1) * BLOCK)):
             x, y = features[w, 0, p], features[w, 1, p]
             xx, xy, yy = features[w, 3, p], features[w, 4, p], features[w, 5, p]
-            red, green, blue, share = _laid(figures, b, x, y, xx, xy, yy, masks, above)
+            red, green, blue, share = _laid(figures, masked, given, b, p, x, y, xx, xy, yy, masks, above)
             red, green, blue = _composed(clean, gain, bias, w, p, red, green, blue, share)
             at = np.uint32(pixels[w, p])
             picture, pixel = at // np.uint32(size), at % np.uint32(size)
@@ -275,11 +276,11 @@ def _paint(
 @Kernel
 @no_type_check
 def _unpaint(
-    figures, features, clean, gain, bias, pixels, counted, first, each, row, size, to_next, to_channel, to_pixel,
+    figures, given, features, clean, gain, bias, pixels, counted, first, each, row, size, to_next, to_channel, to_pixel,
     shares, block,
 ):  # fmt: skip
     """A block's share of the gradient of every number of the figures."""
-    many = figures.shape[1]
+    many, masked = figures.shape[1], given.shape[1] > 0
     masks, above = np.empty(many, np.float32), np.empty(many, np.float32)
     added = np.empty((many, _NUMBERS), np.float64)
     for b in range(figures.shape[0]):
@@ -288,8 +289,10 @@ def _unpaint(
         for p in range(block * BLOCK, min(counted[w], (block + 1) * BLOCK)):
             x, y = features[w, 0, p], features[w, 1, p]
             xx, xy, yy = features[w, 3, p], features[w, 4, p], features[w, 5, p]
-            red, green, blue, share = _laid(figures, b, x, y, xx, xy, yy, masks, above)
+            red, green, blue, share = _laid(figures, masked, given, b, p, x, y, xx, xy, yy, masks, above)
             if share == _ZERO:
+                if masked:
+                    given[b, :, p] = _ZERO
                 continue
             # What was clipped has no gradient.
             at = np.uint32(pixels[w, p])
@@ -318,15 +321,18 @@ def _unpaint(
                 added[k, 9] += shown * on_red
                 added[k, 10] += shown * on_green
                 added[k, 11] += shown * on_blue
+                if masked:
+                    given[b, k, p] = on_mask if mask < _ONE else _ZERO
+                    continue
                 if mask == _ONE or on_mask == _ZERO:
                     continue
                 u, v, variance_u, variance_v = _in_figure(figures, b, k, x, y, xx, xy, yy)
                 sharp_u, sharp_v = _ONE / np.sqrt(max(variance_u, _LEAST)), _ONE / np.sqrt(max(variance_v, _LEAST))
                 low_u, high_u = (figures[b, k, 7] - u) * sharp_u, (figures[b, k, 7] + u) * sharp_u
                 low_v, high_v = (figures[b, k, 8] - v) * sharp_v, (figures[b, k, 8] + v) * sharp_v
-                on_u, on_v = on_mask * (_tent(low_v) + _tent(high_v)), on_mask * (_tent(low_u) + _tent(high_u))
-                on_low_u, on_high_u = on_u * _slope(low_u), on_u * _slope(high_u)
-                on_low_v, on_high_v = on_v * _slope(low_v), on_v * _slope(high_v)
+                on_u, on_v = on_mask * (tent(low_v) + tent(high_v)), on_mask * (tent(low_u) + tent(high_u))
+                on_low_u, on_high_u = on_u * slope(low_u), on_u * slope(high_u)
+                on_low_v, on_high_v = on_v * slope(low_v), on_v * slope(high_v)
                 spread_u, spread_v = _ZERO, _ZERO
                 if variance_u >= _LEAST:
                     spread_u = -_HALF * (on_low_u * low_u + on_high_u * high_u) * sharp_u * sharp_u

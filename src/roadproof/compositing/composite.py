@@ -166,7 +166,7 @@ def _worn(colours: Tensor, clean: Tensor, left: Float[Tensor, "b p"]) -> Tensor:
 
 def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with the pattern painted, differentiable in its boxes and colours."""
-    if _has_only_rectangles(pattern) and fuses(view.clean):
+    if set(pattern.shapes) == {Shape.RECTANGLE} and fuses(view.clean):
         # Triton may be missing.
         from roadproof.compositing.fused import painted as painted_on_gpu
 
@@ -180,14 +180,10 @@ def canvas_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 
     return blend(visibilities(coverages(pattern, view.footprints)), view.response(pattern.colours), view)
 
 
-def _has_only_rectangles(pattern: Pattern) -> bool:
-    return all(shape is Shape.RECTANGLE for shape in pattern.shapes)
-
-
 def _compiles(pattern: Pattern, view: CanvasPixels) -> bool:
-    """Whether a pass compiled for the processor paints a pattern."""
+    """Whether passes compiled for the processor paint a pattern."""
     here = view.clean.dtype == torch.float32 and view.clean.device.type == "cpu"
-    return here and not view.dense and _has_only_rectangles(pattern)
+    return here and not view.dense and len(set(pattern.shapes)) == 1
 
 
 def dense_colours(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:

@@ -60,8 +60,7 @@ def try_out(device: torch.device) -> None:
 
 def painted(pattern: Pattern, view: CanvasPixels) -> Float[Tensor, "*b p 3"]:
     """Colours of the canvas' pixels with rectangles painted, differentiable in their boxes and colours."""
-    batch, count = pattern.boxes.shape[:-2], len(pattern.shapes)
-    figures = view.rectangles(pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3))
+    batch, figures = pattern.boxes.shape[:-2], view.figures(pattern)
     pixels = _numbered(view)
     assert len(pixels) in (1, len(figures)), "pixels of one view, or of one for each pattern"
     colours = cast("Tensor", _Painted.apply(figures, pixels))

@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.coverage import Footprints, axis_rows, canvas_share
+from roadproof.coverage import Footprints, Shape, axis_rows, canvas_share, polygon_vertices
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
+from roadproof.patterns import Pattern
 from roadproof.photometry import ColourTransform, PixelMaps, Response
 from roadproof.photometry.responses import response_on
 
@@ -38,14 +39,20 @@ class CanvasPixels:
     response: Response
     dense: bool = False
 
-    def rectangles(self, boxes: Float[Tensor, "b k 5"], colours: Float[Tensor, "b k 3"]) -> Float[Tensor, "b k 12"]:
-        """Twelve numbers of each rectangle, for kernels that paint them.
+    def figures(self, pattern: Pattern) -> Float[Tensor, "b k 12"]:
+        """Twelve numbers of each figure, for kernels that paint them; all leading dimensions of the pattern are one.
 
-        They are c, s, o_u, o_v with u = c·x + s·y + o_u, v = c·y − s·x + o_v; c², c·s, s²; half its width and length;
-        red, green, blue as seen.
+        Of rectangles and ellipses they are c, s, o_u, o_v with u = c·x + s·y + o_u, v = c·y − s·x + o_v; c², c·s, s²;
+        half their width and length. Of polygons, x and y of four corners, clockwise, the last one perhaps twice; and 0.
+        Of all of them red, green, blue as seen are the last three.
         """
-        u, v, spread, _ = axis_rows(boxes).unbind(-2)
-        return torch.cat([u[..., :3], v[..., 2:3], spread[..., 3:], boxes[..., 2:4] / 2, self.response(colours)], -1)
+        shapes, count = pattern.shapes, len(pattern.shapes)
+        boxes, colours = pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3)
+        if len(set(shapes)) == 1:
+            placed = _placed(shapes[0], boxes)
+        else:
+            placed = torch.stack([_placed(shape, boxes[:, k]) for k, shape in enumerate(shapes)], 1)
+        return torch.cat([placed, self.response(colours)], -1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -120,6 +127,17 @@ class OwnViews(CanvasPixels):
         """The pictures with other colours in the canvas' pixels; the rest is copied bit for bit."""
         place = self.pixel[:, None].expand(-1, 3, -1)
         return frames.flatten(2).scatter(2, place, colours.mT).view_as(frames)
+
+
+def _placed(shape: Shape, boxes: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b 9"]:
+    """The first nine numbers of figures of one shape."""
+    if shape in (Shape.RECTANGLE, Shape.ELLIPSE):
+        u, v, spread, _ = axis_rows(boxes).unbind(-2)
+        return torch.cat([u[..., :3], v[..., 2:3], spread[..., 3:], boxes[..., 2:4] / 2], -1)
+    corners = polygon_vertices(shape, boxes)
+    last = corners[..., -1:, :].expand(*corners.shape[:-2], 4 - corners.shape[-2], 2)
+    placed = torch.cat([corners, last], -2).flatten(-2)
+    return torch.cat([placed, torch.zeros_like(placed[..., :1])], -1)
 
 
 def fuses(values: Tensor) -> bool:

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from roadproof.compiling import Kernel, inline, run
-from roadproof.compositing.compiled import interval_share
+from roadproof.compositing.tents import interval_share
 from roadproof.compositing.view import OwnViews
 from roadproof.coverage import FOOTPRINT_VARIANCE, MIN_VARIANCE, Footprints
 from roadproof.geometry import CANVAS_SIZE_PX, Resampling
