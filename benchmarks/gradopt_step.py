@@ -1,12 +1,13 @@
 """What one step of GradOpt costs, against the bare controller and against the published way.
 
     python benchmarks/gradopt_step.py --json OUT [--frames 88 400] [--recordings SET] [--controllers cil pilotnet]
-        [--devices cpu cuda] [--quick]
+        [--shapes rectangle ellipse triangle diamond] [--devices cpu cuda] [--quick]
 
 A step composites the frames, shows them to the controller and goes back to the pattern's parameters. The bare
 controller's forward and backward pass to the same frames is the physical limit: ratio 1. The published way renders
-1 + 8 K whole sets of frames for one gradient. Kornia's, where kornia is installed, draws the canvas as a picture and
-warps it into every frame. All are measured in turn, in one run, on the same frames. Beside the clock stands processor
+1 + 8 K whole sets of frames for one gradient; it knows rectangles alone. Kornia's, where kornia is installed, draws the
+canvas as a picture and warps it into every frame. On a CPU the step is measured with plain operations, too, in place of
+compiled passes. All are measured in turn, in one run, on the same frames. Beside the clock stands processor
 time, which others on the machine disturb less; with one thread its ratio is the one to trust where the machine is busy.
 
 On a GPU the whole step of a search, as a CUDA graph that is recorded once and replayed, is measured beside the bare
@@ -32,6 +33,7 @@ from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import TypeVar
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -46,7 +48,7 @@ from roadproof.attacks.step import state_at
 from roadproof.controllers import CIL, Controller, pilotnet_controller
 from roadproof.controllers.asking import controls_of
 from roadproof.controllers.precision import multiply_in
-from roadproof.coverage import Footprints
+from roadproof.coverage import Footprints, Shape
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.io.files import write_json
@@ -147,14 +149,15 @@ def gradient(recordings: RecordingSet, name: str, device: str, dtype: torch.dtyp
 
 
 def measure(
-    recordings: RecordingSet, name: str, figures: int, precision: str, device: str, repeats: int
+    recordings: RecordingSet, name: str, shape: Shape, figures: int, precision: str, device: str, repeats: int
 ) -> dict[str, object]:
     """One case: medians of alternating repeats after a warm-up."""
-    dtype, published = DTYPES[precision], precision == "float32"
+    rectangles = shape is Shape.RECTANGLE
+    dtype, published = DTYPES[precision], precision == "float32" and rectangles
     controller = network(name, device, dtype)
     groups = parse_groups("all", recordings)
     surrogate = Surrogate(recordings, controller, groups, device=device)
-    space = SearchSpace(figures=figures)
+    space = SearchSpace(figures=figures) if rectangles else SearchSpace(figures=figures, family="free", shape=shape)
     unit = space.random((1, 1), torch.Generator().manual_seed(0)).to(device)
     exact = gradient(recordings, name, device, torch.float64, space)
     error = (surrogate.values_and_gradients(space, unit)[1].double() - exact).norm() / exact.norm()
@@ -169,7 +172,13 @@ def measure(
         leaf = frames.requires_grad_()
         torch.autograd.grad(controller.steer(leaf, speed, command).float().sum(), leaf)
 
+    def plain() -> None:
+        with patch("roadproof.compositing.composite._compiles", lambda *_: False):
+            step()
+
     runs = {"step": step, "bare": bare}
+    if device == "cpu":
+        runs["plain"] = plain
     if published:
         authors = PublishedMeasure(recordings, controller, groups, device=device).on_grid(10.0)
         runs["published"] = lambda: authors.values_and_gradients(space, unit)
@@ -206,6 +215,7 @@ def measure(
     median = {key: statistics.median(values) for key, values in times.items()}
     return {
         "controller": name,
+        "shape": str(shape),
         "figures": figures,
         "dtype": precision,
         "device": device,
@@ -217,6 +227,8 @@ def measure(
         "bare_ms_range": [round(min(times["bare"]), 2), round(max(times["bare"]), 2)],
         "ratio": _median_ratio(times),
         "cpu_ratio": _median_ratio(cpu_times) if device == "cpu" else None,
+        "plain_step_ms": round(median["plain"], 2) if device == "cpu" else None,
+        "plain_over_ours": round(median["plain"] / median["step"], 2) if device == "cpu" else None,
         "graph_step_ms": round(median["step_graph"], 2) if "step_graph" in median else None,
         "graph_bare_ms": round(median["bare_graph"], 2) if "bare_graph" in median else None,
         "graph_ratio": _graph_ratio(times),
@@ -312,6 +324,7 @@ def main() -> None:
     parser.add_argument("--recordings", type=Path, help="a set of real recordings instead of the synthetic drives")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--controllers", nargs="+", choices=("cil", "pilotnet"), default=("cil", "pilotnet"))
+    parser.add_argument("--shapes", nargs="+", type=Shape, choices=Shape, default=[Shape.RECTANGLE])
     there = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     parser.add_argument("--devices", nargs="+", choices=there, default=there)
     parser.add_argument("--quick", action="store_true", help="K = 5 in float32 on the CPU only")
@@ -321,12 +334,13 @@ def main() -> None:
     devices = ["cpu"] if args.quick else args.devices
     cases, paths = [], []
     for recordings in [given] if given else map(synthetic_drive, args.frames):
-        for device, name, figures in product(devices, args.controllers, (5,) if args.quick else (1, 5)):
+        counts = (5,) if args.quick else (1, 5)
+        for device, name, shape, figures in product(devices, args.controllers, args.shapes, counts):
             for precision in DTYPES:
                 if (args.quick and precision != "float32") or (device == "cpu" and precision == "tf32"):
                     continue
                 multiply_in(precision)
-                cases.append(measure(recordings, name, figures, precision, device, args.repeats))
+                cases.append(measure(recordings, name, shape, figures, precision, device, args.repeats))
                 print(json.dumps(cases[-1]), flush=True)
     multiply_in("float32")
     for device, name in product(devices, args.controllers if given and given.is_placed else ()):
