@@ -84,7 +84,7 @@ def painted_into(
 
     Args:
         pictures: N flattened pictures of float32; they are written to, and what is returned shares their memory.
-        patterns: a batch of patterns for each view.
+        patterns: a batch of patterns for each view, all their figures of one shape.
         views: what the pictures show of the canvas.
         places: where the pixels of each view lie in the pictures.
 
@@ -94,7 +94,8 @@ def painted_into(
     figures, shapes = list[Tensor](), list[Shape]()
     for pattern, view, place in zip(patterns, views, places, strict=True):
         figures.append(view.figures(pattern))
-        shapes.append(pattern.shapes[0])
+        (shape,) = set(pattern.shapes)
+        shapes.append(shape)
         rows = view.clean.shape[:-2].numel()
         end, room = place.first + len(figures[-1]) * place.each, len(pictures)
         if end > room or rows not in (1, len(figures[-1])):
