@@ -94,8 +94,7 @@ def painted_into(
     figures, shapes = list[Tensor](), list[Shape]()
     for pattern, view, place in zip(patterns, views, places, strict=True):
         figures.append(view.figures(pattern))
-        (shape,) = set(pattern.shapes)
-        shapes.append(shape)
+        shapes.append(pattern.shapes[0])
         rows = view.clean.shape[:-2].numel()
         end, room = place.first + len(figures[-1]) * place.each, len(pictures)
         if end > room or rows not in (1, len(figures[-1])):
@@ -117,18 +116,23 @@ class _Canvas(NamedTuple):
         return -(-self.place.pixel.shape[1] // BLOCK)
 
     @property
-    def outlines(self) -> tuple[Tensor | float, ...]:
-        """What kernels of masks are told of its pixels."""
-        many, footprints = self.view.clean.shape[-2], self.view.footprints
-        features, jacobian = footprints.features.reshape(-1, 6, many), footprints.jacobian.reshape(-1, many, 4)
-        return features.contiguous(), jacobian.contiguous(), self.place.counted, footprints.side
+    def features(self) -> Float[Tensor, "w 6 p"]:
+        """The features of its pixels' footprints."""
+        return self.view.footprints.features.reshape(-1, 6, self.view.clean.shape[-2]).contiguous()
+
+    def outlined(self, figures: Tensor, masks: Tensor) -> tuple[Tensor | float, ...]:
+        """What a kernel of masks is told."""
+        footprints = self.view.footprints
+        jacobian = footprints.jacobian.reshape(len(self.features), -1, 4).contiguous()
+        return figures.contiguous(), self.features, jacobian, self.place.counted, footprints.side, masks
 
     def masks(self, figures: Tensor) -> Float[Tensor, "b k p"]:
         """The figures' masks; empty where they are rectangles."""
-        if self.shape is Shape.RECTANGLE:
+        if self.shape not in COVERS:
             return figures.new_empty(len(figures), 0, 0)
+        cover, _ = COVERS[self.shape]
         masks = figures.new_empty(*figures.shape[:2], self.place.pixel.shape[1])
-        run(COVERS[self.shape][0], (figures.contiguous(), *self.outlines, masks), self.blocks)
+        run(cover, self.outlined(figures, masks), self.blocks)
         return masks
 
     def told(self, figures: Tensor, masks: Tensor, pictures: Float[Tensor, "n 3 q"]) -> tuple[Tensor | int, ...]:
@@ -137,24 +141,23 @@ class _Canvas(NamedTuple):
         A kernel is compiled once for all orders of a picture's numbers: channels first as channels last.
         """
         view, many = self.view, self.view.clean.shape[-2]
-        pixels = (
-            view.footprints.features.reshape(-1, 6, many),
-            *(each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias)),
-        )
+        lights = (each.reshape(-1, many, 3) for each in (view.clean, view.gain, view.bias))
         strides = pictures.stride()
         extent = sum((size - 1) * stride for size, stride in zip(pictures.shape, strides, strict=True)) + 1
         row = pictures.detach().as_strided((extent if pictures.numel() else 0,), (1,))
-        given = (each.contiguous() for each in (figures, masks, *pixels, self.place.pixel, self.place.counted))
-        return *given, self.place.first, self.place.each, row, pictures.shape[2], *strides
+        given = (figures, masks, self.features, *lights, self.place.pixel, self.place.counted)
+        own = (each.contiguous() for each in given)
+        return *own, self.place.first, self.place.each, row, pictures.shape[2], *strides
 
     def gradient(self, figures: Tensor, on_pictures: Float[Tensor, "n 3 q"]) -> Float[Tensor, "b k 12"]:
         """The gradient of the figures' numbers from that of the pictures."""
         masks = self.masks(figures)
         shares = torch.empty(self.blocks, *figures.shape, dtype=torch.float64)
         run(_unpaint, (*self.told(figures, masks, on_pictures), shares), self.blocks)
-        if masks.numel():
-            # They hold their own gradient now.
-            run(COVERS[self.shape][1], (figures.contiguous(), *self.outlines, masks, shares), self.blocks)
+        if self.shape in COVERS:
+            # The masks hold their own gradient now.
+            _, uncover = COVERS[self.shape]
+            run(uncover, (*self.outlined(figures, masks), shares), self.blocks)
         return shares.sum(0).to(figures.dtype)
 
 

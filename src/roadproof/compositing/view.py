@@ -40,19 +40,15 @@ class CanvasPixels:
     dense: bool = False
 
     def figures(self, pattern: Pattern) -> Float[Tensor, "b k 12"]:
-        """Twelve numbers of each figure, for kernels that paint them; all leading dimensions of the pattern are one.
+        """Twelve numbers of each figure of a pattern of one shape, for kernels; its leading dimensions are one.
 
         Of rectangles and ellipses they are c, s, o_u, o_v with u = c·x + s·y + o_u, v = c·y − s·x + o_v; c², c·s, s²;
         half their width and length. Of polygons, x and y of four corners, clockwise, the last one perhaps twice; and 0.
         Of all of them red, green, blue as seen are the last three.
         """
-        shapes, count = pattern.shapes, len(pattern.shapes)
+        (shape,), count = set(pattern.shapes), len(pattern.shapes)
         boxes, colours = pattern.boxes.reshape(-1, count, 5), pattern.colours.reshape(-1, count, 3)
-        if len(set(shapes)) == 1:
-            placed = _placed(shapes[0], boxes)
-        else:
-            placed = torch.stack([_placed(shape, boxes[:, k]) for k, shape in enumerate(shapes)], 1)
-        return torch.cat([placed, self.response(colours)], -1)
+        return torch.cat([_placed(shape, boxes), self.response(colours)], -1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
