@@ -21,11 +21,13 @@ import carla
 from command import roadproof
 from roadproof.datatypes import Control, EventKind, Weather
 from roadproof.errors import ScenarioError, SimulatorError
+from roadproof.simulators.carla.actors import Crowd
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
 from roadproof.simulators.protocol import PaintKind
 from roadproof.simulators.town.simulator import TownSimulator
+from roadproof.traffic.traffic import Traffic
 
 AHEAD = Control(0.0, throttle=0.6)
 
@@ -98,6 +100,18 @@ def test_leaving_the_road_is_told_as_in_the_town(simulator):
     kinds = [event.kind for event in events]
     assert kinds[0] == EventKind.SIDEWALK
     assert EventKind.COLLISION_STATIC in kinds
+
+
+def test_traffic_is_spawned_while_pictures_come(port, onlooker):
+    with CarlaSimulator(port=port, camera=SMALL, input=SMALL_INPUT, patience_s=5.0) as simulator:
+        simulator.reset(STREET)
+        roads = simulator.session.road_map("street")
+        traffic = Traffic(roads, cars=2, pedestrians=1, seed=0, ego=STREET.start)
+        moves = Crowd(simulator.session, roads, traffic).moves()
+        assert len(moves) == 3
+        simulator.step(AHEAD)
+        assert len(onlooker.get_world().get_actors([move.actor_id for move in moves])) == 3
+    assert left_behind(onlooker) == []
 
 
 def test_weathers_are_seen(simulator):

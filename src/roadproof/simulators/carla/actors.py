@@ -128,9 +128,8 @@ class Crowd:
                     blueprint.set_attribute("color", colours[look // len(blueprints) % len(colours)])
             still = carla.command.SetSimulatePhysics(carla.command.FutureActor, False)
             commands.append(carla.command.SpawnActor(blueprint, self._place(agents, i, up_m)).then(still))
-        ids = self._session.batch(what, commands, tick=True) if commands else []
-        for actor in self._session.ask(what, lambda: self._session.world.get_actors(ids)) if ids else ():
-            self._session.keep(actor)
+        ids = self._session.batch(what, commands) if commands else []
+        self._session.keep(*ids)
         return ids
 
     def _place(self, agents: Agents, i: int, up_m: float) -> carla.Transform:

@@ -54,7 +54,7 @@ class Session:
         self.painted = False
         self._last_paint: tuple[list[str], UInt8[np.ndarray, "h w 3"]] | None = None
         self._texture: tuple[carla.TextureColor, UInt8[np.ndarray, "h w 3"]] | None = None
-        self._actors: list[carla.Actor] = []
+        self._actors: list[carla.Actor | int] = []
         self._maps: dict[str, RoadMap] = {}
         self.client = self.ask("a connection", lambda: carla.Client(host, port, worker_threads=1))
         self.client.set_timeout(patience_s)
@@ -163,17 +163,19 @@ class Session:
         self._texture = texture, picture.copy()
         return texture
 
-    def keep(self, actor: carla.Actor) -> None:
-        """Keep an actor until the end of the drive, which destroys it."""
-        self._actors.append(actor)
+    def keep(self, *actors: carla.Actor | int) -> None:
+        """Keep actors, or those of these ids, until the end of the drive, which destroys them."""
+        self._actors.extend(actors)
 
-    def batch(self, what: str, commands: Sequence[carla.command.Command], *, tick: bool = False) -> list[int]:
+    def batch(self, what: str, commands: Sequence[carla.command.Command]) -> list[int]:
         """Send commands, and return the ids of their actors.
 
         Raises:
             SimulatorError: a command is refused; the actors that the others made are destroyed again.
         """
-        answers = self.ask(what, lambda: self.client.apply_batch_sync(list(commands), tick))
+        # Never with a tick: the client waits for it with the interpreter's lock held, and what brings the tick may
+        # wait for that lock, as when a picture comes or a sensor that was stopped is forgotten.
+        answers = self.ask(what, lambda: self.client.apply_batch_sync(list(commands), False))
         refused = next((answer.error for answer in answers if answer.error), None)
         if refused is not None:
             pairs = zip(commands, answers, strict=True)
@@ -221,7 +223,8 @@ class Session:
             with contextlib.suppress(RuntimeError):
                 if isinstance(actor, carla.Sensor) and actor.is_listening:
                     actor.stop()
-        return [carla.command.DestroyActor(actor.id) for actor in reversed(actors)]
+        ids = [actor if isinstance(actor, int) else actor.id for actor in reversed(actors)]
+        return [carla.command.DestroyActor(i) for i in ids]
 
     def _load(self, name: str) -> None:
         maps = [Path(path).name for path in self.ask("its maps", self.client.get_available_maps)]
