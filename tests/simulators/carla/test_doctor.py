@@ -42,6 +42,15 @@ from roadproof.cli import main
 main()
 """
 
+# A server that shows a cloud more than asked for: the weather that was there never comes back.
+CLOUDY = """
+from roadproof.simulators.carla_server.world import World
+obedient = World.set_weather
+World.set_weather = lambda self, parameters: obedient(self, [parameters[0] + 1.0, *parameters[1:]])
+from roadproof.cli import main
+main()
+"""
+
 
 @pytest.mark.slow
 def test_a_sound_server_is_found_sound(port):
@@ -62,6 +71,14 @@ def test_a_wrong_depth_camera_is_found(street):
     bad = [check.name for check in findings.checks if not check.passed]
     assert bad == ["road", "paint"], str(findings)
     assert "m from the plane of the canvas" in str(findings)
+
+
+@pytest.mark.slow
+def test_what_is_not_put_back_is_told(street):
+    with serving("--map", street, program=CLOUDY) as (_, port):
+        findings = examine(CarlaSimulator(port=port, camera=CAMERA, input=INPUT))
+    assert [check.name for check in findings.checks if not check.passed] == ["clean-up"], str(findings)
+    assert "the weather is not put back" in str(findings)
 
 
 def test_nobody_there_is_one_finding():

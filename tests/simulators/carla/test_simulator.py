@@ -119,13 +119,16 @@ def test_weathers_are_seen(simulator):
     assert levels[Weather.CLEAR_NOON] > levels[Weather.RAINY_NOON] + 5
 
 
-def test_settings_are_put_back_and_actors_destroyed(port, onlooker):
-    before = onlooker.get_world().get_settings()
+def test_settings_and_weather_are_put_back_and_actors_destroyed(port, onlooker):
+    before, weather = onlooker.get_world().get_settings(), onlooker.get_world().get_weather()
     with CarlaSimulator(port=port, camera=SMALL, input=SMALL_INPUT) as simulator:
-        simulator.reset(STREET, cars=2, pedestrians=2, pattern=np.full((400, 400, 4), 255, np.uint8))
+        pattern = np.full((400, 400, 4), 255, np.uint8)
+        simulator.reset(STREET, cars=2, pedestrians=2, pattern=pattern, weather=Weather.RAINY_NOON)
+        assert onlooker.get_world().get_weather() != weather
         simulator.step(AHEAD)
         assert len(onlooker.get_world().get_actors()) == 1 + 4 + 4
     assert left_behind(onlooker) == []
+    assert onlooker.get_world().get_weather() == weather
     after = onlooker.get_world().get_settings()
     for name in ("synchronous_mode", "no_rendering_mode", "fixed_delta_seconds", "substepping", "max_substeps"):
         assert getattr(after, name) == getattr(before, name), name

@@ -70,6 +70,7 @@ class _Examination:
         self._simulator = simulator
         self._scenario: Scenario | None = None
         self._before: set[int] = set()
+        self._found: tuple[object, object] = (None, None)
         self.connected = False
 
     @property
@@ -82,6 +83,7 @@ class _Examination:
         self.connected = True
         session = self._simulator.session
         session.tick()
+        self._found = session.found
         self._before = {actor.id for actor in session.ask("its actors", session.world.get_actors)}
         return f"version {session.version}, {len(self._before)} actors there already"
 
@@ -178,9 +180,13 @@ class _Examination:
             again.session.tick()
             session = again.session
             left = {actor.id for actor in session.ask("its actors", session.world.get_actors)} - self._before
+            found = session.found
         if left:
             raise BrokenPromiseError(f"{len(left)} actors are left")
-        return "nothing is left, settings are put back"
+        for what, before, now in zip(("settings are", "weather is"), self._found, found, strict=True):
+            if now != before:
+                raise BrokenPromiseError(f"the {what} not put back: {now}, {before} before")
+        return "nothing is left, settings and weather are put back"
 
     def _drive(self) -> list[Observation]:
         seen = [self._simulator.reset(self.scenario)]

@@ -43,6 +43,7 @@ class Session:
         where: HOST:PORT of the server.
         lost: whether a call found no answer, or the session is closed.
         painted: whether objects have textures that are not the map's own.
+        found: the world's settings and weather before anything was changed, which are put back.
 
     Raises:
         SimulatorError: no server answers there, or it is one of another version.
@@ -60,7 +61,8 @@ class Session:
         self.client.set_timeout(patience_s)
         self._check_version()
         self.world = self.ask("its world", self.client.get_world)
-        self._found = self.ask("its settings", self.world.get_settings)
+        self.found = self.ask("its settings", self.world.get_settings), self.ask("its weather", self.world.get_weather)
+        self._weather_changed = False
         self._dt_s = dt_s
         try:
             self._synchronise()
@@ -127,6 +129,13 @@ class Session:
         self.world = self.patiently("its map", lambda: self.client.reload_world(False))
         self._synchronise()
         self.painted, self._last_paint = False, None
+
+    def set_weather(self, weather: carla.WeatherParameters) -> None:
+        """Have the server show a weather."""
+        self._weather_changed = True
+        self.patiently("the weather", lambda: self.world.set_weather(weather))
+        # Setting it gives no answer; asking for it does, once it is set.
+        self.patiently("the weather", self.world.get_weather)
 
     def library(self) -> carla.BlueprintLibrary:
         """The blueprints of everything that can be spawned."""
@@ -195,7 +204,7 @@ class Session:
             self.batch("the end of a drive", commands)
 
     def close(self) -> None:
-        """Destroy what is left, load a painted map anew and put the settings back.
+        """Destroy what is left, load a painted map anew and put weather and settings back.
 
         A server that does not answer is told so too, without a wait: it does as told if it ever goes on.
         """
@@ -210,9 +219,16 @@ class Session:
         with contextlib.suppress(SimulatorError):
             if self.painted and not lost:
                 self.reload()
+        settings, weather = self.found
+        self.lost, lost = False, lost or self.lost
+        with contextlib.suppress(SimulatorError):
+            if self._weather_changed and lost:
+                self.ask("the weather", lambda: self.world.set_weather(weather))
+            elif self._weather_changed:
+                self.set_weather(weather)
         self.lost = False
         with contextlib.suppress(SimulatorError):
-            self.ask("its settings", lambda: self.world.apply_settings(self._found))
+            self.ask("its settings", lambda: self.world.apply_settings(settings))
         self.lost = True
 
     def _farewells(self) -> list[carla.command.Command]:

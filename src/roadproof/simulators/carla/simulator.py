@@ -22,7 +22,7 @@ from roadproof.simulators.carla.session import Session, carla
 from roadproof.simulators.carla.signals import Signals
 from roadproof.simulators.carla.views import image_from_world, levels
 from roadproof.simulators.carla.views import scene as seen_by
-from roadproof.simulators.carla.weather import set_weather
+from roadproof.simulators.carla.weather import carla_weather
 from roadproof.simulators.protocol import PaintChoice, PaintKind
 from roadproof.simulators.tracker.drive import Request, RouteTracker
 from roadproof.simulators.tracker.simulator import RouteSimulator
@@ -194,7 +194,7 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         if self.paint is PaintKind.NATIVE:
             # The bare road as well: what is painted is compared with asphalt of the same make.
             lay(session, self._ground_of(scenario), request.pattern)
-        set_weather(session, request.weather)
+        session.set_weather(carla_weather(request.weather))
         drive.ego = spawn_driven(session, scenario.start)
         # The others stand where they were spawned while the car settles.
         drive.crowd = None

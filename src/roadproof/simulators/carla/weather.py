@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from roadproof.datatypes import Weather
-from roadproof.simulators.carla.session import Session, carla
+from roadproof.simulators.carla.session import carla
 
 PRESETS = {
     Weather.CLEAR_NOON: "ClearNoon",
@@ -15,13 +15,6 @@ PRESETS = {
     Weather.HARD_RAIN_NOON: "HardRainNoon",
 }
 """Names of CARLA's presets by weather; CARLA has none with fog."""
-
-
-def set_weather(session: Session, weather: Weather) -> None:
-    """Have a server show a weather."""
-    session.patiently("the weather", lambda: session.world.set_weather(carla_weather(weather)))
-    # Setting it gives no answer; asking for it does, once it is set.
-    session.patiently("the weather", session.world.get_weather)
 
 
 def carla_weather(weather: Weather) -> carla.WeatherParameters:
