@@ -15,7 +15,7 @@ from roadproof.controllers import ConditionalPilotNet, load_controller, save_con
 from roadproof.controllers.loading import load_trainable
 from roadproof.datatypes import VehicleState, Weather
 from roadproof.drives import Trajectories, Window
-from roadproof.errors import RoadproofError
+from roadproof.errors import RoadproofError, TrainingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.hardening.budget import ALONE, HardeningBudget
 from roadproof.hardening.harden import STAGES, harden
@@ -111,6 +111,21 @@ def test_a_tuning_that_was_ended_after_its_weights_were_kept_leaves_nothing_else
         (plan.round(1) / name).touch()
     stages_of(plan, town).tune(1, [])
     assert [path.name for path in plan.round(1).iterdir()] == ["hardened.safetensors"]
+
+
+@pytest.mark.parametrize(("number", "cure"), [(1, "another seed$"), (2, "another seed, or 1 rounds$")])
+def test_a_tuning_that_spoils_the_driving_is_told_with_what_to_do(town, tmp_path, number, cure):
+    plan = dataclasses.replace(planned(tmp_path, TINY), scenarios=(street(tmp_path, "near", 15.0),))
+    network = load_trainable("pilotnet")
+    for tuned in range(1, number + 1):
+        if tuned == number:
+            with torch.no_grad():
+                for branch in network.branches:
+                    branch[-1].bias[0] = 3.0
+        plan.round(tuned).mkdir(parents=True)
+        save_controller(network, plan.weights(tuned), origin="spoilt")
+    with pytest.raises(TrainingError, match=f"^tuning {number} spoilt the driving without paint: only . steps .*{cure}"):
+        stages_of(plan, town).rounds(number)
 
 
 def test_each_round_learns_from_drives_of_the_rounds_before_too(town, tmp_path):

@@ -15,7 +15,7 @@ from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import CIL, ConditionalPilotNet, Controller, save_controller
 from roadproof.controllers.loading import load_trainable, runs_code
 from roadproof.controllers.steering import NetworkController
-from roadproof.errors import TrainingError
+from roadproof.errors import EpisodeError, RecordingError, TrainingError
 from roadproof.hardening.judgement import BareDrives, JudgedAttack, StreetJudge, clean_drives
 from roadproof.hardening.plan import HardeningPlan
 from roadproof.hardening.result import Round
@@ -61,14 +61,26 @@ class HardeningStages:
         self.on_progress(title, done, total, word)
 
     def rounds(self, count: int) -> tuple[Round, ...]:
-        """Attack, then tune and attack afresh for so many rounds."""
+        """Attack, then tune and attack afresh for so many rounds.
+
+        Raises:
+            TrainingError: a tuned controller no longer drives a street as far as its canvas.
+        """
         tests = list[list[StressTest]]()
         for number in range(count + 1):
             if number:
                 self.tune(number, tests)
                 # The streets took gigabytes, which the processes that attack next need.
                 give_back_freed_memory()
-            tests.append(self.attack(number))
+            try:
+                tests.append(self.attack(number))
+            except (EpisodeError, RecordingError) as error:
+                if not number:
+                    raise
+                cure = "other streets, another seed" + (f", or {number - 1} rounds" if number > 1 else "")
+                raise TrainingError(
+                    f"tuning {number} spoilt the driving without paint: {error}; harden with {cure}"
+                ) from None
         costs = [cost for each in tests for test in each for cost in test.cost.values()]
         self.ledger.calls("attack", sum(cost.simulator_calls for cost in costs))
         return tuple(Round.of(number, each) for number, each in enumerate(tests))
