@@ -19,6 +19,7 @@ from roadproof.driving.rollout import rollout
 from roadproof.simulators.carla.session import Session
 from roadproof.simulators.carla.signals import trigger_volume
 from roadproof.simulators.carla.simulator import CarlaSimulator
+from roadproof.simulators.protocol import uniform
 
 # Along the street's right lane, whose middle is y = 1.75 in CARLA's world, stand a light at 45 m that is red, one at
 # 60 m that is green, one at 75 m that turns red 7.5 s after the lights were set back, and a stop sign at 90 m. A red
@@ -154,6 +155,18 @@ def test_a_drive_past_lights_and_signs_is_told_what_it_ran_every_time_the_same(s
     for event, passed_m in zip(slow.events, (46.0, 76.0, 93.0), strict=True):
         k = round(event.time_s / slow.dt_s)
         assert slow.x_m[k - 1] < passed_m <= slow.x_m[k] + 1e-3
+
+
+def test_lights_are_met_in_the_same_phase_however_many_cameras_paint_needs(signalled, monkeypatch):
+    asked, ask = [], Session.ask
+    monkeypatch.setattr(Session, "ask", lambda session, what, call: asked.append(what) or ask(session, what, call))
+    ticks = []
+    with CarlaSimulator(port=signalled, camera=SMALL, input=SMALL_INPUT) as simulator:
+        for pattern in (None, uniform(255, 0, 0)):
+            simulator.reset(STREET, pattern=pattern)
+            since = len(asked) - 1 - asked[::-1].index("its traffic lights anew")
+            ticks.append(asked[since:].count("a tick"))
+    assert ticks == [1, 1]
 
 
 def test_the_served_town_has_neither_and_drives_there_report_none(port):

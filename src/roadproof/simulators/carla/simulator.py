@@ -199,8 +199,6 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         # The others stand where they were spawned while the car settles.
         drive.crowd = None
         crowd = None if drive.traffic is None else Crowd(session, roads, drive.traffic)
-        # Lights would go on from where the last drive left them; each drive has to find them alike.
-        session.ask("its traffic lights anew", session.world.reset_all_traffic_lights)
         for _ in range(SETTLE_TICKS):
             self._order(session, drive, STOP)
             session.tick()
@@ -213,6 +211,9 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         for camera in drive.cameras.values():
             camera.begin()
         drive.signals = Signals(session, roads)
+        # Lights would go on from where the last drive left them; each drive has to find them alike, however many ticks
+        # its cameras needed.
+        session.ask("its traffic lights anew", session.world.reset_all_traffic_lights)
         self._start(session, drive)
         return drive
 
