@@ -1,18 +1,21 @@
 """The report of whole, partial and hostile runs, and as a browser shows it."""
 
 import dataclasses
+import math
 import re
 
 import numpy as np
 import pytest
+import torch
 
 from browser import hindrances, opened, until
 from pages import HOSTILE, Page
+from roadproof.coverage import Shape
 from roadproof.driving.evaluation import load_paint
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.patterns import save_pattern
+from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.stage_costs import Ledger
-from roadproof.report.page import write_report
+from roadproof.report.page import _figures, write_report
 from roadproof.simulators.protocol import PaintKind
 from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run, write_selection
 
@@ -93,6 +96,21 @@ def test_the_figures_listed_are_those_of_the_pattern_that_was_chosen(tmp_path):
     assert "#e5cc1a" not in report_of(tmp_path).text, "the attack's strongest is not what was painted"
     save_pattern(PATTERN, tmp_path / "pattern.json")
     assert "#e5cc1a" in report_of(tmp_path).text
+
+
+def test_figures_that_are_turned_have_their_size_and_angle_on_the_road():
+    # Canvas pixels of 17.5 by 23.75 mm, worked out by hand; a diagonal of 300 by 300 pixels is 5.25 m by 7.125 m.
+    boxes = [[200, 200, 40, 300, 0], [200, 200, 40, 300, 90], [200, 200, 40, 300, 45], [200, 200, 300, 40, -45]]
+    pattern = Pattern((Shape.RECTANGLE,) * 4, torch.tensor(boxes, dtype=torch.float32), torch.zeros(4, 3))
+    across, along = 40 * math.hypot(0.0175, 0.02375) / math.sqrt(2), 300 * math.hypot(0.0175, 0.02375) / math.sqrt(2)
+    told = [(row["size"], row["turned"]) for row in _figures(pattern, (7.0, 9.5))]
+    assert told == [
+        ("0.70 × 7.12 m", "0°"),
+        ("0.95 × 5.25 m", "90°"),
+        (f"{across:.2f} × {along:.2f} m", "36°"),
+        (f"{along:.2f} × {across:.2f} m", "-54°"),
+    ]
+    assert [row["size"] for row in _figures(pattern, None)][1] == "40 × 300 px"
 
 
 def test_how_conspicuous_is_told_of_the_pattern_that_is_shown(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import torch
 
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
@@ -17,7 +18,7 @@ from roadproof.driving.infractions import counted
 from roadproof.io.files import AnyPath, as_path, write_json, write_text
 from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
-from roadproof.paint.site import metres_per_px
+from roadproof.paint.site import half_edges_m
 from roadproof.patterns import Pattern, raster
 from roadproof.recordings import Recording, evenly
 from roadproof.report import charts
@@ -213,21 +214,29 @@ def _conspicuous(run: Run) -> list[tuple[str, Conspicuousness]]:
 
 
 def _figures(pattern: Pattern, size: tuple[float, float] | None) -> list[Fields]:
-    """The figures in the order they are painted, in metres where the size of the canvas is known, else in pixels."""
-    (scale_x, scale_y), unit, digits = (metres_per_px(size), "m", 2) if size else ((1.0, 1.0), "px", 0)
-    middle = 0.5 if size else 0.0
-    boxes = cast("list[list[float]]", pattern.boxes.tolist())
+    """The figures in the order they are painted, in metres where the size of the canvas is known, else in pixels.
+
+    A rectangle of pixels that is turned is a parallelogram in metres: its turn is that of its longer edges.
+    """
+    boxes, (unit, digits) = pattern.boxes.double(), ("m", 2) if size else ("px", 0)
+    if size:
+        middle, *edges = half_edges_m(boxes, size)
+        sides = torch.stack([2 * edge.norm(dim=-1) for edge in edges], -1)
+        across, along = edges
+        longer = torch.where(sides[:, :1] > sides[:, 1:], torch.stack([-across[:, 1], across[:, 0]], -1), along)
+        boxes = torch.cat([middle, sides, torch.rad2deg(torch.atan2(-longer[:, :1], longer[:, 1:]))], -1)
     colours = cast("list[list[float]]", pattern.colours.tolist())
+    placed = cast("list[list[float]]", boxes.tolist())
     rows: list[Fields] = []
-    for number, (shape, box, rgb) in enumerate(zip(pattern.shapes, boxes, colours, strict=True), 1):
+    for number, (shape, box, rgb) in enumerate(zip(pattern.shapes, placed, colours, strict=True), 1):
         x, y, width, length, turned = box
         red, green, blue = (round(255 * channel) for channel in rgb)
         rows.append(
             {
                 "number": number,
                 "shape": str(shape),
-                "at": f"{(x + middle) * scale_x:.{digits}f}, {(y + middle) * scale_y:.{digits}f} {unit}",
-                "size": f"{width * scale_x:.{digits}f} × {length * scale_y:.{digits}f} {unit}",
+                "at": f"{x:.{digits}f}, {y:.{digits}f} {unit}",
+                "size": f"{width:.{digits}f} × {length:.{digits}f} {unit}",
                 "turned": f"{turned:.0f}°",
                 "colour": f"#{red:02x}{green:02x}{blue:02x}",
             }
