@@ -237,7 +237,7 @@ def test_a_reference_of_other_conditions_is_refused(accepted, tmp_path):
     with pytest.raises(CheckError, match="other patterns, starts, seeds or recordings"):
         run_check(replace(accepted, seeds=(0, 2)), magenta_shy(), tmp_path)
     with pytest.raises(CheckError, match="is not there; make it with --accept"):
-        run_check(replace(accepted, reference=tmp_path / "check.json"), magenta_shy(), tmp_path)
+        run_check(replace(accepted, reference=tmp_path / "check.json"), magenta_shy(), tmp_path / "out")
     accepted.reference.with_name("bad.json").write_text('{"format": "roadproof-check-result", "version": 1}')
     with pytest.raises(CheckError, match="incomplete or damaged"):
         run_check(replace(accepted, reference=accepted.reference.with_name("bad.json")), magenta_shy(), tmp_path)
@@ -292,6 +292,13 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
         '"reference"', '"kept"'
     )
     (team / "loose.toml").write_text(loose)
+    # Not even the first result, passed or not, is made where the references are.
+    code, said = invoke("check", "loose.toml", "--trust", "--out", "kept/smoke", "--accept")
+    assert (code, "kept for a reference" in said.err) == (2, True)
+    # Nor where its patterns would be stored ones.
+    for out in (".", "patterns/test-road", "patterns/test-road/out"):
+        code, said = invoke("check", "loose.toml", "--trust", "--out", out)
+        assert (code, "among the plan's patterns" in said.err) == (2, True), said.err
     code, said = invoke("check", "loose.toml", "--trust", "--out", tmp_path, "--accept")
     assert code == 0, said.err
     assert (team / "kept/smoke/check.json").read_bytes() == (tmp_path / "check.json").read_bytes()
@@ -306,7 +313,10 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     for plan in ("loose.toml", "wrong.toml"):
         code, said = invoke("check", plan, "--trust", "--out", "kept/smoke")
         assert code == 2
-        assert "kept/smoke/check.json is a reference of the plan; choose another folder for the results" in said.err
+        assert (
+            "kept/smoke/check.json is kept for a reference of the plan; choose another folder for the results"
+            in said.err
+        )
         assert (team / "kept/smoke/check.json").exists()
     # Nor where the plan cannot say what it is: mistyped, unreadable, not there.
     (team / "typo.toml").write_text(loose.replace("[change]", "[chnage]"))
@@ -319,5 +329,5 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
         code, said = invoke("check", name, "--trust", "--out", "kept/smoke")
         assert (code, message in said.err) == (2, True), said.err
         assert (team / "kept/smoke/check.json").exists()
-    with pytest.raises(CheckError, match="is a reference of the plan"):
+    with pytest.raises(CheckError, match="is kept for a reference of the plan"):
         run_check(load_check("loose.toml", trust=True), magenta_shy(), "kept/smoke")

@@ -161,6 +161,13 @@ def test_code_and_other_machines_need_trust(team):
         load_check(plan(team, text), budget="full")
 
 
+def test_a_recording_that_is_not_calibrated_is_named_with_what_to_do(team):
+    run = team / "recordings" / "test-road"
+    (run / "recordings").rename(run / "elsewhere")
+    with pytest.raises(CheckError, match=f"test-road is not calibrated; do so with: roadproof calibrate {run}"):
+        load_check(plan(team, PLAN), trust=True)
+
+
 def test_a_folder_of_patterns_is_named_after_a_scenario(team):
     (team / "patterns" / "tset-road").mkdir()
     try:

@@ -124,9 +124,7 @@ def test_a_tuning_that_spoils_the_driving_is_told_with_what_to_do(town, tmp_path
                     branch[-1].bias[0] = 3.0
         plan.round(tuned).mkdir(parents=True)
         save_controller(network, plan.weights(tuned), origin="spoilt")
-    with pytest.raises(
-        TrainingError, match=f"^tuning {number} spoilt the driving without paint: only .*{cure}"
-    ):
+    with pytest.raises(TrainingError, match=f"^tuning {number} spoilt the driving without paint: only .*{cure}"):
         stages_of(plan, town).rounds(number)
 
 

@@ -50,6 +50,7 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, begun_in
 
 SUMMARY = "summary.md"
+PATTERNS = "patterns"
 OUTPUTS = (FILE, "junit.xml", SUMMARY, WORST)
 
 
@@ -75,7 +76,8 @@ def run_check(
         on_progress: called in every stage with the stage's name, the steps done, their number, and a word on them.
 
     Raises:
-        CheckError: the reference is missing, damaged, or was made under other conditions, or the folder is its own.
+        CheckError: the reference is missing, damaged, or was made under other conditions, or the folder is its own
+            or the stored patterns'.
         ControllerError: the controller raises, answers wrongly, or cannot travel to several processes.
         SimulatorError: the simulator is not there or stopped answering.
         OutputError: the folder cannot be written, or another process works in it.
@@ -87,6 +89,7 @@ def run_check(
         require_picklable(controller)
     with working_in(folder):
         clear(folder, None if plan.reference is None else plan.reference.parents[1])
+        _keep_apart(folder, plan)
         if compare and plan.reference is not None:
             before = load_reference(plan.reference, architecture, plan)
         run = _Check(plan, controller, folder, before, device, processes, on_progress)
@@ -115,15 +118,23 @@ def clear(folder: Path, references: Path | None) -> None:
         references: the folder in which the plan keeps its references; None where it names none.
 
     Raises:
-        CheckError: the results would take the place of a reference, or of a result that no check left there.
+        CheckError: the folder is one for references, or holds a result that no check left there.
     """
     named = references is not None and folder.resolve().parent == references.resolve()
     # A check leaves its result beside its summary; a result alone is one that somebody keeps, whatever a plan says.
-    if (folder / FILE).is_file() and (named or not (folder / SUMMARY).is_file()):
-        whose = "a reference of the plan" if named else f"no check's own, without {SUMMARY} beside it"
+    if named or ((folder / FILE).is_file() and not (folder / SUMMARY).is_file()):
+        whose = "kept for a reference of the plan" if named else f"no check's own, without {SUMMARY} beside it"
         raise CheckError(f"{folder / FILE} is {whose}; choose another folder for the results")
     for name in OUTPUTS:
         (folder / name).unlink(missing_ok=True)
+
+
+def _keep_apart(folder: Path, plan: CheckPlan) -> None:
+    """See that no pattern of the results would be a stored one of the next check."""
+    out = folder.resolve()
+    for place in {stored.path.resolve().parent for each in plan.stored.values() for stored in each}:
+        if place.is_relative_to(out / PATTERNS) or out.is_relative_to(place):
+            raise CheckError(f"the results would lie among the plan's patterns in {place}; choose another folder")
 
 
 def architecture_of(controller: Controller) -> str:
@@ -155,7 +166,7 @@ class _Check:
             require_usable(self.controller, size=size, device=self.device, gradients=attacks)
             scenario = begun_in(world, place.scenario)
             site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
-            paints = known_paints(plan, scenario, site, self.folder / "patterns" / scenario.name)
+            paints = known_paints(plan, scenario, site, self.folder / PATTERNS / scenario.name)
             if attacks:
                 paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
             images = {paint.name: raster(paint.pattern) for paint in paints}
@@ -230,7 +241,7 @@ class _Check:
                 f"{scenario.name}, seed {seed}: {stage}", done, total, word
             ),
         )
-        path = self.folder / "patterns" / scenario.name / f"{name}.json"
+        path = self.folder / PATTERNS / scenario.name / f"{name}.json"
         save_pattern(found.pattern, path)
         drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
         return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)

@@ -94,7 +94,8 @@ def recordings_of(
         controller: the controller's spec, for the advice where a recording is missing.
 
     Raises:
-        CheckError: a recording is missing, or of another stretch of road, or a folder does not lie beside the plan.
+        CheckError: a recording is missing, not calibrated, or of another stretch of road, or a folder does not lie
+            beside the plan.
         RecordingError: a recording is damaged.
     """
     found: dict[tuple[str, Weather], Path] = {}
@@ -105,6 +106,10 @@ def recordings_of(
             made = read_settings(run / "record")
             if (made.scenario.start, made.scenario.canvas) != (scenario.start, scenario.canvas):
                 raise CheckError(f"{run} is a recording of another {scenario.name}; record it again")
+            if not (run / "recordings").is_dir():
+                raise CheckError(
+                    f"{run} is not calibrated; do so with: {shlex.join(['roadproof', 'calibrate', str(run)])}"
+                )
             found.setdefault((scenario.name, made.weather), run)
     for scenario in scenarios:
         for weather in weathers:
