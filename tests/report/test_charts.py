@@ -8,17 +8,23 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from recorded_drives import drivable_set
 from roadproof.datatypes import Ending
 from roadproof.driving.deviation import beside_m, path_of
 from roadproof.driving.intervals import Estimate
 from roadproof.patterns import raster
+from roadproof.pipeline.fidelity import Agreement, Fidelity
 from roadproof.report import charts
 from roadproof.report.formatting import mean_in_words
+from roadproof.report.page import _compared
 from roadproof.report.plots import save
 from roadproof.report.top_view import top_view
 from roadproof.scenarios import find_scenario
 from runs import CRASH, PATTERN, driven
 
+AGREEMENT = Agreement(
+    frames=1, paint_error=0.0, elsewhere_error=0.0, steer_error=0.0, predicted_shift=0.0, rendered_shift=0.0
+)
 SCENARIO = find_scenario("straight-01")
 
 
@@ -29,7 +35,7 @@ def drives():
 
 def test_metres_are_counted_from_the_canvas_near_edge(drives):
     clean, canvas = drives[0], SCENARIO.canvas
-    metres = charts.metres_past(clean, canvas)
+    metres = charts.metres_past(path_of(clean), canvas)
     ahead = np.array([np.cos(canvas.yaw_rad), np.sin(canvas.yaw_rad)])
     along = (path_of(clean) - (canvas.x_m, canvas.y_m)) @ ahead + canvas.length_m / 2
     near = np.abs(along) < 5.0
@@ -38,10 +44,30 @@ def test_metres_are_counted_from_the_canvas_near_edge(drives):
     np.testing.assert_allclose(metres[near], along[near], atol=0.2)
 
 
+def test_composites_are_drawn_where_they_were_recorded_wherever_the_shown_drive_begins(drives):
+    recordings = drivable_set()
+    recorded = recordings.clean
+    frames, steer = np.zeros((len(recorded.frames), 2, 3, 3), np.uint8), np.zeros(len(recorded.frames))
+    fidelity = Fidelity(
+        drive=recorded.name, frame_number=recorded.frame_number, clean=frames, composited=frames, rendered=frames,
+        clean_steer=steer, composited_steer=steer, rendered_steer=steer, agreement=AGREEMENT,
+    )  # fmt: skip
+    at_m, told = _compared(fidelity, recordings, recordings.canvas)
+    assert told is fidelity
+    rows = recorded.track.rows(recorded.frame_number)
+    ahead = np.array([np.cos(recordings.canvas.yaw_rad), np.sin(recordings.canvas.yaw_rad)])
+    away = np.stack([recorded.track.x_m, recorded.track.y_m], 1)[rows] - (recordings.canvas.x_m, recordings.canvas.y_m)
+    np.testing.assert_allclose(at_m, away @ ahead + recordings.canvas.length_m / 2, atol=0.5)
+    assert (
+        "composites along the recorded path" in charts.steering(*drives, SCENARIO.canvas, compared=(at_m, told)).words
+    )
+    assert _compared(fidelity, None, recordings.canvas) is None
+
+
 def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drives):
     drawn = [
         charts.offsets([("clear-noon", *drives)], SCENARIO.canvas),
-        charts.steering(*drives, None, SCENARIO.canvas),
+        charts.steering(*drives, SCENARIO.canvas),
         charts.search(np.zeros((5, 2, 3)), ["clean+right", "clean+left"], "path deviation"),
     ]
     for chart in drawn:
@@ -74,7 +100,7 @@ def test_marks_lie_on_the_lines_that_they_move_along(drives):
     steps = np.arange(len(drives[1]) // 3, len(drives[1]) // 2, 5)
     for chart, name in (
         (charts.offsets([("clear-noon", *drives)], SCENARIO.canvas, steps), "painted"),
-        (charts.steering(*drives, None, SCENARIO.canvas, steps), "painted"),
+        (charts.steering(*drives, SCENARIO.canvas, steps), "painted"),
         (top_view(SCENARIO, raster(PATTERN), *drives, steps=steps), "clean"),
     ):
         marks = re.findall(rf'<circle class="at m(\d+) {name}" r="5" cx="([\d.]+)" cy="([\d.]+)"/>', chart.svg)
@@ -104,8 +130,8 @@ def test_beyond_the_end_of_a_clean_drive_that_was_blocked_no_offset_is_drawn(dri
 
 def test_marks_beyond_the_axes_are_left_out(drives):
     steps = np.array([len(drives[1]) // 2, len(drives[1]) - 1])
-    assert charts.metres_past(drives[1], SCENARIO.canvas)[-1] > SCENARIO.canvas.length_m + charts.BEHIND_M
-    chart = charts.steering(*drives, None, SCENARIO.canvas, steps)
+    assert charts.metres_past(path_of(drives[1]), SCENARIO.canvas)[-1] > SCENARIO.canvas.length_m + charts.BEHIND_M
+    chart = charts.steering(*drives, SCENARIO.canvas, steps)
     assert set(re.findall(r'class="at (m\d)', chart.svg)) == {"m0"}
 
 

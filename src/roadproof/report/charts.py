@@ -18,7 +18,7 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from roadproof.driving.deviation import HORIZON_M, beside_m, lateral_m, path_of
+from roadproof.driving.deviation import HORIZON_M, Path2D, beside_m, lateral_m, path_of
 from roadproof.driving.episode import Episode
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
@@ -108,9 +108,8 @@ def _dots(figure: Figure, mark: Mark) -> str:
     )
 
 
-def metres_past(episode: Episode, canvas: CanvasPlacement) -> Float[np.ndarray, " n"]:
-    """How far the car had driven at each observation, from the canvas' near edge; before it negative."""
-    path = path_of(episode)
+def metres_past(path: Path2D, canvas: CanvasPlacement) -> Float[np.ndarray, " n"]:
+    """How far the car had driven at each place of its path, from the canvas' near edge; before it negative."""
     driven = polyline_stations(path)
     at = int(np.hypot(path[:, 0] - canvas.x_m, path[:, 1] - canvas.y_m).argmin())
     return driven - driven[at] + canvas.length_m / 2
@@ -119,18 +118,19 @@ def metres_past(episode: Episode, canvas: CanvasPlacement) -> Float[np.ndarray, 
 def steering(
     clean: Episode,
     painted: Episode,
-    fidelity: Fidelity | None,
     canvas: CanvasPlacement,
     steps: Int[np.ndarray, " n"] = NO_MOMENTS,
+    compared: tuple[Float[np.ndarray, " f"], Fidelity] | None = None,
 ) -> Chart:
     """Steering of the clean drive, what it answers to composites, and what the car did over the paint.
 
     Args:
         clean: the drive without paint.
         painted: the drive over the paint.
-        fidelity: composites beside renders; None where they were not compared.
         canvas: where the canvas lies.
         steps: the steps of both drives at which there are pictures of the passage.
+        compared: composites beside renders, and how far past the canvas' near edge each of their frames was recorded,
+            metres; None where they were not compared.
     """
     figure, axes = _past_canvas("steering (right > 0)", canvas)
     marks: list[Mark] = []
@@ -139,20 +139,19 @@ def steering(
         (clean, CLEAN, "bare road"),
         (painted, PAINTED, "over the paint, predicted" if predicted else "driven over the paint"),
     ):
-        where = metres_past(episode, canvas)[:-1]
+        where = metres_past(path_of(episode), canvas)[:-1]
         axes.plot(where, episode.steer, color=colour, linewidth=1.8, label=label)
         at = np.minimum(steps, len(where) - 1)
         marks.append(Mark("painted" if episode is painted else "clean", np.stack([where[at], episode.steer[at]], 1)))
     words = "Steering without paint and over it"
-    if fidelity is not None:
-        along, frames = metres_past(clean, canvas), fidelity.frame_number
-        kept = frames < len(along)
+    if compared is not None:
+        at_m, fidelity = compared
         for values, style, label in (
-            (fidelity.composited_steer, "o", "composited along the clean path"),
+            (fidelity.composited_steer, "o", "composited along the recorded path"),
             (fidelity.rendered_steer, "x", "same places, rendered"),
         ):
-            axes.plot(along[frames[kept]], values[kept], style, color=PREDICTED, markersize=3.6, label=label)
-        words += ", and what the controller answers to composites along the clean path"
+            axes.plot(at_m, values, style, color=PREDICTED, markersize=3.6, label=label)
+        words += ", and what the controller answers to composites along the recorded path"
     return _finished(figure, axes, "steering", words, until_m=canvas.length_m + BEHIND_M, marks=marks)
 
 
@@ -177,7 +176,7 @@ def offsets(
     for name, clean, painted in drives:
         beside = -beside_m(clean, painted)
         k, label = names.index(name), labels.pop(name, None)
-        where, colour = metres_past(painted, canvas)[: len(beside)], SERIES[k % len(SERIES)]
+        where, colour = metres_past(path_of(painted), canvas)[: len(beside)], SERIES[k % len(SERIES)]
         axes.plot(where, beside, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=width, label=label)
         if not marks:
             shown = np.minimum(steps, len(beside) - 1)

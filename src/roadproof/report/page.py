@@ -11,16 +11,19 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from roadproof.attacks import site_of
 from roadproof.drives import Drive
 from roadproof.driving.infractions import counted
+from roadproof.geometry import CanvasPlacement
 from roadproof.io.files import AnyPath, as_path, write_json, write_text
 from roadproof.io.html import encoded
 from roadproof.paint import Conspicuousness, conspicuousness
 from roadproof.paint.site import half_edges_m
 from roadproof.patterns import Pattern, raster
-from roadproof.recordings import Recording, evenly
+from roadproof.pipeline.fidelity import Fidelity
+from roadproof.recordings import Recording, RecordingSet, evenly
 from roadproof.report import charts
 from roadproof.report.html import rendered
 from roadproof.report.road_view import on_asphalt
@@ -133,7 +136,8 @@ def _charts(run: Run) -> dict[str, charts.Chart | None]:
         judged, scenario = run.judged, run.judged.evaluation.scenario
         clean, painted, steps = judged.clean, judged.painted, judged.steps
         drawn["above"] = top_view(scenario, judged.paint, clean, painted, steps=steps)
-        drawn["steering"] = charts.steering(clean, painted, judged.fidelity, scenario.canvas, steps)
+        compared = _compared(judged.fidelity, run.recordings, scenario.canvas)
+        drawn["steering"] = charts.steering(clean, painted, scenario.canvas, steps, compared)
         drawn["offsets"] = charts.offsets(judged.by_weather, scenario.canvas, steps)
     if run.attack is not None:
         drawn["search"] = charts.search(run.attack.history, tuple(run.attack.by_group), run.attack.objective)
@@ -141,6 +145,17 @@ def _charts(run: Run) -> dict[str, charts.Chart | None]:
         canvas = run.recordings and run.recordings.canvas
         drawn["predicted_path"] = None if canvas is None else charts.predicted_path(run.prediction, canvas)
     return drawn
+
+
+def _compared(
+    fidelity: Fidelity | None, recordings: RecordingSet | None, canvas: CanvasPlacement
+) -> tuple[Float[np.ndarray, " f"], Fidelity] | None:
+    """Composites beside renders, where it is known how far past the canvas' near edge their frames were recorded."""
+    for each in () if recordings is None else recordings.recordings:
+        if fidelity is not None and each.name == fidelity.drive and each.track is not None:
+            path = np.column_stack([each.track.x_m, each.track.y_m])
+            return charts.metres_past(path, canvas)[each.track.rows(fidelity.frame_number)], fidelity
+    return None
 
 
 def _passage(run: Run) -> list[Fields]:
