@@ -58,9 +58,8 @@ def test_composites_are_drawn_where_they_were_recorded_wherever_the_shown_drive_
     ahead = np.array([np.cos(recordings.canvas.yaw_rad), np.sin(recordings.canvas.yaw_rad)])
     away = np.stack([recorded.track.x_m, recorded.track.y_m], 1)[rows] - (recordings.canvas.x_m, recordings.canvas.y_m)
     np.testing.assert_allclose(at_m, away @ ahead + recordings.canvas.length_m / 2, atol=0.5)
-    assert (
-        "composites along the recorded path" in charts.steering(*drives, SCENARIO.canvas, compared=(at_m, told)).words
-    )
+    chart = charts.steering(*drives, SCENARIO.canvas, compared=(at_m, told))
+    assert "composites along the recorded path" in chart.caption
     assert _compared(fidelity, None, recordings.canvas) is None
 
 

@@ -10,7 +10,7 @@ from command import answered, roadproof
 from pages import HOSTILE, Page
 from roadproof.errors import RoadproofError
 from roadproof.patterns import raster
-from roadproof.report.comparison import _name, compared, write_comparison
+from roadproof.report.comparison import _cautions, _name, compared, write_comparison
 from roadproof.report.page import result_of
 from roadproof.report.run import read_run
 from roadproof.scenarios import find_scenario
@@ -63,6 +63,17 @@ def test_what_is_not_alike_is_said(runs, tmp_path):
     page = Page((tmp_path / "compare.html").read_text())
     assert "different stretches of road" in page.text
     assert "offsets" not in [each["id"] for _, each in page.tags if "id" in each]
+
+
+def test_another_pattern_is_said_however_many_were_judged_over_it(runs, tmp_path):
+    other = dataclasses.replace(PATTERN, colours=PATTERN.colours.flip(0))
+    for name, pattern in (("again", PATTERN), ("other", other)):
+        evaluation = write_run(tmp_path / name)
+        evaluation.save(tmp_path / name / "evaluation", raster(pattern))
+    said = "They were not all judged over the same pattern."
+    for names, own, some in ((["again"], 0, 0), (["other"], 1, 0), (["again", "other"], 0, 1)):
+        told = _cautions(compared([runs[1], *(tmp_path / name for name in names)]), same_place=True)
+        assert (told.count("Each was judged over a pattern of its own."), told.count(said)) == (own, some)
 
 
 def test_others_in_other_numbers_are_said(runs, tmp_path):

@@ -12,10 +12,12 @@ from browser import hindrances, opened, until
 from pages import HOSTILE, Page
 from roadproof.coverage import Shape
 from roadproof.driving.evaluation import load_paint
+from roadproof.driving.starts import StartOffset
 from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.stage_costs import Ledger
 from roadproof.report.page import _figures, write_report
+from roadproof.report.verdict import _driven
 from roadproof.simulators.protocol import PaintKind
 from runs import CRASH, PATTERN, read_result, write_attack, write_evaluation, write_film, write_run, write_selection
 
@@ -215,6 +217,19 @@ def test_the_verdict_follows_from_the_drives(tmp_path, key):
     write_evaluation(tmp_path / "evaluation", runs=0, **VERDICTS[key])
     report_of(tmp_path)
     assert read_result(tmp_path)["verdict"]["key"] == key
+
+
+@pytest.mark.parametrize(("failing", "key"), [(1, "holds"), (2, "holds"), (3, "unfit"), (4, "unfit")])
+def test_a_controller_is_unfit_that_fails_in_most_drives_over_the_bare_road(tmp_path, failing, key):
+    evaluation = write_evaluation(tmp_path / "evaluation", runs=0, aside_m=0.02)
+    trials = [
+        dataclasses.replace(each, start=StartOffset(right_m=0.01 * k), points=points, clean_points=points)
+        for k, each in enumerate(evaluation.trials * 2)
+        for points in [2.0 * (k < failing)]
+    ]
+    assert len(trials) == 4
+    judged = dataclasses.replace(evaluation, trials=tuple(trials), starts=2)
+    assert _driven(judged).key == key
 
 
 def test_another_simulators_map_leaves_the_road_out_of_the_picture(tmp_path):

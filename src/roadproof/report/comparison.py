@@ -160,7 +160,9 @@ def _cautions(runs: Sequence[Compared], *, same_place: bool) -> list[str]:
         said.append(
             "They were not judged in the same weathers, from the same starts, with the same others on the road."
         )
-    patterns = {each.judged.paint.tobytes() for each in runs}
-    if len(patterns) == len(runs):
+    patterns = len({each.judged.paint.tobytes() for each in runs})
+    if patterns == len(runs):
         said.append("Each was judged over a pattern of its own.")
+    elif patterns > 1:
+        said.append("They were not all judged over the same pattern.")
     return said
