@@ -96,6 +96,15 @@ def test_cubics_change_piece_at_its_start() -> None:
     np.testing.assert_allclose(cubics(np.array([0.0, 4.0, 10.0, 12.0])), [1.0, 3.0, 6.0, 6.48])
 
 
+def test_offset_and_elevation_that_begin_later_are_zero_before(tmp_path: Path) -> None:
+    lanes = LANES.replace("<lanes>", '<lanes><laneOffset s="20" a="1" b="0.5" c="0" d="0"/>')
+    hill = '<elevationProfile><elevation s="20" a="0" b="0.1" c="0" d="0"/></elevationProfile>'
+    road = read_opendrive(written(tmp_path, piece("<line/>"), lanes=lanes, extra=hill)).roads["7"]
+    at = np.array([0.0, 19.9, 20.0, 30.0])
+    np.testing.assert_allclose(road.lane_offset(at), [0.0, 0.0, 1.0, 6.0])
+    np.testing.assert_allclose(road.elevation(at), [0.0, 0.0, 0.0, 1.0])
+
+
 def test_a_road_is_placed_by_its_start_pose(tmp_path: Path) -> None:
     road = read_opendrive(written(tmp_path, piece('<arc curvature="0.1"/>'))).roads["7"]
     points, headings = road.reference(np.array([0.0, 10.0]))

@@ -261,6 +261,19 @@ def test_a_road_goes_on_into_the_next(tmp_path: Path) -> None:
     assert back_home.length_m == pytest.approx(70.0)
 
 
+def test_a_route_keeps_to_driving_lanes(tmp_path: Path) -> None:
+    roads = [
+        street(1, 0.0, link='<successor elementType="road" elementId="2" contactPoint="start"/>'),
+        street(2, 40.0, link='<successor elementType="road" elementId="3" contactPoint="start"/>').replace(
+            '"driving"', '"biking"'
+        ),
+        street(3, 80.0),
+    ]
+    road_map = loaded(tmp_path, *roads)
+    with pytest.raises(ScenarioError, match=r"no way leads from lane -1 of road 1 .* to lane -1 of road 3"):
+        road_map.route(VehicleState(5.0, -1.75, 0.0, 0.0, 0.0), (110.0, -1.75))
+
+
 @pytest.mark.parametrize("kind", ["shoulder", "biking", "bus", "bidirectional", "exit", "onRamp", "slipLane"])
 def test_lanes_with_asphalt_are_no_lawn_whoever_drives_there(tmp_path: Path, kind: str) -> None:
     beside = f'<lane id="-2" type="{kind}"><width sOffset="0" a="2.5" b="0" c="0" d="0"/></lane></right>'

@@ -199,9 +199,9 @@ def _lane(element: ET.Element, where: str) -> LaneRecord:
     if number != 0 and not widths:
         hint = "<border> is not supported, " if element.find("border") is not None else ""
         raise ScenarioError(f"{where}: {hint}expected at least one <width>")
+    if number != 0 and (first_m := _number(widths[0], "sOffset", where)) > GAP_M:
+        raise ScenarioError(f"{where}: the first <width> has sOffset {first_m:.3f} m, expected 0")
     width = _cubics(widths, "sOffset", where) if number != 0 else None
-    if width is not None and width.starts_m[0] > GAP_M:
-        raise ScenarioError(f"{where}: the first <width> has sOffset {width.starts_m[0]:.3f} m, expected 0")
     marks = tuple(_mark(mark, where) for mark in element.iterfind("roadMark"))
     _check_order("roadMark", "sOffset", [mark.offset_m for mark in marks], where)
     return LaneRecord(
@@ -265,13 +265,14 @@ def _contact(element: ET.Element, where: str) -> Literal["start", "end"]:
 
 
 def _cubics(elements: list[ET.Element], start: str, where: str) -> Cubics:
-    if not elements:
-        return Cubics(np.zeros(1), np.zeros((1, 4)))
+    """The pieces of a value along the road; 0 before the first, as the standard has it."""
     starts = [_number(element, start, where) for element in elements]
-    _check_order(elements[0].tag, start, starts, where)
-    return Cubics(
-        np.array(starts), np.array([[_number(element, key, where) for key in "abcd"] for element in elements])
-    )
+    pieces = [[_number(element, key, where) for key in "abcd"] for element in elements]
+    if elements:
+        _check_order(elements[0].tag, start, starts, where)
+    if not elements or starts[0] > GAP_M:
+        starts, pieces = [0.0, *starts], [[0.0] * 4, *pieces]
+    return Cubics(np.array(starts), np.array(pieces))
 
 
 def _text(element: ET.Element, name: str, where: str) -> str:

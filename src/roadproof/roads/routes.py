@@ -105,7 +105,7 @@ class Route:
 
 
 def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[int, float]) -> tuple[int, ...]:
-    """Lanes from a place (lane, arc length) to another, by A* over lane lengths with the straight line as its bound.
+    """Driving lanes from a place (lane, arc length) to another, by A* over lengths with the straight line as its bound.
 
     Raises:
         ScenarioError: no way leads from the start to the goal.
@@ -130,7 +130,7 @@ def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[i
             continue
         done.add(index)
         for after in lanes[index].successors:
-            if after not in done:
+            if after not in done and lanes[after].kind == "driving":
                 total = cost + lanes[after].length_m
                 heapq.heappush(queue, (total + bound(after), total, after, (*way, after)))
     at, to = lanes[first].centre[0], lanes[last].centre[0]
