@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import zipfile
 import zlib
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from roadproof.errors import RoadproofError
-from roadproof.io.arrays import archive_names, packed, read_archive, read_array, read_record, write_archive
+from roadproof.io.arrays import MOST_BYTES, archive_names, packed, read_archive, read_array, read_record, write_archive
 
 NUMBERS = {"x": np.arange(12.0).reshape(3, 4), "n": np.array([1, 2], np.int8), "f": np.asfortranarray(np.eye(3))}
 
@@ -200,6 +201,10 @@ def test_single_arrays_are_guarded_too(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(RoadproofError, match="is damaged"):
             read_array(path, RoadproofError, "again")
+    path.write_bytes(claiming((MOST_BYTES // 8,)))
+    os.truncate(path, MOST_BYTES + 1)  # takes no room on the disk
+    with pytest.raises(RoadproofError, match=f"has {MOST_BYTES + 1} bytes, expected at most {MOST_BYTES}"):
+        read_array(path, RoadproofError, "again")
 
 
 def test_no_byte_can_be_changed_unnoticed_or_bring_a_traceback(tmp_path: Path) -> None:

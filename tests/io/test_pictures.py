@@ -77,6 +77,17 @@ def test_pictures_that_would_silently_become_others_are_refused(
         read_picture(tmp_path / "x.png", RoadproofError, "make it again")
 
 
+@pytest.mark.parametrize(("colour", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
+def test_16_bits_a_channel_are_refused_in_every_kind_of_png(tmp_path: Path, colour: int, channels: int) -> None:
+    """Pillow opens all but the grey ones as if they had 8, and drops the lower half of every number."""
+    head = struct.pack(">IIBBBBB", 2, 2, 16, colour, 0, 0, 0)
+    rows = zlib.compress(2 * (b"\0" + np.full(2 * channels, 65535, ">u2").tobytes()))
+    path = tmp_path / "deep.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    with pytest.raises(RoadproofError, match="more than 8 bits"):
+        read_picture(path, RoadproofError, "make it again")
+
+
 @pytest.mark.parametrize("kind", ["jpg", "png"])
 def test_a_picture_that_is_stored_turned_is_refused(tmp_path: Path, kind: str) -> None:
     exif, picture = Image.Exif(), Image.fromarray(np.zeros((4, 5, 3), np.uint8))

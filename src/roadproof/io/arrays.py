@@ -150,10 +150,14 @@ def read_array(path: Path, error: type[RoadproofError], remedy: str) -> np.ndarr
     """The numbers of a .npy file.
 
     Raises:
-        error: the file is missing, holds anything but numbers, or holds more or less than it claims.
+        error: the file is missing, larger than `MOST_BYTES`, holds anything but numbers, or holds more or less than it
+            claims.
     """
     with _told(path, error, remedy), open_file(path) as file:
-        return _array(cast("io.BufferedIOBase", file), os.fstat(file.fileno()).st_size, _KINDS)
+        size = os.fstat(file.fileno()).st_size
+        if size > MOST_BYTES:
+            raise ValueError(f"it has {size} bytes, expected at most {MOST_BYTES}")
+        return _array(cast("io.BufferedIOBase", file), size, _KINDS)
 
 
 @contextmanager

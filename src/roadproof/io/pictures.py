@@ -35,6 +35,7 @@ def read_picture(
     try:
         # Pillow leaves a file open whose first bytes cannot be read.
         with open_file(path) as file, Image.open(file, formats=("PNG", "JPEG")) as picture:
+            deep = picture.format == "PNG" and _png_depth(path) > 8
             if picture.width * picture.height > MOST_PIXELS:
                 raise ValueError(f"{picture.width}×{picture.height} pixels, expected at most {MOST_PIXELS}")
             if (frames := getattr(picture, "n_frames", 1)) > 1:
@@ -42,8 +43,8 @@ def read_picture(
             if (orientation := picture.getexif().get(Base.Orientation)) in range(2, 9):
                 # Viewers would show it turned, Pillow reads it as it lies in the file.
                 raise ValueError(f"it is stored turned (EXIF orientation {orientation}), expected one that is upright")
-            if picture.mode[0] in "IF":
-                # Pillow would clip them to 8 bits: nearly all white.
+            if picture.mode[0] in "IF" or deep:
+                # Pillow would clip grey ones to 8 bits, nearly all white, and drop the lower half of colours unsaid.
                 raise ValueError(f"its channels have more than 8 bits (mode {picture.mode}), expected 8")
             if (
                 mode == "RGB"
@@ -56,3 +57,9 @@ def read_picture(
         raise error(f"{path} is missing; {remedy}") from None
     except (*DAMAGE, Image.DecompressionBombError) as reason:
         raise error(f"{path} cannot be read ({reason}); {remedy}") from None
+
+
+def _png_depth(path: Path) -> int:
+    """Bits of a channel, which Pillow does not tell of colours."""
+    with open_file(path) as file:
+        return file.read(25)[24]
