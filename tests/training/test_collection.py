@@ -1,5 +1,7 @@
 """Recorded drives hold the expert's clean answers, can be filled up later, and are the same in every process."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -94,6 +96,15 @@ def test_a_folder_is_filled_up_and_processes_agree(tmp_path):
     assert again == first
     assert first[1].stat().st_mtime_ns == kept
     np.testing.assert_array_equal(Shard.load(again[0]).frames, frames[0])
+
+
+def test_drives_of_another_plan_are_not_taken_for_this_ones(tmp_path):
+    plan = CollectionPlan(drives=1, seed=8, disturbed=0.0, traffic=0.0)
+    (path,) = collect(plan, tmp_path)
+    assert collect(plan, tmp_path) == (path,)
+    for changes in ({"seed": 7}, {"painted": 1.0}, {"controller": "cil"}):
+        with pytest.raises(TrainingError, match=r"00000\.npz is a drive of another plan"):
+            collect(replace(plan, **changes), tmp_path)
 
 
 def test_scenarios_are_not_what_is_driven():

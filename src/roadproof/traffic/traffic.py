@@ -21,7 +21,7 @@ class Traffic:
     """
 
     def __init__(self, road_map: RoadMap, *, cars: int, pedestrians: int, seed: int, ego: VehicleState) -> None:
-        """Place everybody, away from the driven car.
+        """Place everybody, the cars away from the driven one.
 
         Raises:
             SimulatorError: a number or the seed is negative, or they do not fit on the map.

@@ -52,7 +52,8 @@ class CollectionPlan:
 
     Args:
         drives: how many drives to record, at least 1.
-        seed: the seed of everything drawn, at least 0: scenarios, weathers, traffic, disturbances, paint.
+        seed: the seed of everything drawn, at least 0: scenarios, weathers, numbers of others, disturbances, paint.
+            Where those others are follows from the drive's number alone.
         controller: spec of the controller that drives; None for the expert.
         disturbed: share of the drives that start beside the lane's middle and are disturbed, 0 to 1.
         traffic: share of the drives with others on the road, 0 to 1.
@@ -115,18 +116,29 @@ def collect(
         The shards of the plan, in order.
 
     Raises:
-        TrainingError: the plan is not valid.
+        TrainingError: the plan is not valid, or the folder holds drives of another.
         ControllerError: the controller cannot be loaded.
         OutputError: a shard cannot be written.
     """
     paths = tuple(folder / f"drive-{number:05d}.npz" for number in range(plan.drives))
-    missing = [(plan, number, path) for number, path in enumerate(paths) if not path.exists()]
+    missing = [(plan, number, path) for number, path in enumerate(paths) if not _is_there(path, plan, number)]
     done = plan.drives - len(missing)
     for _ in spread(_record, missing, partial(driving, plan.controller, STEP_S), processes=processes):
         done += 1
         if on_drive is not None:
             on_drive(done)
     return paths
+
+
+def _is_there(path: Path, plan: CollectionPlan, number: int) -> bool:
+    """Whether a folder holds a drive of a plan; how many drives the plan has does not matter."""
+    if not path.exists():
+        return False
+    about = Shard.about_of(path)
+    made = about.get("plan")
+    if not isinstance(made, dict) or made | {"drives": plan.drives} != asdict(plan) or about.get("number") != number:
+        raise TrainingError(f"{path} is a drive of another plan, {made}; choose another folder")
+    return True
 
 
 def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, controller: Controller | None) -> Shard:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float32, Int8, UInt8
 
 from roadproof.errors import TrainingError
+from roadproof.io.arrays import read_record
 from roadproof.io.records import RecordFile, Saved
 
 
@@ -56,6 +58,19 @@ class Shard(Saved):
         for name in ("speed_mps", "expert", "lateral_m", "path_m"):
             if not np.isfinite(getattr(self, name)).all():
                 raise TrainingError(f"{name} of the drive has NaN or infinite values")
+
+    @staticmethod
+    def about_of(path: Path) -> Mapping[str, Any]:
+        """What a shard says about itself; its arrays are not read.
+
+        Raises:
+            TrainingError: the file is missing or damaged, or no shard.
+        """
+        file = Shard.FILE
+        stated, _ = read_record(path, (), file.error, file.remedy, format_version=(file.name, file.version))
+        if not isinstance(about := stated.get("about"), dict):
+            raise TrainingError(f"{path} says nothing about itself; {file.remedy}")
+        return cast("dict[str, Any]", about)
 
     def __len__(self) -> int:
         """How many frames there are."""
