@@ -47,6 +47,13 @@ class Solid:
         """Its footprint, counter-clockwise."""
         return edge_corners(self.pose, *self.half_m)
 
+    def apart_m(self, x_m: float, y_m: float) -> float:
+        """How far a place is from the footprint, metres; 0 inside."""
+        c, s = math.cos(self.pose.yaw_rad), math.sin(self.pose.yaw_rad)
+        dx, dy = x_m - self.pose.x_m, y_m - self.pose.y_m
+        along, across = abs(c * dx + s * dy) - self.half_m[0], abs(c * dy - s * dx) - self.half_m[1]
+        return math.hypot(max(along, 0.0), max(across, 0.0))
+
 
 @dataclass(frozen=True, slots=True)
 class Tree:

@@ -104,7 +104,7 @@ class TownSimulator(RouteSimulator[_Drive]):
                 half_width_m=solid.half_m[1],
             )
             for solid in build_scenery(load_map(scenario.map_name)).solids
-            if math.hypot(solid.pose.x_m - canvas.x_m, solid.pose.y_m - canvas.y_m) < BESIDE_M
+            if solid.apart_m(canvas.x_m, canvas.y_m) < BESIDE_M
         )
 
     def image_from_canvas(self) -> Homography:
