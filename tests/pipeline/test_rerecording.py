@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -140,8 +141,6 @@ def test_a_controller_that_was_trained_again_is_not_answered_from_what_the_one_b
 def test_a_round_that_cannot_be_calibrated_ends_them_and_the_demo_says_why(
     done, town, street, tmp_path, monkeypatch, capsys
 ):
-    import shutil
-
     folder = shutil.copytree(done[0], tmp_path / "run")
     shutil.rmtree(folder / "round-2")
     for path in (folder / "calibration").glob("round-2*"):
@@ -156,6 +155,15 @@ def test_a_round_that_cannot_be_calibrated_ends_them_and_the_demo_says_why(
     assert result.rounds.stopped == "round 2: drive round-2 has 1 of 6 frames left"
     _report(result, folder)
     assert "\nSearching on ended early: round 2: drive round-2 has 1 of 6 frames left\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("what", ["round-1/drive.npz", "recordings/recordings.json"])
+def test_a_damaged_file_of_a_round_is_named_and_ends_no_round(done, town, street, tmp_path, what):
+    folder = shutil.copytree(done[0], tmp_path / "run")
+    damaged = folder / "round-1" / what
+    damaged.write_bytes(damaged.read_bytes()[:-200])
+    with pytest.raises(RoadproofError, match=rf"round-1/{what}"):
+        run(town, street, folder, BUDGET)
 
 
 def test_one_search_may_be_for_several_weathers(town, street, tmp_path):
@@ -176,3 +184,9 @@ def test_budgets_that_contradict_themselves_are_refused():
         dataclasses.replace(BUDGET, attack_weathers=(NOON, NOON))
     with pytest.raises(RoadproofError, match="published calibration holds in one weather"):
         dataclasses.replace(BUDGET, calibration=CalibrationMethod.PUBLISHED, attack_weathers=(NOON, RAIN))
+    with pytest.raises(RoadproofError, match="weathers has clear-noon twice"):
+        dataclasses.replace(BUDGET, weathers=(NOON, NOON))
+    with pytest.raises(RoadproofError, match="weathers is empty"):
+        dataclasses.replace(BUDGET, weathers=())
+    with pytest.raises(RoadproofError, match=r"starts is -1, expected a whole number, 0 or more"):
+        dataclasses.replace(BUDGET, starts=-1)

@@ -12,6 +12,7 @@ from roadproof.drives import Scheme, SteeringNoise, Swerve, Trajectories, Window
 from roadproof.driving.evaluate import PAPER_WEATHERS
 from roadproof.driving.starts import USUAL_STARTS, StartRange
 from roadproof.errors import RoadproofError
+from roadproof.io.tables import each_once
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,8 +38,9 @@ class Budget:
             first. By default the first of `weathers` alone.
 
     Raises:
-        RoadproofError: a number is below 0, rounds have no candidates to drive, weathers repeat or do not suit the
-            calibration, or the search does not suit the drives or the published settings.
+        RoadproofError: a number is not whole or below 0, rounds have no candidates to drive, there are no weathers,
+            they repeat or do not suit the calibration, or the search does not suit the drives or the published
+            settings.
     """
 
     method: Method = field(default_factory=lambda: GradOpt(restarts=3))
@@ -58,11 +60,10 @@ class Budget:
     attack_weathers: tuple[Weather, ...] = ()
 
     def __post_init__(self) -> None:
-        if min(self.rounds, self.select, self.starts, self.runs) < 0:
-            raise RoadproofError(
-                f"{self.rounds} rounds, {self.select} candidates driven, {self.starts} starts, {self.runs} runs in "
-                "traffic; expected ≥ 0"
-            )
+        for name in ("rounds", "select", "starts", "runs"):
+            if not isinstance(number := getattr(self, name), int) or number < 0:
+                raise RoadproofError(f"{name} is {number}, expected a whole number, 0 or more")
+        each_once(self.weathers, "weathers", RoadproofError)
         if isinstance(self.method, Published):
             self._check_published()
         if self.rounds and not self.select:

@@ -13,7 +13,8 @@ searches on from the patterns that deviated most when driven. Rounds are not mon
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count, takewhile
@@ -144,7 +145,7 @@ def search_on(
         bare, driven = last.episodes(drives_of_last)
         try:
             added, calls = _recorded(simulator, controller, clean, driven, method, place, pool)
-        except (CalibrationError, RecordingError) as error:
+        except _ShowsTooLittleError as error:
             return Rounds(first=selection, done=tuple(done), stopped=f"round {number}: {error}")
         recordings = replace(recordings, recordings=(*recordings.recordings, added))
         again = _search_again(
@@ -229,14 +230,29 @@ def _recorded(
     pool: Pool[Simulator] | None,
 ) -> tuple[Recording, int]:
     """The recording of the last pattern's path, without paint and calibrated, and the number of drives it took."""
-    drive = record_along(simulator, controller, clean, last, name=place.name, folder=place)
+    read_drive(place.name, place)  # one that is damaged is told as such, and ends no round
+    with _what_is_shown():
+        drive = record_along(simulator, controller, clean, last, name=place.name, folder=place)
     both = replace(clean, drives=(*clean.drives, drive))
     calibrated = Calibrated.kept(place, both, method)
     if calibrated is None:
         # The clean drive's replays lie there already and are not driven again.
-        calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration", pool=pool)
+        with _what_is_shown():
+            calibrated = calibrate(simulator, both, method, folder=place.parent / "calibration", pool=pool)
         calibrated.save(place)
     return calibrated.recordings.recordings[1], _calls_of(drive, method)
+
+
+class _ShowsTooLittleError(Exception):
+    """The road along a pattern's path cannot be recorded or calibrated."""
+
+
+@contextmanager
+def _what_is_shown() -> Generator[None]:
+    try:
+        yield
+    except (CalibrationError, RecordingError) as error:
+        raise _ShowsTooLittleError(str(error)) from error
 
 
 def _calls_of(drive: Drive, method: CalibrationMethod) -> int:
