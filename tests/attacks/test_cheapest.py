@@ -9,7 +9,8 @@ import torch
 
 from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import Cheapest, GradOpt, PathDeviation, attack, cheapest, site_of
-from roadproof.attacks.cheapest import cheapest_in_words
+from roadproof.attacks.cheapest import _Narrowing, cheapest_in_words
+from roadproof.attacks.deviation import DeviationMeasure
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.paint import PaintLimits, conspicuousness
@@ -77,6 +78,20 @@ def test_less_paint_still_reaches_the_deviation_and_keeps_the_limits(searched, t
     far = (kept.pattern.colours.double() - torch.tensor(site.asphalt).double()).norm(dim=-1) / math.sqrt(3)
     assert float(far.max()) <= 0.4
     assert "Least paint that is predicted" in cheapest_in_words(less, wanted_m)
+
+
+@pytest.mark.parametrize("family", ["published", "published-bo", "free"])
+def test_the_figures_that_stay_are_the_same_without_the_one_that_goes(monkeypatch, family):
+    space = SearchSpace(figures=2, family=family)
+    unit = space.random((1, 1), torch.Generator().manual_seed(0))
+    measure = DeviationMeasure.__new__(DeviationMeasure)
+    both = _Narrowing(measure=measure, space=space, wanted_m=0.1, seed=0, unit=unit)
+    for kept in (0, 1):
+        worth = torch.tensor([0.5, 0.5]).index_fill(0, torch.tensor([1 - kept]), 1.0)
+        monkeypatch.setattr(_Narrowing, "_least_m", lambda _self, _space, _unit, worth=worth: worth)
+        alone = both.without_a_figure()
+        torch.testing.assert_close(alone.pattern.boxes, both.pattern.boxes[[kept]], atol=1e-3, rtol=0)
+        torch.testing.assert_close(alone.pattern.colours, both.pattern.colours[[kept]])
 
 
 def test_a_deviation_that_nothing_reaches_has_no_cheapest_pattern(searched):

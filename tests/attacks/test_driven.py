@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from paint_shy import along_a_street
+from paint_shy import PaintShy, along_a_street
 from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import (
     CMAES,
@@ -26,7 +26,7 @@ from roadproof.controllers import load_controller
 from roadproof.datatypes import Control, Weather
 from roadproof.driving.rollout import rollout
 from roadproof.driving.trial import judge
-from roadproof.errors import RoadproofError
+from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.recorded import RecordedSimulator
 from roadproof.scenarios import find_scenario
 from roadproof.search_space import SearchSpace
@@ -130,6 +130,34 @@ def test_attack_in_a_simulator_finds_the_best_it_drove_over(town, street, tmp_pa
     assert [each.driven for each in again.candidates] == [each.driven for each in found.candidates]
     on = attack(place, controller, SPACE, method=method, objective=PathDeviation(), starts=again.candidates[:1])
     assert on.history[0, 0, 0] == pytest.approx(found.driven.deviation), "the start is the first that is driven"
+
+
+def test_where_nothing_can_be_measured_nothing_is_searched(town):
+    far = dataclasses.replace(find_scenario("straight-08"), time_limit_s=1.0)
+    for objective in (SteeringShift(), PathDeviation()):
+        with pytest.raises(EpisodeError, match="without paint the car never comes near the canvas of straight-08"):
+            DrivenMeasure(InSimulator(town, far), PaintShy(), objective)
+
+
+@pytest.mark.slow
+def test_an_interrupted_search_counts_all_its_drives(town, street, tmp_path):
+    def searched(name, stop):
+        def pull_the_plug(calls, _best):
+            if calls == stop:
+                raise KeyboardInterrupt
+
+        place = InSimulator(town, street, keep=tmp_path / f"{name}.json")
+        return attack(
+            place, PaintShy(), SPACE, method=RandomSearch(calls=4), objective=PathDeviation(),
+            checkpoint=tmp_path / f"{name}.safetensors", on_step=pull_the_plug,
+        )  # fmt: skip
+
+    whole = searched("whole", None).cost
+    with pytest.raises(KeyboardInterrupt):
+        searched("again", 2)
+    again = searched("again", None).cost
+    assert (again.controller_frames, again.simulator_calls) == (whole.controller_frames, whole.simulator_calls)
+    assert whole.simulator_calls == 5
 
 
 def test_a_search_by_gradient_in_a_simulator_is_refused_before_it_drives():

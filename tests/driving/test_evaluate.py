@@ -370,6 +370,14 @@ def test_a_pattern_that_paints_nothing_is_refused(town, street, tmp_path):
         evaluate(town, PaintShy(), street, np.zeros((400, 400, 4), np.uint8), folder=tmp_path)
 
 
+def test_starts_that_are_all_the_same_count_once(town, street, tmp_path):
+    nowhere = StartRange(right_m=0.0, turned_rad=0.0, faster_mps=0.0)
+    told = evaluate(
+        town, PaintShy(), street, MAGENTA, folder=tmp_path, weathers=WEATHERS[:1], starts=5, start_range=nowhere, runs=0
+    )
+    assert (len(told.trials), told.starts) == (1, 1)
+
+
 DAMAGE = {
     "is not valid JSON": lambda text: text[:100],
     "required field `trials`": lambda text: text.replace('"trials"', '"trails"'),

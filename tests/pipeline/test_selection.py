@@ -15,9 +15,10 @@ from roadproof.datatypes import Weather
 from roadproof.driving.drive_store import load_episodes
 from roadproof.driving.evaluate import evaluate
 from roadproof.driving.rollout import rollout
-from roadproof.errors import RoadproofError
+from roadproof.errors import EpisodeError, RoadproofError
 from roadproof.patterns import Pattern
 from roadproof.pipeline.selection import Selection, select_by_driving
+from roadproof.scenarios import find_scenario
 
 needs.town()
 
@@ -121,6 +122,13 @@ def test_an_evaluation_finds_the_bare_drive_of_a_selection(done, town, street):
     )
     assert evaluation.trials[0].clean == selection.driven[0].trial.clean
     assert evaluation.trials[0].deviation_m == selection.deviation_m, "the same drive again"
+
+
+def test_a_canvas_that_is_never_reached_is_refused_before_any_paint_is_driven_over(town, tmp_path):
+    far = dataclasses.replace(find_scenario("straight-08"), time_limit_s=1.0)
+    with pytest.raises(EpisodeError, match="without paint the car never comes near the canvas"):
+        select_by_driving(town, PaintShy(), far, CANDIDATES, best=3, folder=tmp_path)
+    assert len(list(tmp_path.rglob("*.npz"))) == 1
 
 
 def test_nothing_to_drive_is_refused(town, street, tmp_path):

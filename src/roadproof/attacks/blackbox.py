@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias, Unpack, cast
 
@@ -82,6 +82,7 @@ class BlackBox(Method):
             at_once=1 if isinstance(measure, DrivenMeasure) else self.at_once,
             first=torch.cat(list(given)) if sum(map(len, given)) else None,
             world=measure.fingerprint(),
+            measure=measure,
             checkpoint=running.get("checkpoint"),
             aim=aim_of(running),
             on_step=running.get("on_step", lambda _calls, _best: None),
@@ -168,15 +169,22 @@ class Trials:
         unit: the points tried, in the unit cube, (T, K, N) for T trials, K figures and N parameters each.
         value: value of each point, (T,).
         seconds: time at which each value was known, in seconds since the search began, (T,); pauses do not count.
+        spent: frames through the controller and drives until each value was known, (T, 2); 0 where nobody counts.
     """
 
     unit: Float[Tensor, "t k n"]
     value: Float[Tensor, " t"]
     seconds: Float[Tensor, " t"]
+    spent: Float[Tensor, "t 2"]
 
     def __len__(self) -> int:
         """How many points have been tried."""
         return len(self.value)
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All of it by name, as a checkpoint keeps it."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
     def best(self) -> int:
@@ -198,6 +206,7 @@ def blackbox_search(
     at_once: int = 1,
     first: Float[Tensor, "f k n"] | None = None,
     world: str = "",
+    measure: Measure | None = None,
     checkpoint: Path | None = None,
     aim: str = "",
     on_step: Callable[[int, float], object] = lambda _calls, _best: None,
@@ -212,6 +221,7 @@ def blackbox_search(
         at_once: number of points proposed before their values are asked for, 1 or more.
         first: points (F, K, N) to try first, such as those of another search; the method goes on from their values.
         world: text that identifies what computes the values, so that a checkpoint of other values is not resumed.
+        measure: what computes the values; a search that goes on counts its frames and drives on from those kept.
         checkpoint: file that keeps the trials after every call of `value`, so that an interrupted search goes on.
         aim: name of what is made large, which the checkpoint says; a search for another is refused there.
         on_step: called after every batch with the number of points tried and the best value so far.
@@ -229,17 +239,20 @@ def blackbox_search(
     given = None if first is None else cast("list[Any]", first.tolist())
     propose = method.proposer_after(len(given or ()), space, seed)
     # More calls are the same search, gone on with.
-    fields = {name: each for name, each in asdict(method).items() if name != "calls"}
-    identity = repr((space, method.word, fields, seed, at_once, given, world))
+    settings = {name: each for name, each in asdict(method).items() if name != "calls"}
+    identity = repr((space, method.word, settings, seed, at_once, given, world))
     keeping = Checkpoint(checkpoint, identity, aim)
     nothing = torch.empty(0, dtype=torch.float64)
     none = {"unit": nothing.new_empty(0, space.figures, len(space.names)), "value": nothing, "seconds": nothing}
     kept = keeping.load(torch.device("cpu")) or none
     count = len(kept["value"])
+    kept.setdefault("spent", nothing.new_zeros(count, 2))  # of an older version
     if count < method.calls:  # a batch that fewer calls had cut short is proposed again as a whole
         count -= max(0, count - len(given or ())) % at_once
     trials = Trials(**{name: each[: min(count, method.calls)] for name, each in kept.items()})
     before_s = float(trials.seconds[-1]) if len(trials) else 0.0
+    if measure is not None and len(trials):
+        _count_on(measure, trials.spent[-1])
     started = time.perf_counter()
     while len(trials) < method.calls:
         flat, known = trials.unit.flatten(1).numpy(), trials.value.numpy()
@@ -253,12 +266,24 @@ def blackbox_search(
         if not bool(found.isfinite().all()):
             raise RoadproofError(f"the value is NaN or infinite at call {len(trials) + 1}; check the controller")
         now = torch.full_like(found, before_s + time.perf_counter() - started)
-        trials = Trials(
-            torch.cat([trials.unit, unit]), torch.cat([trials.value, found]), torch.cat([trials.seconds, now])
-        )
-        keeping.save({"unit": trials.unit, "value": trials.value, "seconds": trials.seconds})
+        more = Trials(unit, found, now, _spent(measure).expand(len(found), 2)).tensors
+        trials = Trials(**{name: torch.cat([before, more[name]]) for name, before in trials.tensors.items()})
+        keeping.save(trials.tensors)
         on_step(len(trials), float(trials.value.max()))
     return trials
+
+
+def _spent(measure: Measure | None) -> Float[Tensor, "2"]:
+    """Frames through the controller and drives so far."""
+    drives = measure.calls if isinstance(measure, DrivenMeasure) else 0
+    return torch.tensor([0 if measure is None else measure.frames_evaluated, drives], dtype=torch.float64)
+
+
+def _count_on(measure: Measure, spent: Float[Tensor, "2"]) -> None:
+    """Have a measure count on from what a search had spent when it was interrupted."""
+    measure.frames_evaluated = int(spent[0])
+    if isinstance(measure, DrivenMeasure):
+        measure.calls = int(spent[1])
 
 
 def at_least_one(method: object, *names: str) -> None:

@@ -245,6 +245,10 @@ class _Narrowing:
             return None
         rest = torch.tensor([[k for k in range(count) if k != gone] for gone in range(count)])
         unit, space = self.unit[0, 0][rest][None], replace(self.space, figures=count - 1)
+        # A figure alone may have other bounds; they all begin at 0 there.
+        scale = torch.tensor(self.space.shape_ranges) / torch.tensor(space.shape_ranges)
+        unit[..., : len(scale)] *= scale.to(unit)
+        unit = space.project(unit)
         least = self._least_m(space, unit)
         best = int(least.argmax())
         return replace(self, space=space, unit=unit[:, [best]]) if float(least[best]) >= self.wanted_m else None

@@ -21,7 +21,7 @@ from roadproof.attacks.groups import Direction, Group, Points, Values
 from roadproof.attacks.objective import Objective, PathDeviation, SteeringShift
 from roadproof.controllers import Controller
 from roadproof.datatypes import Observation, Weather
-from roadproof.driving.deviation import passage, passage_deviation_m, path_of
+from roadproof.driving.deviation import canvas_missed, passage, passage_deviation_m, path_of, sees_canvas
 from roadproof.driving.drive_store import Episodes
 from roadproof.driving.episode import Episode
 from roadproof.driving.rollout import Driver, rollout
@@ -81,7 +81,8 @@ class DrivenMeasure:
         objective: `SteeringShift()` or `PathDeviation()`; their fields concern recordings and are not used here.
 
     Raises:
-        RoadproofError: another objective is asked for, the file of drives is damaged, or the clean `rollout` fails.
+        RoadproofError: another objective is asked for, the file of drives is damaged, the clean `rollout` fails, or it
+            never comes to the canvas.
     """
 
     groups = (Group((), Direction.EITHER),)
@@ -110,6 +111,8 @@ class DrivenMeasure:
 
         self._drive = drive
         self.clean = drive(None, None)
+        if not sees_canvas(path_of(self.clean), place.scenario.canvas):
+            raise canvas_missed(place.scenario.name)
         if self._keep is not None and self._keep.exists():
             kept = _FILE.read(self._keep)
             if (kept.clean, kept.conditions) != (self._told(), self._conditions):

@@ -50,6 +50,14 @@ def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZO
     return slice(int(seen[0]), int(seen[-1]) + 1)
 
 
+def canvas_missed(scenario: str) -> EpisodeError:
+    """The error where a drive without paint never comes to the canvas of a scenario."""
+    return EpisodeError(
+        f"without paint the car never comes near the canvas of {scenario}: nothing can be compared with it; choose a "
+        "scenario that the controller masters"
+    )
+
+
 def sees_canvas(clean: Path2D, canvas: CanvasPlacement) -> bool:
     """Whether a drive came so near to the canvas that a driver begins to see what is painted on it."""
     _check_path(clean, "clean")

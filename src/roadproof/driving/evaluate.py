@@ -12,6 +12,7 @@ from dataclasses import replace
 from itertools import cycle
 
 from roadproof.datatypes import Weather
+from roadproof.driving.deviation import canvas_missed
 from roadproof.driving.drive_store import CLEAN, AnyDriver, DriveConditions, Episodes, driver_in_words, make_missing
 from roadproof.driving.evaluation import ATTACK, Evaluation
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartOffset, StartRange
@@ -24,7 +25,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
-from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory, begun_in
+from roadproof.simulators.protocol import PatternImage, Simulator, SimulatorFactory, begun_in, check_image
 
 PAPER_WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON, Weather.RAINY_NOON, Weather.CLEAR_SUNSET)
 
@@ -114,7 +115,7 @@ def evaluate(
         simulator_calls=0 if world.paint.predicted else len(drives),
         seconds=time.perf_counter() - started,
         paint=world.paint,
-        starts=starts,
+        starts=len(begins) if starts else 0,
         start_range=start_range,
     )
     evaluation.save(folder, paints[ATTACK])
@@ -139,10 +140,7 @@ def _compared(episodes: Episodes, planned: Sequence[tuple[DriveConditions, Drive
     seen = {clean for clean in dict.fromkeys(clean for clean, _ in planned) if episodes.sees_canvas(clean)}
     trials = tuple(episodes.trial(clean, painted) for clean, painted in planned if clean in seen)
     if all(trial.traffic for trial in trials):
-        raise EpisodeError(
-            f"without paint the car never comes near the canvas of {episodes.scenario.name}: nothing can be compared "
-            "with it; choose a scenario that the controller masters"
-        )
+        raise canvas_missed(episodes.scenario.name)
     return trials
 
 
@@ -154,6 +152,7 @@ def random_patterns(pattern: Pattern, count: int, *, seed: int = 0) -> tuple[Pat
 
 def _raster(pattern: Pattern | PatternImage) -> PatternImage:
     paint = raster(pattern) if isinstance(pattern, Pattern) else pattern
+    check_image(paint)
     if not paint[..., 3].any():
         raise PatternError("the pattern paints nothing, so there is nothing to evaluate; give another")
     return paint

@@ -17,6 +17,7 @@ from roadproof.attacks import Candidate, PathDeviation, SpeedChange
 from roadproof.attacks.groups import Direction
 from roadproof.controllers import Controller
 from roadproof.datatypes import Weather
+from roadproof.driving.deviation import canvas_missed
 from roadproof.driving.drive_store import CLEAN, DriveConditions, Episodes, load_episodes, make_missing
 from roadproof.driving.episode import Episode
 from roadproof.driving.trial import Trial
@@ -175,7 +176,8 @@ def select_by_driving(
             or change of the speed, m/s.
 
     Raises:
-        RoadproofError: there is nothing to drive, the folder is damaged, or it holds a choice among others.
+        RoadproofError: there is nothing to drive, without paint the car never comes to the canvas, the folder is
+            damaged, or it holds a choice among others.
         SimulatorError, ControllerError: as `rollout` does.
         OutputError: the folder cannot be written.
     """
@@ -196,6 +198,8 @@ def select_by_driving(
     if clean is not None and not episodes.has(bare):
         episodes.put(bare, clean)
     episodes.make(simulator, bare)
+    if not episodes.sees_canvas(bare):
+        raise canvas_missed(scenario.name)
 
     @cache
     def driven_over(place: int) -> Driven:

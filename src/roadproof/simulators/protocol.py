@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, Obstacle, Weather
+from roadproof.errors import SimulatorError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
 from roadproof.homographies import Homography
 from roadproof.io.identity import digest, stated
@@ -28,6 +29,19 @@ PatternImage = UInt8[np.ndarray, "400 400 4"]
 def uniform(red: int, green: int, blue: int) -> PatternImage:
     """A canvas painted all over with one colour, each channel in 0…255."""
     return np.full((CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4), (red, green, blue, 255), np.uint8)
+
+
+def check_image(paint: np.ndarray) -> None:
+    """See that an array is what can be painted on a canvas.
+
+    Raises:
+        SimulatorError: the array has another shape or type.
+    """
+    shape = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
+    if paint.shape != shape or paint.dtype != np.uint8:
+        raise SimulatorError(
+            f"the pattern is {paint.dtype} of shape {paint.shape}, expected uint8 of shape {shape} (RGBA)"
+        )
 
 
 class PaintKind(StrEnum):

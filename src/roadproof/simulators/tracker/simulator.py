@@ -14,10 +14,10 @@ from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, Observation, VehicleState, Weather
 from roadproof.errors import SimulatorError
-from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize
+from roadproof.geometry import CameraModel, CropResize
 from roadproof.roads.routes import Route, RoutePosition
 from roadproof.scenarios import Scenario
-from roadproof.simulators.protocol import PatternImage, Pictures
+from roadproof.simulators.protocol import PatternImage, Pictures, check_image
 from roadproof.simulators.tracker.drive import DriveTracker, Request, RouteTracker
 from roadproof.traffic.agents import Agents
 
@@ -96,11 +96,8 @@ class TrackedSimulator(ABC, Generic[DriveT]):
         """
         if not self._is_open:
             raise SimulatorError("the simulator is closed; use it in a with-block")
-        shape = (CANVAS_SIZE_PX, CANVAS_SIZE_PX, 4)
-        if pattern is not None and (pattern.shape != shape or pattern.dtype != np.uint8):
-            raise SimulatorError(
-                f"the pattern is {pattern.dtype} of shape {pattern.shape}, expected uint8 of shape {shape} (RGBA)"
-            )
+        if pattern is not None:
+            check_image(pattern)
         asked = _steps("frames", frames), _steps("full_pictures", full_pictures)
         request = Request(scenario, Weather(weather), pattern, cars, pedestrians, seed, *asked)
         self._drive = self._begin(request)
