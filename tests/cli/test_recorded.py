@@ -10,12 +10,13 @@ from recorded_drives import drivable_set
 from roadproof.attacks import AttackResult, Cheapest
 from roadproof.attacks.cheapest import Level
 from roadproof.datatypes import Weather
+from roadproof.drives.worlds import recorded_in
 from roadproof.driving.episode import Episode
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
 from roadproof.recordings import save_recordings
 from runs import write_attack
-from team_folder import write_recorded
+from team_folder import write_recorded, write_team
 
 BAR = magenta(300.0)
 
@@ -166,7 +167,7 @@ MISTAKES = {
     "missing set, dry run": ([*EVALUATE[:-1], "recorded:nobody", "--dry-run"], "nobody has no recordings.json"),
     "another weather": (
         [*EVALUATE, "--weathers", "rainy-noon", "--dry-run"],
-        "--weathers has rainy-noon, but the drives",
+        "--weathers has rainy-noon, but the recordings have the light of clear-noon",
     ),
     "no canvas": ([*EVALUATE[:-1], "recorded:nowhere-known"], "canvas"),
     "expert": (["drive", "--simulator", "recorded:run"], "the expert needs a map"),
@@ -176,6 +177,25 @@ MISTAKES = {
     ),
     "recording": (["record", "left-03", "--simulator", "recorded:run"], "evaluate, select and drive alone"),
 }
+
+
+def test_recordings_are_the_same_however_their_path_is_spelled(tmp_path, monkeypatch):
+    write_team(tmp_path)
+    run = tmp_path / "recordings" / "test-road"
+    found = recorded_in(f"recorded:{run}")
+    assert found.scenario is not None
+    (tmp_path / "link").symlink_to(run / "recordings")
+    assert recorded_in(f"recorded:{tmp_path / 'link'}") == found
+    monkeypatch.chdir(run / "recordings")
+    assert recorded_in("recorded:.") == recorded_in("recorded:..") == found
+
+
+@pytest.mark.parametrize("said", ["rainy-noon", ""])
+def test_a_set_alone_has_the_weather_that_it_states(tmp_path, said):
+    made = drivable_set()
+    drives = tuple(dataclasses.replace(each, weather=said) for each in made.recordings)
+    save_recordings(dataclasses.replace(made, recordings=drives), tmp_path / "set")
+    assert recorded_in(f"recorded:{tmp_path / 'set'}").weather == (said or "clear-noon")
 
 
 @pytest.mark.parametrize("name", MISTAKES)

@@ -176,6 +176,16 @@ def test_full_pictures_are_the_frame_in_its_place(world):
     np.testing.assert_array_equal(seen.picture[120, 2::4], seen.frame[1])
 
 
+@pytest.mark.parametrize(
+    ("said", "light"),
+    [("rainy-noon", Weather.RAINY_NOON), ("", Weather.CLEAR_NOON), ("drizzle", Weather.CLEAR_NOON)],
+)
+def test_its_light_is_what_the_drives_say(recordings, said, light):
+    drives = tuple(dataclasses.replace(each, weather=said) for each in recordings.recordings)
+    with RecordedSimulator(dataclasses.replace(recordings, recordings=drives)) as world:
+        assert not world.reset(world.scenario, weather=light).done
+
+
 REFUSED = {
     "cars": ({"cars": 3}, "3 cars and 0 pedestrians are asked for, but recordings hold no others"),
     "people": ({"pedestrians": 1}, "expected 0 of both"),

@@ -168,7 +168,7 @@ def _check_recorded(
     """Refuse what recordings cannot give, before anything is driven: other weathers, traffic, renders."""
     if other := [weather for weather in weathers if weather != recorded.weather]:
         raise RoadproofError(
-            f"--weathers has {other[0]}, but the drives were recorded at {recorded.weather}; leave it out"
+            f"--weathers has {other[0]}, but the recordings have the light of {recorded.weather}; leave it out"
         )
     if runs:
         raise RoadproofError(f"--runs is {runs}, but recordings hold no others on the road; expected 0")

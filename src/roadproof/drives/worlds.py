@@ -9,8 +9,8 @@ from pathlib import Path
 from roadproof.datatypes import Weather
 from roadproof.drives.folder import read_settings
 from roadproof.errors import RecordingError, RoadproofError
-from roadproof.recorded.simulator import RecordedSimulator
-from roadproof.recordings import load_recordings
+from roadproof.recorded.simulator import RecordedSimulator, light_of
+from roadproof.recordings import load_recordings, stated_weather
 from roadproof.scenarios import Scenario
 from roadproof.simulators.loading import RECORDED, MappedSimulator, open_simulator
 
@@ -22,7 +22,7 @@ class Recorded:
     Args:
         folder: the folder of the set.
         scenario: the scenario that was recorded, where the set lies in a run that says so; else None.
-        weather: the weather it was recorded in; a set alone does not say it, and its light is called clear-noon.
+        weather: the weather it was recorded in; clear noon where nothing says it.
     """
 
     folder: Path
@@ -42,13 +42,13 @@ def recorded_in(spec: str) -> Recorded | None:
         raise RoadproofError(
             f"--simulator is {spec!r}, expected the folder of recordings, or of a run, after the colon"
         )
-    folder = Path(spec.removeprefix(RECORDED))
+    folder = Path(spec.removeprefix(RECORDED)).resolve()
     run = folder if (folder / "recordings").is_dir() else folder.parent if folder.name == "recordings" else None
     there = folder if run is None else run / "recordings"
     if not (there / "recordings.json").is_file():
         raise RecordingError(f"{there} has no recordings.json; expected recordings, or a run that has some")
     if run is None or not (run / "record" / "record.json").is_file():
-        return Recorded(there, None, Weather.CLEAR_NOON)
+        return Recorded(there, None, light_of(stated_weather(there)))
     settings = read_settings(run / "record")
     return Recorded(there, settings.scenario, settings.weather)
 

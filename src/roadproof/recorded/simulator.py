@@ -54,6 +54,11 @@ class _Drive(DriveTracker):
     pattern: PatternImage | None
 
 
+def light_of(weather: str) -> Weather:
+    """The weather that recordings call by a name; clear noon where they say none, or one that is none of `Weather`."""
+    return Weather(weather) if weather in set(Weather) else Weather.CLEAR_NOON
+
+
 class RecordedSimulator(TrackedSimulator[_Drive]):
     """Drives in calibrated recordings, as a `Simulator`.
 
@@ -70,7 +75,8 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
     Args:
         recordings: calibrated recordings with a canvas and the tracks of all drives, the clean drive among them.
         vehicle: model of how the car answers to controls; None identifies it from the drives.
-        weather: weather in whose light the set was recorded; drives in another weather are refused.
+        weather: weather in whose light the set was recorded, by default what the set says (`light_of`); drives in
+            another weather are refused.
         device: torch device on which pictures are made.
 
     Raises:
@@ -86,13 +92,13 @@ class RecordedSimulator(TrackedSimulator[_Drive]):
         recordings: RecordingSet,
         *,
         vehicle: Vehicle | None = None,
-        weather: Weather = Weather.CLEAR_NOON,
+        weather: Weather | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         self.recordings = recordings
         self._world = RecordedWorld(recordings, vehicle=vehicle, device=device)
         super().__init__(recordings.camera, recordings.view, self._world.course.dt_s)
-        self._weather = Weather(weather)
+        self._weather = light_of(recordings.recordings[0].weather) if weather is None else Weather(weather)
 
     @cached_property
     def identity(self) -> str:

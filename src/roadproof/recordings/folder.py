@@ -178,6 +178,16 @@ def _write_drive(recording: Recording, folder: Path, *, compact: bool) -> None:
         Image.fromarray(frame).save(folder / "frames" / f"{number}.png")
 
 
+def stated_weather(folder: AnyPath) -> str:
+    """The weather that the drives of a set say they were recorded in; empty where they say none, or several.
+
+    Raises:
+        RecordingError: the folder's recordings.json is missing or damaged.
+    """
+    weathers = {drive.weather for drive in _MANIFEST.read(as_path(folder) / "recordings.json").drives}
+    return weathers.pop() if len(weathers) == 1 else ""
+
+
 def load_recordings(folder: AnyPath) -> RecordingSet:
     """Read and check a set of recorded drives.
 
