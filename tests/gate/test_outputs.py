@@ -2,13 +2,16 @@
 
 import xml.etree.ElementTree as ET
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from roadproof.datatypes import Weather
 from roadproof.driving.starts import NOMINAL
-from roadproof.gate.outputs import rows_of, write_junit, write_summary
+from roadproof.gate.outputs import SHOWN_PX, WORST_COLUMNS, rows_of, write_junit, write_summary, write_worst
 from roadproof.gate.result import Case, CheckResult, JudgedDrive
 from roadproof.gate.verdict import Kind, Status, share_95
+from roadproof.pipeline.film import Strip
 
 
 def result(*, controller="pilotnet", name="magenta", yes=1, count=6):
@@ -63,3 +66,13 @@ def test_names_are_shown_as_they_are_whatever_is_in_them(tmp_path, controller, n
     plain = "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in name)
     assert suite.find("testcase").get("name") == f"clear-noon, {plain}"
     assert f"see it: roadproof evaluate {plain}.json" in suite.find("testcase/failure").text
+
+
+@pytest.mark.parametrize(("level", "rows"), [(3, 120), (90, 80)])
+def test_the_worst_drive_is_shown_without_what_was_not_recorded_however_dark_it_was(tmp_path, level, rows):
+    pictures = np.zeros((6, 60, 80, 3), np.uint8)
+    pictures[:, 20:] = level
+    Strip(time_s=np.arange(6.0), lateral_m=np.zeros(6), clean=pictures, painted=pictures).save(tmp_path / "strip.npz")
+    write_worst(tmp_path / "strip.npz", tmp_path / "worst.jpg")
+    with Image.open(tmp_path / "worst.jpg") as shown:
+        assert shown.size == (SHOWN_PX, round(SHOWN_PX * rows / (80 * WORST_COLUMNS)))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from roadproof.errors import OutputError
-from roadproof.io.locks import hold, working_in
+from roadproof.io.locks import hold, own_folder, working_in
 
 CHILD = """
 import sys, time
@@ -84,6 +84,16 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"), working_in(tmp_path / "file" / "run"):
         pass
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need rights elsewhere")
+def test_a_link_is_no_folder_of_ones_own(tmp_path):
+    own = own_folder(tmp_path, "locks")
+    assert own_folder(tmp_path, "locks") == own
+    own.rename(tmp_path / "elsewhere")
+    own.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match="is a link, expected a folder of yours"):
+        own_folder(tmp_path, "locks")
 
 
 def test_another_temporary_folder_is_no_way_round(child, tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from roadproof.controllers import (
     waypoint_controller,
 )
 from roadproof.controllers.conditional import SPEED_SCALE_MPS, ConditionalOutput
+from roadproof.controllers.temporal import WINDOW
 from roadproof.errors import TrainingError
 from roadproof.training.augmentation import Augmentation
 from roadproof.training.dataset import SHARES, Batch, Dataset
@@ -189,6 +190,11 @@ def test_dropout_is_scaled():
 def test_plans_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError):
         TrainingPlan(**({"samples": 1000} | changes))
+
+
+def test_a_batch_has_a_whole_window_of_what_remembers():
+    with pytest.raises(TrainingError, match=f"batch is 4, expected at least {WINDOW}, the frames of a network"):
+        imitate(temporal_controller(), drives(20), TrainingPlan(samples=16, batch=4))
 
 
 def test_nothing_recorded_is_refused():

@@ -143,10 +143,11 @@ def write_worst(strip: Path, path: Path) -> None:
         OutputError: the picture cannot be written.
     """
     found = Strip.load(strip)
-    shown = evenly(len(found.painted), WORST_COLUMNS)
-    rows = [np.concatenate(list(pictures[shown]), 1) for pictures in (found.clean, found.painted)]
+    moments = evenly(len(found.painted), WORST_COLUMNS)
+    rows = [np.concatenate(list(pictures[moments]), 1) for pictures in (found.clean, found.painted)]
     whole = np.concatenate(rows)
     # Around what was recorded, pictures of the recorded world are black.
-    picture = Image.fromarray(whole[whole.max((1, 2)) > BLACK])
+    shown = whole.max((1, 2)) > BLACK
+    picture = Image.fromarray(whole[shown] if shown.any() else whole)
     picture = picture.resize((SHOWN_PX, round(SHOWN_PX * picture.height / picture.width)))
     write_atomically(path, lambda part: picture.save(part, format="JPEG", quality=88))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import stat
 import sys
 import tempfile
 from collections.abc import Generator
@@ -86,17 +87,18 @@ def own_folder(shared: Path, purpose: str) -> Path:
     """The user's own folder in one that all users write to, made where it is not there.
 
     Raises:
-        OutputError: the folder cannot be made, or belongs to another user.
+        OutputError: the folder cannot be made, belongs to another user, or is a link.
     """
     user: int = getattr(os, "getuid", int)()  # a user may have no name, or no number
     own = shared / f"roadproof-{purpose}-{user}"
     try:
         own.mkdir(mode=0o700, exist_ok=True)
-        whose = own.stat().st_uid
+        found = own.lstat()
     except OSError as error:
         raise OutputError(f"cannot keep {purpose} in {own}: {error.strerror}; remove what is there") from None
-    if whose != user:
-        raise OutputError(f"{own} belongs to another user, expected yours; have it removed")
+    # Another user's link would lead into any folder.
+    if found.st_uid != user or not stat.S_ISDIR(found.st_mode):
+        raise OutputError(f"{own} belongs to another user or is a link, expected a folder of yours; have it removed")
     return own
 
 

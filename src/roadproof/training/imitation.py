@@ -135,10 +135,17 @@ def imitate(
         The network with the running average of the weights, in eval mode.
 
     Raises:
-        TrainingError: the loss is no longer finite, or the checkpoint is of another plan or damaged.
+        TrainingError: the loss is no longer finite, a batch is too small for what remembers, or the checkpoint is of
+            another plan or damaged.
         OutputError: the checkpoint cannot be written.
     """
     place = torch.device(device)
+    # What remembers learns from whole windows of frames; the last of each is drawn.
+    window = WINDOW if isinstance(network, TemporalPlanner) else 1
+    if plan.batch < window:
+        raise TrainingError(
+            f"batch is {plan.batch}, expected at least {window}, the frames of a network that remembers"
+        )
     # Convolutions by channels-last pictures run 1.3 times as fast.
     network.to(device=place, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     scale_dropout(network, plan.dropout)
@@ -151,8 +158,6 @@ def imitate(
         for group in optimiser.param_groups:
             group["lr"] = plan.rate(step)
         draw = torch.Generator().manual_seed(plan.seed * 1_000_003 + step)
-        # What remembers learns from whole windows of frames; the last of each is drawn.
-        window = WINDOW if isinstance(network, TemporalPlanner) else 1
         last = torch.multinomial(weights, plan.batch // window, replacement=True, generator=draw)
         batch = data.batch(data.windows(last, window), place)
         batch = batch._replace(frames=plan.augmentation(paste(batch.frames, draw), draw, window=window))
