@@ -77,7 +77,7 @@ class HardeningStages:
             except (EpisodeError, RecordingError) as error:
                 if not number:
                     raise
-                cure = "other streets, another seed" + (f", or {number - 1} rounds" if number > 1 else "")
+                cure = "other streets, another seed or fewer rounds" if number > 1 else "other streets or another seed"
                 raise TrainingError(
                     f"tuning {number} spoilt the driving without paint: {error}; harden with {cure}"
                 ) from None
