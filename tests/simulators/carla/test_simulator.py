@@ -25,7 +25,7 @@ from roadproof.simulators.carla.actors import Crowd
 from roadproof.simulators.carla.simulator import CarlaSimulator
 from roadproof.simulators.checks import check_simulator
 from roadproof.simulators.loading import open_simulator
-from roadproof.simulators.protocol import PaintKind
+from roadproof.simulators.protocol import PaintKind, world_of
 from roadproof.simulators.town.simulator import TownSimulator
 from roadproof.traffic.traffic import Traffic
 
@@ -53,6 +53,10 @@ def left_behind(onlooker):
     world.wait_for_tick(30.0)
     world.wait_for_tick(30.0)
     return [actor.type_id for actor in world.get_actors()]
+
+
+def test_a_server_is_known_by_its_version(simulator):
+    assert world_of(simulator) == f"CarlaSimulator {simulator.session.version}"
 
 
 def test_it_keeps_what_a_simulator_promises(port):

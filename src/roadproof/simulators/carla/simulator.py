@@ -94,6 +94,15 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         self._ground: tuple[str, CanvasPlacement, Ground] | None = None
 
     @property
+    def identity(self) -> str:
+        """The server's version: physics and pictures differ from one to the next.
+
+        Raises:
+            SimulatorError: the simulator is not entered.
+        """
+        return f"{CarlaSimulator.__name__} {self.session.version}"
+
+    @property
     def session(self) -> Session:
         """The connection.
 
