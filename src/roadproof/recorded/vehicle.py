@@ -10,7 +10,7 @@
 From one step to the next, dt seconds later,
 
     κ⁺ = a κ + b u + c u⁻ + k          u⁻ is the steer of the step before
-    v⁺ = v + dt (e t + f p + g + h v + j κ u v²)
+    v⁺ = v + dt (e t + f p + g + h v + j κ⁺ u v²)
     ψ⁺ = ψ + κ⁺ v̄ dt,   v̄ = (v + v⁺)/2
     P⁺ = P + v̄ dt (cos, sin)((ψ + ψ⁺)/2 + β),   β = l κ⁺ + m
 
@@ -214,9 +214,7 @@ class _Rows:
         curving = np.stack([kappa[before], u[now], u[before], one], 1)
         pull = np.diff(v)[now] / track.dt_s
         speed = v[now]
-        pulling = np.stack(
-            [throttle[now], brake[now] * (speed > 0.2), one, speed, kappa[before] * u[now] * speed**2], 1
-        )
+        pulling = np.stack([throttle[now], brake[now] * (speed > 0.2), one, speed, kappa[now] * u[now] * speed**2], 1)
         dx, dy = np.diff(track.x_m[rows])[now], np.diff(track.y_m[rows])[now]
         yaw = np.unwrap(track.yaw_rad[rows])
         middle = 0.5 * (yaw[1:] + yaw[:-1])[now]
@@ -293,11 +291,13 @@ def _fitted(
     """
     believed = np.asarray(prior)
     weights = _PRIOR_WEIGHT * (np.ones(len(believed)) if weight is None else np.asarray(weight))
+    # Where a law leaves nothing, the prior's own pull is no reason to doubt the few steps with a brake.
+    least = 1e-3 * float(np.abs(right).mean()) + 1e-9
     trust, found = np.ones(len(right)), believed
     for _ in range(_ROUNDS):
         rows = np.concatenate([left * trust[:, None], np.diag(weights)])
         found = np.linalg.lstsq(rows, np.concatenate([right * trust, weights * believed]), rcond=None)[0]
         off = np.abs(right - left @ found)
-        usual = 3.0 * float(np.median(off)) + 1e-9
+        usual = 3.0 * float(np.median(off)) + least
         trust = 1.0 / np.sqrt(1.0 + np.square(off / usual))
     return found
