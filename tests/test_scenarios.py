@@ -84,6 +84,7 @@ def test_what_a_file_leaves_out_has_the_usual_values(tmp_path: Path) -> None:
         ("x_m = 20.0, y_m = 0.0", "x_m = 20.0, y_m = 0.0, width_m = -2", "canvas is -2.0 m"),
         ('map_name = "town"', 'map_name = "../town.xodr"', "is not a plain name"),
         ("[[scenario]]", "[scenario]", "no [[scenario]]"),
+        ("[[scenario]]", "[[scenaro]]\nname = 'two'\n[[scenario]]", "an unknown key 'scenaro'"),
         ("goal_m", "goal_m =", "not valid TOML"),
     ],
 )

@@ -86,7 +86,7 @@ def identity(scenario: Scenario) -> dict[str, Any]:
         OSError: the file of the map cannot be read.
     """
     file = Path(scenario.map_name)
-    content = digest(file.read_bytes()) if file.is_file() else ""
+    content = digest(file.read_bytes()) if file.suffix == ".xodr" and file.is_file() else ""
     return asdict(scenario) | {"map_name": file.name, "map": content}
 
 
@@ -124,7 +124,10 @@ def load_scenarios(path: AnyPath) -> tuple[Scenario, ...]:
         ScenarioError: the file cannot be read, or an entry is not a valid scenario; the message names it.
     """
     path = as_path(path)
-    entries = read_toml(path, ScenarioError).get("scenario")
+    told = read_toml(path, ScenarioError)
+    entries = told.pop("scenario", None)
+    if told:
+        raise ScenarioError(f"scenarios {path} has an unknown key {next(iter(told))!r}, expected [[scenario]] alone")
     if not isinstance(entries, list) or not entries:
         raise ScenarioError(f"scenarios {path} has no [[scenario]], expected at least one")
     scenarios = [

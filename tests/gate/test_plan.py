@@ -1,6 +1,7 @@
 """A check's plan: every mistake is told before work begins."""
 
 import os
+import shlex
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from roadproof.errors import CheckError
 from roadproof.gate.plan import load_check
 from roadproof.gate.verdict import Kind
 from roadproof.patterns import save_pattern
+from roadproof.scenarios import builtin_scenarios, save_scenarios
 from team_folder import BAR, PLAN, write_team
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "check" / "check.toml"
@@ -23,8 +25,22 @@ def test_the_plan_of_the_docs_is_the_example_and_can_be_followed(tmp_path):
     found = load_check(tmp_path / "check.toml", budget="full")
     assert len(found.keys) == 5 * 2 * 5
     assert found.reference == tmp_path / "reference" / "full" / "check.json"
-    with pytest.raises(CheckError, match="no recording of left-03 at clear-noon"):
+    with pytest.raises(CheckError, match="no recording of left-03 at clear-noon") as refused:
         load_check(tmp_path / "check.toml")
+    assert "--scenarios" not in str(refused.value)
+
+
+def test_the_advice_for_a_missing_recording_names_the_file_of_scenarios(tmp_path):
+    save_scenarios(builtin_scenarios(), tmp_path / "own.toml")
+    text = EXAMPLE.read_text(encoding="utf-8").replace("# scenario_file", "scenario_file")
+    (tmp_path / "check.toml").write_text(text, encoding="utf-8")
+    save_pattern(BAR, tmp_path / "patterns" / "bar.json")
+    with pytest.raises(CheckError) as refused:
+        load_check(tmp_path / "check.toml")
+    advice = str(refused.value).partition("make one with: ")[2]
+    words = shlex.split(advice)
+    assert words[:3] == ["roadproof", "record", "left-03"]
+    assert words[words.index("--scenarios") :][:2] == ["--scenarios", str(tmp_path / "own.toml")]
 
 
 def plan(team, text):

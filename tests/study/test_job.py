@@ -137,20 +137,25 @@ def test_a_job_is_not_done_with_other_weights_than_it_is_known_by(tmp_path):
 
 
 @pytest.mark.slow
-def test_weights_that_are_written_again_while_a_job_runs_give_it_no_rows(street, tmp_path, monkeypatch):
-    weights = tmp_path / "own.safetensors"
+@pytest.mark.parametrize(
+    ("written", "told"), [("own.safetensors", "no longer those"), ("own.xodr", "has changed while the job ran")]
+)
+def test_files_that_are_written_again_while_a_job_runs_give_it_no_rows(street, tmp_path, monkeypatch, written, told):
+    weights, roads, again = tmp_path / "own.safetensors", tmp_path / "own.xodr", tmp_path / written
     shutil.copy(installed_weights("pilotnet"), weights)
-    job = job_of(GRADOPT, street, controller=str(weights), weights=weights_digest(str(weights)))
+    shutil.copy(street.map_name, roads)
+    here = dataclasses.replace(street, map_name=str(roads))
+    job = job_of(GRADOPT, here, controller=str(weights), weights=weights_digest(str(weights)))
     search = job_module.stress_test
 
     def meanwhile(*args, **options):
         found = search(*args, **options)
-        weights.write_bytes(weights.read_bytes() + b" ")
+        again.write_bytes(again.read_bytes() + b" ")
         return found
 
     assert run_job(job, tmp_path / "whole").rows
     monkeypatch.setattr(job_module, "stress_test", meanwhile)
-    with pytest.raises(StudyError, match="no longer those"):
+    with pytest.raises(StudyError, match=told):
         run_job(job, tmp_path / "job")
 
 

@@ -83,6 +83,7 @@ def recordings_of(
     scenarios: tuple[Scenario, ...],
     weathers: tuple[Weather, ...],
     controller: str,
+    scenario_file: Path | None,
 ) -> dict[tuple[str, Weather], Path]:
     """The run folder in which each scenario was recorded in each weather, by (scenario's name, weather).
 
@@ -91,7 +92,8 @@ def recordings_of(
         listed: the folders with runs, as the plan names them.
         scenarios: the scenarios that are driven.
         weathers: the weathers that each scenario is driven in.
-        controller: the controller's spec, for the advice where a recording is missing.
+        controller: the controller's spec, for the advice where a recording is missing; so is the next.
+        scenario_file: the file of these scenarios, where it is the user's own.
 
     Raises:
         CheckError: a recording is missing, not calibrated, or of another stretch of road, or a folder does not lie
@@ -114,17 +116,18 @@ def recordings_of(
     for scenario in scenarios:
         for weather in weathers:
             if (scenario.name, weather) not in found:
-                raise CheckError(_missing(folder, listed, scenario, weather, controller))
+                own = [] if scenario_file is None else ["--scenarios", str(scenario_file)]
+                raise CheckError(_missing(folder, listed, scenario, weather, [*own, "--driver", controller]))
     return found
 
 
-def _missing(folder: Path, listed: tuple[str, ...], scenario: Scenario, weather: Weather, controller: str) -> str:
+def _missing(folder: Path, listed: tuple[str, ...], scenario: Scenario, weather: Weather, given: list[str]) -> str:
     name, added = Path(listed[0] if listed else "recordings").as_posix(), ""
     if (folder / name / scenario.name).exists():
         # A run is of one weather, so that another has a folder of its own.
         name = f"{name}-{weather}"
         added = f"add {name!r} to recordings and "
     place = folder / name
-    words = ["record", scenario.name, "--weather", weather, "--driver", controller, "--out", str(place)]
+    words = ["record", scenario.name, "--weather", weather, *given, "--out", str(place)]
     made = [shlex.join(["roadproof", *each]) for each in (words, ["calibrate", str(place / scenario.name)])]
     return f"no recording of {scenario.name} at {weather}; {added}make one with: {'; '.join(made)}"

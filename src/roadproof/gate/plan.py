@@ -205,7 +205,7 @@ def _plan(stated: _Stated, folder: Path, budget: str | None) -> CheckPlan:
         paint=None if stated.paint is None else build(PaintLimits, stated.paint, "paint", CheckError),
         variation=None if stated.variation is None else build(Variation, stated.variation, "variation", CheckError),
         stored=stored_patterns(stated.patterns, folder, scenarios, known),
-        recordings=recordings_of(folder, smoke.recordings, scenarios, weathers, stated.controller)
+        recordings=recordings_of(folder, smoke.recordings, scenarios, weathers, stated.controller, own)
         if smoke is not None and chosen == "smoke"
         else {},
         simulator=full.simulator,

@@ -66,7 +66,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         RoadproofError: the simulator or controller is not there, its files are not those of the job, or a stage
             refuses; the message says why.
     """
-    _check_weights(job)
+    key = job.key
+    _check_files(job, key)
     controller = load_controller(job.controller)
     with open_simulator(job.simulator) as world:
         drives = isinstance(job.method, BlackBoxPlan) and job.method.where == "simulator"
@@ -83,7 +84,7 @@ def run_job(job: Job, scratch: Path) -> JobResult:
         for name, part in zip(PARTS, parts, strict=False):
             pictures |= passages(world, part, scratch / name, paint)
     # What was loaded lies between two looks at the files.
-    _check_weights(job)
+    _check_files(job, key)
     costs: CostColumns = {
         "search_calls": found.calls,
         "search_seconds": found.seconds,
@@ -103,8 +104,8 @@ def run_job(job: Job, scratch: Path) -> JobResult:
     return JobResult(rows, files | pictures)
 
 
-def _check_weights(job: Job) -> None:
-    """See that a controller's files are those that the job is known by; they may be written again while a study runs.
+def _check_files(job: Job, key: str) -> None:
+    """See that the files of controller and map are those of the job; they may be written again while a study runs.
 
     Raises:
         StudyError: they are others, or gone.
@@ -114,6 +115,8 @@ def _check_weights(job: Job) -> None:
             f"the files of {job.controller} are no longer those that the study began with; run it again for those of "
             "now, or put the old ones back"
         )
+    if job.key != key:
+        raise StudyError(f"the map {job.scenario.map_name} has changed while the job ran; run the study again")
 
 
 def space_of(job: Job) -> SearchSpace:
