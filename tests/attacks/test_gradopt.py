@@ -20,6 +20,7 @@ from roadproof.attacks import (
     Surrogate,
     attack,
     kept_attack,
+    methods,
 )
 from roadproof.attacks.checks import random_search
 from roadproof.attacks.gradopt import Rung, Search, dropping, gradopt
@@ -532,6 +533,17 @@ def test_the_published_steps_are_the_papers():
         (4, 50, 0.001, 1.0),
     ]
     assert Published().steps(SteeringShift()) == 250
+
+
+def test_a_published_search_tells_the_shift_of_a_frame_beside_its_sums(monkeypatch):
+    monkeypatch.setattr(Published, "ladder", property(lambda _: (methods._OnGrid(1, 3, 0.1, grid=10.0),)))
+    recordings, controller = recording_set(frames=3), pull_to_the_right()
+    found = attack(recordings, controller, SearchSpace(figures=2), method=Published(restarts=1))
+    frames = sum(len(drive.frames) for drive in RIGHT_GROUP.select(recordings))
+    best = {each.group: each.surrogate_shift for each in found.candidates}
+    assert frames > 1
+    assert best[str(RIGHT_GROUP)] == pytest.approx(found.by_group[str(RIGHT_GROUP)] / frames, rel=1e-4)
+    assert found.made_large == "steering shift, steer, summed over frames"
 
 
 def test_a_result_that_names_no_method_is_refused_in_one_line(tmp_path):

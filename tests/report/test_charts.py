@@ -67,7 +67,7 @@ def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drive
     drawn = [
         charts.offsets([("clear-noon", *drives)], SCENARIO.canvas),
         charts.steering(*drives, SCENARIO.canvas),
-        charts.search(np.zeros((5, 2, 3)), ["clean+right", "clean+left"], "path deviation"),
+        charts.search(np.zeros((5, 2, 3)), ["clean+right", "clean+left"], "path deviation, m", driven=False),
     ]
     for chart in drawn:
         assert not re.search(r"#0101", chart.svg)
@@ -80,7 +80,7 @@ def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drive
 
 def test_dollars_in_names_are_no_mathematics(tmp_path):
     name = r"$\foo$ of $x"
-    chart = charts.search(np.zeros((5, 1, 3)), [name], "path deviation")
+    chart = charts.search(np.zeros((5, 1, 3)), [name], "path deviation, m", driven=True)
     assert r"$\foo$ of $x" in chart.svg
     figure = Figure()
     figure.add_subplot().set_title(name)

@@ -10,6 +10,9 @@ import torch
 
 from browser import hindrances, opened, until
 from pages import HOSTILE, Page
+from roadproof.attacks import CMAES, AttackResult, Candidate
+from roadproof.attacks.driven import Effect
+from roadproof.attacks.result import Cost
 from roadproof.coverage import Shape
 from roadproof.driving.evaluation import load_paint
 from roadproof.driving.starts import StartOffset
@@ -202,6 +205,29 @@ def test_a_run_that_has_come_only_so_far_says_what_is_missing(tmp_path, stage):
     assert ("closed_loop" in content) == (stage == "evaluation")
     assert (content["surrogate"] is not None) == (stage == "attack")
     assert ("roadproof evaluate" in page.text) == (stage != "evaluation")
+
+
+def test_an_attack_in_a_simulator_is_driven_to_choose_and_not_predicted(tmp_path):
+    write_attack(tmp_path / "attack")
+    found, effect = AttackResult.load(tmp_path / "attack"), Effect(0.4, 1.25)
+    only = {"driven": effect, "surrogate_shift": None, "group": "all"}
+    dataclasses.replace(
+        found,
+        **only,
+        objective="path deviation",
+        by_group={"all": 1.25},
+        candidates=(Candidate(found.pattern, "all", driven=effect),),
+        cost=Cost(controller_frames=900, seconds=31.0, simulator_calls=21),
+        history=found.history[:, :1, :1],
+        method=CMAES(calls=20),
+    ).save(tmp_path / "attack")
+    page, content = report_of(tmp_path), read_result(tmp_path)
+    assert content["verdict"]["key"] == "chosen"
+    assert "deviate by 1.25 m" in content["verdict"]["sentence"]
+    assert content["surrogate"] is None and content["search"]["driven"]["deviation"] == 1.25
+    assert [row["simulator_calls"] for row in content["cost"]] == [21]
+    assert "Best path deviation, m in the drives that chose" in page.text
+    assert "Predict" not in page.text and "composited" not in page.text
 
 
 VERDICTS = {

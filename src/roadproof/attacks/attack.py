@@ -348,10 +348,12 @@ def _candidates(
         if isinstance(measure, DrivenMeasure):
             candidates.append(candidate(driven=measure.effect(pattern)))
             continue
-        if shifts is None or predicted is None:
-            candidates.append(candidate(float(search.best[group, restart])))
+        # A published value is a sum over frames, one of the user's own is no steering at all.
+        shift = float(search.best[group, restart] if shifts is None else shifts[group, restart])
+        if predicted is None:
+            candidates.append(candidate(shift))
             continue
-        shift, each = float(shifts[group, restart]), predicted[group, restart]
+        each = predicted[group, restart]
         mean, spread = float(each.mean()), (float(each.min()), float(each.max()))
         if isinstance(measure, SpeedMeasure):
             candidates.append(candidate(shift, predicted_mps=mean, predicted_range_mps=spread))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.method import Method
-from roadproof.attacks.methods import method_of, stored
+from roadproof.attacks.methods import Published, method_of, stored
 from roadproof.checks import Check
 from roadproof.driving.speed import speed_in_words, speeds_in_words
 from roadproof.errors import RoadproofError
@@ -24,6 +24,10 @@ from roadproof.io.records import Form, RecordFile, plain
 from roadproof.paint import Conspicuousness
 from roadproof.patterns import Pattern, load_pattern, raster, save_pattern
 from roadproof.search_space import SearchSpace
+
+_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m", "speed change": "predicted m/s"}
+_DRIVEN = {"steering shift": "steer, summed over the drives that chose", "path deviation": "m in the drives that chose"}
+_OWN = "its own unit"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -129,6 +133,15 @@ class AttackResult(Candidate):
     objective: str = "steering shift"
     conspicuousness: Conspicuousness | None = None
     made_of: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def made_large(self) -> str:
+        """What was made large, with the unit of its values: "path deviation, predicted m"."""
+        aim = self.objective.removesuffix(" over variations")
+        unit = (_UNITS if self.driven is None else _DRIVEN).get(aim, _OWN)
+        if isinstance(self.method, Published):
+            unit = "steer, summed over frames"
+        return f"{self.objective}, {unit}"
 
     def _repr_html_(self) -> str:
         """How a notebook shows it: the pattern, and what each kind of number says."""

@@ -205,8 +205,6 @@ def _less_paint(
 
 
 def _summarise(result: AttackResult, out: Path) -> None:
-    from roadproof.report.plots import in_units
-
     sides = ", ".join(f"{name} {value:+.3f}" for name, value in result.by_group.items())
     shift = f"{result.surrogate_shift:+.3f} steer a frame on recorded frames"
     if (predicted := result.predicted_with_spread) is not None:
@@ -215,7 +213,7 @@ def _summarise(result: AttackResult, out: Path) -> None:
         shift = f"{mean} predicted ({spread} over small errors{looks}), nothing was driven for real; {shift}"
     say(
         f"Strongest for {result.group}: {shift}",
-        f"Best of each group ({in_units(result.objective)}): {sides}",
+        f"Best of each group ({result.made_large}): {sides}",
         f"{result.space.figures} figures, {result.method.word}: {result.history.shape[2]} × {len(result.history)} last "
         f"steps; {result.cost.controller_frames} frames in {result.cost.seconds:.0f} s",
     )

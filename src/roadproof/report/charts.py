@@ -24,7 +24,7 @@ from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
 from roadproof.report.formatting import in_words
-from roadproof.report.plots import LINE_STYLES, draw_search, in_units, show_as_it_is
+from roadproof.report.plots import LINE_STYLES, draw_search, show_as_it_is
 from roadproof.roads.polylines import polyline_stations
 
 _NAMES = "ink muted rule clean painted predicted canvas third fourth asphalt kerb grass marking paper"
@@ -205,12 +205,20 @@ def predicted_path(prediction: Prediction, canvas: CanvasPlacement) -> Chart:
     return _finished(figure, axes, "predicted-path", words, columns=1)
 
 
-def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], objective: str) -> Chart:
-    """The search: every start thin, the best so far of each group bold."""
-    figure, axes = _axes("iteration", in_units(objective))
+def search(history: Float[np.ndarray, "i g r"], groups: Sequence[str], made_large: str, *, driven: bool) -> Chart:
+    """The search: every start thin, the best so far of each group bold.
+
+    Args:
+        history: the value at every iteration, of every group and start.
+        groups: the names of the groups.
+        made_large: the objective with its unit.
+        driven: whether the values are of drives in a simulator.
+    """
+    figure, axes = _axes("iteration", made_large)
     draw_search(axes, history, groups, SERIES, MUTED)
     _legend(axes, columns=1)
-    words = "What the search gained on composited frames, every start and the best of each group"
+    where = "in the drives that chose" if driven else "on composited frames"
+    words = f"What the search gained {where}, every start and the best of each group"
     return Chart(svg_of(figure, "search", words), words + ".")
 
 

@@ -114,8 +114,11 @@ def result_of(run: Run) -> Fields:
     if run.prediction is not None:
         content["prediction"] = {name: getattr(run.prediction, name) for name in PREDICTION}
     if run.attack is not None:
-        surrogate |= {"shift": run.attack.surrogate_shift}
         content["search"] = {"objective": run.attack.objective, "by_group": run.attack.by_group}
+        if run.attack.driven is None:
+            surrogate |= {"shift": run.attack.surrogate_shift}
+        else:
+            content["search"]["driven"] = asdict(run.attack.driven)
     if run.judged is not None and run.judged.fidelity is not None:
         surrogate |= {"agreement": asdict(run.judged.fidelity.agreement)}
     if run.cheapest is not None:
@@ -140,7 +143,12 @@ def _charts(run: Run) -> dict[str, charts.Chart | None]:
         drawn["steering"] = charts.steering(clean, painted, scenario.canvas, steps, compared)
         drawn["offsets"] = charts.offsets(judged.by_weather, scenario.canvas, steps)
     if run.attack is not None:
-        drawn["search"] = charts.search(run.attack.history, tuple(run.attack.by_group), run.attack.objective)
+        drawn["search"] = charts.search(
+            run.attack.history,
+            tuple(run.attack.by_group),
+            run.attack.made_large,
+            driven=run.attack.driven is not None,
+        )
     if run.prediction is not None:
         canvas = run.recordings and run.recordings.canvas
         drawn["predicted_path"] = None if canvas is None else charts.predicted_path(run.prediction, canvas)

@@ -16,7 +16,6 @@ from roadproof.io.files import write_atomically
 from roadproof.recordings import evenly
 
 LINE_STYLES = ("solid", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
-_UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m", "speed change": "predicted m/s"}
 _COLOURS = ("#0b6fa4", "#c8501e", "#3a7d44", "#7a4fa3")
 _INK = "#222222"
 _COLUMNS = 6
@@ -38,7 +37,7 @@ def draw_attack(result: AttackResult, shown: Sequence[ShownDrive], folder: Path)
     axes = figure.add_subplot()
     draw_search(axes, result.history, tuple(result.by_group), _COLOURS)
     axes.set_xlabel("iteration")
-    axes.set_ylabel(in_units(result.objective))
+    axes.set_ylabel(result.made_large)
     axes.legend(frameon=False)
     _finish(axes)
     save(figure, folder / "search.png")
@@ -66,11 +65,6 @@ def draw_search(
         label = f"best of {name}: {best[-1]:.2f}"
         axes.plot(steps, best, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=2.0, label=label)
     axes.axhline(0.0, color=ink, linewidth=0.6)
-
-
-def in_units(objective: str) -> str:
-    """The name of an objective with its unit, as an axis shows it."""
-    return f"{objective}, {_UNITS.get(objective.removesuffix(' over variations'), 'its own unit')}"
 
 
 def _film_strip(drive: ShownDrive) -> Figure:

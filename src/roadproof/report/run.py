@@ -136,7 +136,8 @@ class Run:
             calls = self.calibration.calls - recorded
             spent["calibrate"] = {"simulator_calls": calls, "seconds": self.calibration.seconds}
         if self.attack is not None:
-            spent["attack"] = {"simulator_calls": 0, "seconds": self.attack.cost.seconds}
+            cost = self.attack.cost
+            spent["attack"] = {"simulator_calls": cost.simulator_calls, "seconds": cost.seconds}
         if self.judged is not None:
             judged = self.judged.evaluation
             spent["evaluate"] = {"simulator_calls": judged.simulator_calls, "seconds": judged.seconds}

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from roadproof.attacks import AttackResult
+from roadproof.attacks.driven import Effect
 from roadproof.datatypes import Ending
 from roadproof.driving.evaluation import Evaluation
 from roadproof.driving.intervals import mean_95
@@ -25,7 +26,7 @@ class Verdict:
     """What came out of a run.
 
     Args:
-        key: "fails", "deviates", "holds", "unfit", "predicted" or "recorded".
+        key: "fails", "deviates", "holds", "unfit", "chosen", "predicted" or "recorded".
         title: the verdict in two or three words.
         sentence: the whole finding.
     """
@@ -49,6 +50,8 @@ def verdict(run: Run) -> Verdict:
         evaluation = run.judged.evaluation
         return _predicted_drives(evaluation) if evaluation.predicted else _driven(evaluation)
     if run.attack is not None:
+        if run.attack.driven is not None:
+            return Verdict("chosen", "Driven to choose, not judged", _chosen(run.attack.driven))
         driven = run.attack.predicted_m is not None or run.attack.predicted_mps is not None
         title = "Predicted, not driven" if driven else "Seen on composited frames, not driven"
         return Verdict("predicted", title, _predicted(run.attack))
@@ -70,6 +73,13 @@ def _predicted(attack: AttackResult) -> str:
     return (
         f"On composited frames the pattern shifts steering by {attack.surrogate_shift:+.3f} a frame "
         f"({attack.group}); nobody has driven over it yet."
+    )
+
+
+def _chosen(effect: Effect) -> str:
+    return (
+        f"In the drive that chose it the pattern makes the car deviate by {effect.deviation:.2f} m; what chose a "
+        "pattern does not say how bad it is: evaluate it from other starts."
     )
 
 
