@@ -102,6 +102,8 @@ def test_the_round_is_kept_that_leaves_its_lane_least_often_and_then_deviates_le
     told = [(2.0, 0.0), (0.1, 0.5), (0.3, 0.25), (0.2, 0.25)]
     rounds = [Round(number, {"near": metres}, left) for number, (metres, left) in enumerate(told)]
     assert best_of(rounds) == 3
+    lost = Round(4, {"near": 0.01}, 0.0, left_out=0.9)
+    assert best_of([*rounds, lost]) == 3
 
 
 def test_a_tuning_that_was_ended_after_its_weights_were_kept_leaves_nothing_else(town, tmp_path):

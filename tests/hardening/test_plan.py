@@ -38,13 +38,15 @@ def test_an_edited_training_step_is_another_hardening(tmp_path):
             require_same(tmp_path, "a hardening", parts[1], other, RoadproofError)
 
 
-@pytest.mark.parametrize("seed", [0, 999, MAX_SEED - 1000, MAX_SEED])
+@pytest.mark.parametrize("seed", [0, 6, 417, 999, MAX_SEED - 1000, MAX_SEED])
 def test_judging_has_a_seed_that_no_round_has_and_that_searches_take(tmp_path, seed):
     plan = HardeningPlan(
         spec="pilotnet", scenarios=(), folder=tmp_path, budget=HardeningBudget(), space=SPACE, seed=seed, device="cpu"
     )
     assert plan.judging_seed <= MAX_SEED
-    assert all(plan.seed_of(number) < plan.judging_seed for number in range(101))
+    rounds = [plan.seed_of(number) for number in range(101)]
+    assert max(rounds) < plan.judging_seed
+    assert len(set(rounds)) == 101, "each round attacks afresh"
 
 
 def test_a_street_that_is_named_twice_is_driven_over_once(tmp_path):

@@ -17,6 +17,10 @@ def drive(found_on, controller, deviation_m, scenario="left-01", **changed):
         "figures": "3",
         "method": "GradOpt",
         "seed": 0,
+        "weather": "clear-noon",
+        "start_right_m": 0.1,
+        "start_turned_rad": 0.02,
+        "start_faster_mps": 1.0,
         "deviation_m": deviation_m,
         "points": 2 * deviation_m,
     } | changed
@@ -51,6 +55,12 @@ def test_controllers_are_compared_over_the_patterns_that_all_of_them_drove():
     assert transfer_table(DataFrame([*DRIVES, *unjudged])) == transfer_table(DataFrame(DRIVES))
     with pytest.raises(StudyError, match="no pattern of the transfer was driven over by every controller"):
         transfer_table(DataFrame(unjudged))
+
+
+def test_controllers_are_compared_over_the_starts_that_all_of_them_drove_from():
+    # One that never came to the canvas from this start has no drive from there.
+    other = [drive("cil", "cil", 9.0, start_right_m=0.2), drive("cil", "robust", 9.0, start_right_m=0.2)]
+    assert transfer_table(DataFrame([*DRIVES, *other])) == transfer_table(DataFrame(DRIVES))
 
 
 def test_the_penalty_has_a_matrix_of_its_own():

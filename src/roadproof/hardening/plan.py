@@ -78,8 +78,14 @@ class HardeningPlan:
         return load_controller(self.spec_of(number), device=self.device)
 
     def seed_of(self, number: int) -> int:
-        """The seed of a round's attacks and of its tuning."""
-        return derived_seed(self.seed, number) % _FRESH
+        """The seed of a round's attacks and of its tuning, which no other round has."""
+        seeds: list[int] = []
+        for each in range(number + 1):
+            seed = derived_seed(self.seed, each) % _FRESH
+            while seed in seeds:
+                seed = (seed + 1) % _FRESH
+            seeds.append(seed)
+        return seeds[number]
 
     @property
     def judging_seed(self) -> int:

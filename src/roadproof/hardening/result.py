@@ -25,11 +25,19 @@ class Round:
         number: the round's number; 0 is the round before anything was learnt.
         deviation_m: mean deviation over the drives of each scenario's evaluation, metres, by the scenario's name.
         left_lane: share of all the evaluations' drives that leave their lane, 0 to 1.
+        left_out: share of the evaluations' planned drives that were not made, since without paint the car never came
+            to the canvas.
     """
 
     number: int
     deviation_m: dict[str, float]
     left_lane: float
+    left_out: float = 0.0
+
+    @property
+    def failed(self) -> float:
+        """Share of the planned drives that leave their lane, or whose car never comes to the canvas without paint."""
+        return self.left_out + (1.0 - self.left_out) * self.left_lane
 
     @property
     def mean_m(self) -> float:
@@ -42,12 +50,13 @@ class Round:
         trials = {test.evaluation.scenario.name: test.evaluation.of(ATTACK, traffic=False) for test in tests}
         left = [trial.leaves_lane for each in trials.values() for trial in each]
         deviations = {name: float(np.mean([trial.deviation_m for trial in each])) for name, each in trials.items()}
-        return Round(number, deviations, float(np.mean(left)))
+        lost = sum(test.evaluation.left_out for test in tests)
+        return Round(number, deviations, float(np.mean(left)), lost / (lost + len(left)))
 
 
 def best_of(rounds: Sequence[Round]) -> int:
-    """The number of the tuned round that leaves its lane least often; of equals, of the least mean deviation."""
-    return min(rounds[1:], key=lambda each: (each.left_lane, each.mean_m)).number
+    """The number of the tuned round that fails least often; of equals, of the least mean deviation."""
+    return min(rounds[1:], key=lambda each: (each.failed, each.mean_m)).number
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

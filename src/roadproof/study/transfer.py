@@ -15,6 +15,7 @@ from pathlib import Path
 
 from roadproof.controllers import Controller, load_controller
 from roadproof.driving.evaluate import evaluate
+from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError, ScenarioError, StudyError
 from roadproof.io.files import inside, write_atomically
 from roadproof.io.locks import working_in
@@ -32,7 +33,8 @@ class Transfer:
 
     Args:
         rows: a row for each pattern and drive of a controller, also of those that were tried before.
-        failures: a line for each pattern that a controller could not be judged on, with the controller and the reason.
+        failures: a line for each pattern that a controller could not be judged on, or not from all starts, with the
+            controller and the reason.
     """
 
     rows: Frame
@@ -73,9 +75,16 @@ def transfer(
         for spec, driver in drivers.items():
             for job in found:
                 try:
-                    rows += _rows(job, folder, world, spec, driver)
+                    evaluation = _evaluated(job, folder, world, spec, driver)
                 except RoadproofError as error:
                     failures.append(f"{spec}: {_named(job)}: {error}")
+                else:
+                    rows += _rows(job, spec, evaluation)
+                    if lost := evaluation.left_out:
+                        failures.append(
+                            f"{spec}: {_named(job)}: {lost} of {lost + len(evaluation.trials)} drives left out, since "
+                            "without paint the car never came to the canvas"
+                        )
                 done += 1
                 on_pattern(done, len(drivers) * len(found))
     if not rows:
@@ -93,9 +102,9 @@ def _named(job: Job) -> JobId:
     return JobId(job.scenario.name, str(job.figures), job.method.name, job.seed)
 
 
-def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> list[TransferRow]:
+def _evaluated(job: Job, folder: Path, world: Simulator, spec: str, driver: Controller) -> Evaluation:
     place = inside(folder / "transfer" / re.sub(r"[^\w.-]", "_", spec), job.scenario.name, "scenario", ScenarioError)
-    evaluation = evaluate(
+    return evaluate(
         world,
         driver,
         job.scenario,
@@ -108,6 +117,9 @@ def _rows(job: Job, folder: Path, world: Simulator, spec: str, driver: Controlle
         runs=0,
         seed=job.seed,
     )
+
+
+def _rows(job: Job, spec: str, evaluation: Evaluation) -> list[TransferRow]:
     return [
         TransferRow(**job_columns(job), found_on=job.controller, controller=spec, **drive_columns(trial))
         for trial in evaluation.trials

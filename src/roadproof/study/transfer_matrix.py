@@ -14,6 +14,9 @@ from roadproof.study.rows import Frame
 from roadproof.study.statistics import mean_over_scenarios
 from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
 
+START = ["weather", "start_right_m", "start_turned_rad", "start_faster_mps"]
+"""Columns that tell a drive over a pattern from others; rows of an older roadproof have none."""
+
 
 def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
     """The matrix with intervals; each controller's worst pattern source in bold, where there are several.
@@ -38,8 +41,8 @@ def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
         name=f"transfer-{slug(metric.title)}",
         title=f"Transfer: {metric.title.lower()} of patterns found against one controller, driven by another",
         note=f"{metric.title} in {metric.unit}, driven; means over "
-        f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} patterns a cell, those that all "
-        "controllers of its row drove, with 95 % bootstrap intervals over scenarios."
+        f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} patterns a cell, over the drives that "
+        "all controllers of its row made, with 95 % bootstrap intervals over scenarios."
         + (" The highest of each driver in bold." if several else "")
         + (f" {missing} pairs were not driven." if missing else ""),
         header=((Heading(""), Heading("driven by", len(driven_by))), headings("found on", *driven_by)),
@@ -71,7 +74,7 @@ def transfer_map(rows: Frame, metric: Metric = DEVIATION) -> Picture:
     return Picture(
         f"transfer-{slug(metric.title)}",
         f"{metric.title} in {metric.unit} of patterns found against one controller (rows) and driven by another "
-        "(columns), driven; means over the patterns that all controllers of a row drove.",
+        "(columns), driven; means over the drives that all controllers of a row made.",
         figure,
     )
 
@@ -79,7 +82,7 @@ def transfer_map(rows: Frame, metric: Metric = DEVIATION) -> Picture:
 def _matrix(rows: Frame, metric: Metric) -> Frame:
     """Means over patterns: a row for whom they were found against, a column for who drove; None where nobody.
 
-    All cells of a row are over the same patterns, those that every controller in it drove.
+    All cells of a row are over the same drives, those that every controller in it made.
     """
     if rows.empty:
         raise StudyError("the transfer has no rows; drive some patterns first")
@@ -89,12 +92,13 @@ def _matrix(rows: Frame, metric: Metric) -> Frame:
             raise StudyError(f"the transfer's rows have no column {column!r}; run the transfer again")
     check_names(rows, pairs)
     check_finite(rows, metric.column)
-    patterns = rows.groupby([*pairs, *JOB], sort=False)[metric.column].mean()
-    of_row = patterns.reset_index("controller").groupby("found_on")["controller"].transform("nunique")
-    by_all = patterns.groupby(level=["found_on", *JOB]).transform("size").to_numpy() == of_row.to_numpy()
+    of_row = rows.groupby("found_on")["controller"].transform("nunique")
+    drive = ["found_on", *JOB, *(column for column in START if column in rows)]
+    by_all = rows.groupby(drive)["controller"].transform("nunique") == of_row
     if not by_all.any():
         raise StudyError("no pattern of the transfer was driven over by every controller; run the transfer again")
-    means = patterns[by_all].reorder_levels([*JOB, *pairs]).groupby(level=pairs, sort=False).apply(mean_over_scenarios)
+    patterns = rows[by_all].groupby([*JOB, *pairs], sort=False)[metric.column].mean()
+    means = patterns.groupby(level=pairs, sort=False).apply(mean_over_scenarios)
     # Controllers that stand on both sides first and in one order, so that the diagonal is their own patterns.
     found, drivers = list(rows["found_on"].unique()), list(rows["controller"].unique())
     driven = [*(name for name in found if name in drivers), *(name for name in drivers if name not in found)]
