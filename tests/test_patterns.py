@@ -164,6 +164,13 @@ def test_files_that_are_missing_or_no_json_are_refused(tmp_path):
         load_pattern(tmp_path / "text.json")
 
 
+def test_the_figures_are_not_written_where_their_picture_goes(tmp_path):
+    pattern = Pattern((Shape.ELLIPSE,), torch.full((1, 5), 50.0), torch.rand(1, 3))
+    with pytest.raises(PatternError, match=r"x\.png is where the picture of a pattern goes"):
+        save_pattern(pattern, tmp_path / "x.png")
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):

@@ -212,9 +212,12 @@ def save_pattern(pattern: Pattern, path: AnyPath) -> None:
     """Write `path` (JSON: every figure by name and unit) and, beside it, its raster as PNG.
 
     Raises:
-        PatternError: the pattern is a batch, has values that are not finite, or a figure of it is not valid.
+        PatternError: the pattern is a batch, has values that are not finite, or a figure of it is not valid; or the
+            path ends in .png, where the picture goes.
         OutputError: the folder cannot be written.
     """
+    if as_path(path).suffix == ".png":
+        raise PatternError(f"{path} is where the picture of a pattern goes; give a path that ends in .json")
     path, picture = as_path(path), Image.fromarray(raster(pattern))
     boxes = cast("list[list[float]]", pattern.boxes.tolist())
     colours = cast("list[list[float]]", pattern.colours.tolist())

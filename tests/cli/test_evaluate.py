@@ -8,6 +8,7 @@ from command import answered, roadproof, stored
 from paint_shy import along_a_street, magenta
 from roadproof.driving.evaluation import Evaluation
 from roadproof.patterns import save_pattern
+from roadproof.pipeline.fidelity import Fidelity
 from roadproof.scenarios import save_scenarios
 
 needs.town()
@@ -69,6 +70,21 @@ def test_a_pattern_is_driven_over_filmed_judged_and_reported(workplace, tmp_path
     assert (other.returncode, other.stderr) == (0, "")
     shown = {path.name for path in (run / "evaluation").iterdir()}
     assert not shown & {"film.mp4", "film.jpg", "strip.npz", "fidelity.npz"}, "of the paint before"
+
+
+@pytest.mark.slow
+def test_composites_are_compared_with_renders_in_the_light_that_they_were_recorded_in(workplace, tmp_path):
+    own = ["--scenarios", "own.toml", "--controller", "paint_shy:paint_shy"]
+    recorded = ["street", "--weather", "clear-sunset", "--trajectories", "1", "--frames", "4", "--out", str(tmp_path)]
+    for words in (["record", *recorded, *own], ["calibrate", str(tmp_path), "--method", "pose"]):
+        done = roadproof(*words, folder=workplace)
+        assert done.returncode == 0, done.stderr
+    place, there = tmp_path / "evaluation", ["--scenario", "street", "--scenarios", "own.toml", "--no-film"]
+    compared = ["--recordings", str(tmp_path / "street" / "recordings"), "--out", str(place)]
+    done = roadproof("evaluate", "pattern.json", *there, *ONE_DRIVE, *compared, folder=workplace)
+    assert done.returncode == 0, done.stderr
+    # At noon, in which this evaluation drives, the paint is some 60 levels brighter.
+    assert Fidelity.load(place / "fidelity.npz").agreement.paint_error < 5.0
 
 
 MISTAKES = {

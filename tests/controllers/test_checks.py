@@ -8,7 +8,7 @@ from torch import nn
 
 from roadproof.controllers import CIL, ControllerReport, check_controller, pilotnet_controller
 from roadproof.datatypes import Control
-from roadproof.errors import ControllerError
+from roadproof.errors import ControllerError, DeviceError
 
 
 class Linear:
@@ -134,6 +134,19 @@ def test_a_controller_of_any_size_needs_a_size():
     with pytest.raises(ControllerError, match="any size"):
         check_controller(controller)
     assert check_controller(controller, size=(6, 8)).passed
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "told"),
+    [
+        ({"device": "foo"}, DeviceError, "foo"),
+        ({"size": (0, 0)}, ControllerError, r"size is \(0, 0\), expected a height and a width"),
+    ],
+)
+def test_no_device_and_no_size_are_told_in_one_line(given, error, told):
+    with pytest.raises(error, match=told) as refused:
+        check_controller(Linear(), **given)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_report_survives_its_file_and_shows_what_to_do(tmp_path):

@@ -14,7 +14,7 @@ from roadproof.errors import OutputError, RecordingError
 from roadproof.geometry import CanvasPlacement
 from roadproof.paint.site import LaneMark
 from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
-from roadproof.recordings import RecordingSet, Side, Track, load_recordings, pooled, save_recordings
+from roadproof.recordings import RecordingSet, Side, Track, evenly, load_recordings, pooled, save_recordings
 from scenes import recording, recording_set
 
 PER_FRAME = ("frames", "frame_number", "image_from_canvas", "speed_mps", "command", "steer")
@@ -484,3 +484,9 @@ def test_sets_are_pooled_only_where_the_canvas_lies_in_one_place():
     for other in (replace(CANVAS, x_m=31.0), None):
         with pytest.raises(RecordingError, match=r"the recordings rain place the canvas at .* but the first at"):
             pooled({"noon": here, "rain": replace(here, canvas=other)})
+
+
+def test_frames_are_kept_evenly_and_the_last_of_all():
+    assert evenly(10, 4).tolist() == [0, 3, 6, 9]
+    assert evenly(10, 1).tolist() == [9]
+    assert evenly(3, 40).tolist() == [0, 1, 2]

@@ -1,6 +1,6 @@
 """Recorded drives hold the expert's clean answers, can be filled up later, and are the same in every process."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -96,6 +96,20 @@ def test_a_folder_is_filled_up_and_processes_agree(tmp_path):
     assert again == first
     assert first[1].stat().st_mtime_ns == kept
     np.testing.assert_array_equal(Shard.load(again[0]).frames, frames[0])
+
+
+def test_a_folder_that_was_carried_elsewhere_goes_on_with_its_network(tmp_path):
+    def plan(folder):
+        return CollectionPlan(drives=1, seed=8, controller=str(folder / "network-0.safetensors"))
+
+    here, there = tmp_path / "here", tmp_path / "there"
+    (path,) = collect(CollectionPlan(drives=1, seed=8, disturbed=0.0, traffic=0.0), here)
+    shard = Shard.load(path)
+    replace(shard, about=shard.about | {"plan": asdict(plan(here))}).save(path)
+    here.rename(there)
+    assert collect(plan(there), there) == (there / path.name,)
+    with pytest.raises(TrainingError, match="another plan"):
+        collect(replace(plan(there), controller=str(there / "network-1.safetensors")), there)
 
 
 def test_drives_of_another_plan_are_not_taken_for_this_ones(tmp_path):

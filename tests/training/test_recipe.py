@@ -76,6 +76,10 @@ def test_a_recipe_may_start_from_weights(tmp_path):
     assert isinstance(network, CIL)
     assert network.width == 0.05
     assert not network.is_folded
+    with pytest.raises(TrainingError, match=r"width is 0.5, but start .* has 0.05; leave it out"):
+        Recipe(start=str(tmp_path / "start.safetensors"), width=0.5).fresh()
+    with pytest.raises(TrainingError, match="pilotnet has one width"):
+        Recipe(network="pilotnet", width=0.5)
     assert isinstance(Recipe(network="pilotnet", start="pilotnet").fresh(), ConditionalPilotNet)
     assert isinstance(Recipe(network="waypoint").fresh(), TrajectoryController)
 

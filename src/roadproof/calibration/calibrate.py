@@ -46,7 +46,7 @@ LEAST_SHARE = 0.5
 class CalibrationMethod(StrEnum):
     """How drives are calibrated.
 
-    two-paint: the canvas black, and black with grey squares, two replays a drive; homographies from its outline.
+    two-paint: the canvas white, and black with grey squares, two replays a drive; homographies from its outline.
     pose: the same paints; homographies from the camera model and the poses, unrefined.
     published: 12 replays a drive over coloured points, 22 of the clean drive over painted colours.
     """

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from roadproof.driving.evaluation import Evaluation
     from roadproof.patterns import Pattern
     from roadproof.pipeline.fidelity import Fidelity
+    from roadproof.recordings import RecordingSet
 
 _TOLD_MPS = 0.3
 """A mean change of the speed, m/s, that is worth a column: one kilometre an hour."""
@@ -134,11 +135,20 @@ def evaluate(
             film_drives(world, shown.start.of(driven), (shown.clean, shown.painted), paint, out)
         fidelity = None
         if recorded is not None and figures is not None and isinstance(who, Controller):
-            fidelity = measure_fidelity(world, who, driven, figures, recorded, out, weather=skies[0], device=device)
+            light = _light_of(recorded, skies[0])
+            fidelity = measure_fidelity(world, who, driven, figures, recorded, out, weather=light, device=device)
     keep_command(out)
     _summarise(evaluation, fidelity, out, compared=recorded is not None)
     surrogate = {} if fidelity is None else {"surrogate": {"agreement": asdict(fidelity.agreement)}}
     answer(stored(out / "evaluation.json") | surrogate)
+
+
+def _light_of(recorded: RecordingSet, otherwise: Weather) -> Weather:
+    """The weather that a set's clean drive was recorded in; another where it does not say."""
+    from roadproof.datatypes import Weather
+
+    drive = recorded.clean
+    return Weather(drive.weather) if drive is not None and drive.weather in {*Weather} else otherwise
 
 
 def _shown_in(out: Path) -> tuple[object, ...]:

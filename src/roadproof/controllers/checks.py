@@ -100,8 +100,12 @@ def check_controller(
         The report of all checks; what the controller does wrong stands in it and is never raised.
 
     Raises:
-        ControllerError: the controller takes frames of any size and `size` is not given.
+        ControllerError: the controller takes frames of any size and `size` is not given, or is no size.
+        DeviceError: there is no such device.
     """
+    device_of(device)
+    if size is not None and min(size) < 1:
+        raise ControllerError(f"size is {size}, expected a height and a width of 1 or more")
     try:
         missing = call("the controller's interface", missing_members, controller)
         own_size = None if missing else frame_size_of(cast("Controller", controller))

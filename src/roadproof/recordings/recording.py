@@ -261,5 +261,6 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, " f"]:
-    """Indices of at most `most` of `count` frames, evenly spread, the first and the last included."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+    """Indices of at most `most` of `count` frames, evenly spread, the first and the last included; of one, the last."""
+    first = 0 if most > 1 else count - 1
+    return np.unique(np.linspace(first, count - 1, min(most, count)).round().astype(int))

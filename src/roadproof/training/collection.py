@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -136,9 +136,15 @@ def _is_there(path: Path, plan: CollectionPlan, number: int) -> bool:
         return False
     about = Shard.about_of(path)
     made = about.get("plan")
-    if not isinstance(made, dict) or made | {"drives": plan.drives} != asdict(plan) or about.get("number") != number:
+    if not isinstance(made, dict) or _known(made) != _known(asdict(plan)) or about.get("number") != number:
         raise TrainingError(f"{path} is a drive of another plan, {made}; choose another folder")
     return True
+
+
+def _known(plan: Mapping[str, object]) -> dict[str, object]:
+    """What tells a plan's drives: not how many there are, nor where the network lies, since folders move."""
+    who = plan.get("controller")
+    return {**plan, "drives": 0, "controller": Path(who).name if isinstance(who, str) else who}
 
 
 def record_drive(town: TownSimulator, plan: CollectionPlan, number: int, controller: Controller | None) -> Shard:

@@ -6,7 +6,6 @@
     FOLDER/drives/round-1/ …      the network's own drives, with the expert's answers (DAgger)
     FOLDER/network-0.safetensors  what was learnt from the expert; network-1 … after each round
     FOLDER/NAME.safetensors       the last of them, in half the bytes
-    FOLDER/scores.json            how it drives the built-in scenarios
 
 A stage whose files are there is not repeated, so an interrupted run goes on, and a folder can be carried to another
 machine between stages.
@@ -59,7 +58,7 @@ class Recipe:
     Args:
         network: "cil", "pilotnet" for the conditional PilotNet, "waypoint" for the one that sees a path, or "temporal"
             for that with a memory.
-        width: factor on the channels and units of CIL.
+        width: factor on the channels and units of CIL; other networks have one width.
         seed: the seed of scenarios, traffic, disturbances, weights and batches.
         start: weights file, or name of a shipped controller, to go on from; None begins with fresh weights.
         drives: how many drives of the expert are recorded.
@@ -94,6 +93,8 @@ class Recipe:
         for name in ("painted_drives", "rounds"):
             if getattr(self, name) < 0:
                 raise TrainingError(f"{name} is {getattr(self, name)}, expected 0 or more")
+        if self.width != 1.0 and self.network != "cil":
+            raise TrainingError(f"width is {self.width:g}, but {self.network} has one width; leave it out")
         # Found out now rather than after an hour of driving.
         self.expert_plans()
         for number in range(self.rounds + 1):
@@ -117,6 +118,8 @@ class Recipe:
                 f"start {self.start} is a {type(begun).__name__}, network {self.network} a {type(fresh).__name__}; "
                 "give the network that it goes on with"
             )
+        if isinstance(begun, CIL) and self.width not in (1.0, begun.width):
+            raise TrainingError(f"width is {self.width:g}, but start {self.start} has {begun.width:g}; leave it out")
         return begun
 
     def weights_of_start(self) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import inspect
 import os
 import signal
 import textwrap
@@ -53,6 +54,12 @@ def left_behind(onlooker):
     world.wait_for_tick(30.0)
     world.wait_for_tick(30.0)
     return [actor.type_id for actor in world.get_actors()]
+
+
+def test_an_unknown_way_to_paint_is_refused():
+    with pytest.raises(SimulatorError, match="paint is 'nativ', expected one of"):
+        # The tests' own check of types would refuse it first.
+        inspect.unwrap(CarlaSimulator.__init__)(object.__new__(CarlaSimulator), paint="nativ")
 
 
 def test_a_server_is_known_by_its_version(simulator):

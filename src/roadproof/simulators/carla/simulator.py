@@ -6,6 +6,8 @@ map, so that the same scenario means the same on both. The server gives the car'
 
 from __future__ import annotations
 
+from typing import get_args
+
 from roadproof.datatypes import Control, Observation, Obstacle
 from roadproof.errors import RoadproofError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT, CameraModel, CanvasPlacement, CropResize
@@ -78,8 +80,10 @@ class CarlaSimulator(RouteSimulator[_Drive]):
         """Make a simulator; nothing is connected before it is entered.
 
         Raises:
-            SimulatorError: the crop leaves the camera picture, or the camera has a lens.
+            SimulatorError: the crop leaves the camera picture, the camera has a lens, or paint is none of the three.
         """
+        if paint not in get_args(PaintChoice):
+            raise SimulatorError(f"paint is {paint!r}, expected one of {', '.join(get_args(PaintChoice))}")
         if camera.lens is not None:
             raise SimulatorError(
                 f"CARLA renders through a pinhole and knows no {camera.lens.model} lens; give CarlaSimulator a camera "
