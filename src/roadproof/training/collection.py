@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -136,7 +136,8 @@ def _is_there(path: Path, plan: CollectionPlan, number: int) -> bool:
         return False
     about = Shard.about_of(path)
     made = about.get("plan")
-    if not isinstance(made, dict) or _known(made) != _known(asdict(plan)) or about.get("number") != number:
+    there = _known(cast("dict[str, object]", made)) if isinstance(made, dict) else None
+    if there != _known(asdict(plan)) or about.get("number") != number:
         raise TrainingError(f"{path} is a drive of another plan, {made}; choose another folder")
     return True
 
