@@ -200,6 +200,8 @@ def main() -> None:
     drawn = space.drawn(arguments.patterns, arguments.seed)
     patterns = [drawn[k] for k in range(arguments.patterns)]
     methods = [CalibrationMethod(name) for name in arguments.methods.split(",")]
+    if CalibrationMethod.POSE not in methods:
+        parser.error(f"--methods is {arguments.methods}, expected pose among them: it says where the paint is")
     records: list[dict[str, object]] = []
     with TownSimulator() as town:
         for weather in map(Weather, arguments.weathers.split(",")):
@@ -213,6 +215,7 @@ def main() -> None:
                     weather=weather,
                     trajectories=Trajectories(count=arguments.trajectories),
                     window=Window(frames=arguments.frames),
+                    seed=arguments.seed,
                     folder=keep / "record",
                     driver_name="expert",
                 )

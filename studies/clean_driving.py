@@ -4,7 +4,8 @@
 
 Every controller drives, closed loop: the 40 built-in scenarios in four weathers, alone; the same at clear noon with 20
 cars and 20 people; 40 random ways through the town it learnt in; and 40 through the second town, which it never saw. A
-drive is clean when it arrives in time without any event. Drives that OUT already holds are not repeated.
+drive is clean when it arrives in time without any event. Drives that OUT already holds are not repeated, unless a
+controller has other weights now.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from roadproof.controllers import shipped_names
 from roadproof.controllers.shipped import shipped_weights
 from roadproof.datatypes import Command, Weather
 from roadproof.io.files import write_json
+from roadproof.io.identity import digest
 from roadproof.machine import made_with
 from roadproof.roads.maps import load_map
 from roadproof.scenarios import Scenario, builtin_scenarios
@@ -101,8 +103,13 @@ def study(controllers: Sequence[str], names: Sequence[str], processes: int, out:
     begin = time.perf_counter()
     content: dict[str, Any] = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {"drives": {}}
     drives: dict[str, dict[str, dict[str, Any]]] = content["drives"]
+    weights: dict[str, str] = content.setdefault("weights", {})
     with Progress() as bar:
         for controller in controllers:
+            now = digest(shipped_weights(controller).read_bytes())[:16]
+            if weights.get(controller) != now:
+                drives.pop(controller, None)  # of other weights of this name
+                weights[controller] = now
             for name, wanted in conditions().items():
                 if name not in names:
                     continue
@@ -134,7 +141,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, required=True, help="file to write the numbers to, or to go on with")
     parser.add_argument("--controllers", nargs="+", default=list(shipped_names()), help="which; by default all")
-    parser.add_argument("--conditions", nargs="+", default=list(conditions()), help="which; by default all")
+    parser.add_argument(
+        "--conditions", nargs="+", choices=list(conditions()), default=list(conditions()), help="which; by default all"
+    )
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="simulators at once")
     options = parser.parse_args()
     study(options.controllers, options.conditions, options.processes, options.json)

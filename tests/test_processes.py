@@ -231,6 +231,13 @@ def test_what_a_piece_raises_comes_through_and_ends_the_others():
     assert time.monotonic() < begun + 45
 
 
+def test_what_cannot_travel_is_a_line_about_controllers():
+    with Pool(nullcontext, 2) as pool:
+        for travel in (lambda what: list(pool.each(what, [1])), pool.begin):
+            with pytest.raises(ControllerError, match="cannot travel to another process"):
+                travel(lambda _inside, number: number)
+
+
 def large_tensor(inside, number):
     del inside
     return torch.full((number,), 1.0)

@@ -13,11 +13,16 @@ MAX_PROCESSES = 256
 MANY = 1_000_000
 
 
+def is_whole(number: object) -> bool:
+    """Whether something is a whole number, of Python or numpy."""
+    return isinstance(number, Integral) and not isinstance(number, bool)
+
+
 def check_seed(seed: object, what: str, error: type[RoadproofError]) -> None:
     """See that a seed is a whole number in its range.
 
     Raises:
         error: it is none, or out of its range.
     """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= MAX_SEED:
+    if not isinstance(seed, Integral) or not is_whole(seed) or not 0 <= int(seed) <= MAX_SEED:
         raise error(f"{what} is {seed!r:.40}, expected a whole number from 0 to {MAX_SEED:,}")

@@ -104,7 +104,7 @@ class Pool(Generic[Inside]):
             function: as of `each`; what it raises is not told.
         """
         if self.processes > 1:
-            travelled = _pickled_for_the_processor(function)
+            travelled = _travelling(function)
             for process in self._beside:
                 process.submit(_call, travelled, None)
 
@@ -161,6 +161,7 @@ class Pool(Generic[Inside]):
 
         Raises:
             SimulatorError: a process died.
+            ControllerError: something in the function cannot be pickled.
         """
         known = isinstance(function, Settled)
         settled = cast("Settled[Inside, Work, Result]", function) if known else Settled(function, None)
@@ -169,7 +170,7 @@ class Pool(Generic[Inside]):
             for work in works:
                 yield work, asked(self._here, work)
             return
-        call = partial(_call, file or _pickled_for_the_processor(asked))
+        call = partial(_call, file or _travelling(asked))
         left = _Left(works, alike)
         try:
             free = self._beside if file is None else self._beside * -(-len(works) // self.processes)
@@ -348,6 +349,14 @@ _opens: Opens[Any] | None = None
 _opened = ExitStack()
 _stop: Event | None = None
 _folder: Path | None = None
+
+
+def _travelling(function: Callable[..., object]) -> bytes:
+    """A function as it travels to a process, with whatever controller is in it."""
+    try:
+        return _pickled_for_the_processor(function)
+    except Exception as error:  # of a user's controller
+        raise ControllerError(f"a controller cannot travel to another process: {error}; {_PICKLED}") from error
 
 
 def _begin_work(opens: Opens[Any], stop: Event, threads: int, folder: Path) -> None:

@@ -83,6 +83,9 @@ def test_composites_are_compared_with_renders_in_the_light_that_they_were_record
     compared = ["--recordings", str(tmp_path / "street" / "recordings"), "--out", str(place)]
     done = roadproof("evaluate", "pattern.json", *there, *ONE_DRIVE, *compared, folder=workplace)
     assert done.returncode == 0, done.stderr
+    blind = ["--controller", "expert", *there, *ONE_DRIVE[:-2], *compared]
+    done = roadproof("evaluate", "pattern.json", *blind, folder=workplace)
+    assert (done.returncode, "expert looks at none; leave it out" in done.stderr) == (2, True)
     # At noon, in which this evaluation drives, the paint is some 60 levels brighter.
     assert Fidelity.load(place / "fidelity.npz").agreement.paint_error < 5.0
 

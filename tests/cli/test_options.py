@@ -33,6 +33,17 @@ REFUSED = [
 ]
 
 
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [("", "is empty"), ("o\udcff", r"is 'o\udcff'"), ("a\nb", r"is 'a\nb'")],
+    ids=["none", "raw", "line"],
+)
+def test_a_word_that_cannot_be_shown_again_is_refused_before_any_work(invoke, word, said):
+    code, printed = invoke("record", "left-03", "--out", word)
+    assert code == 2
+    assert f"a word of the command {said}, expected letters and signs" in printed.err
+
+
 @pytest.mark.parametrize(("words", "said"), REFUSED, ids=[" ".join(words[-2:])[:40] for words, _ in REFUSED])
 def test_a_number_out_of_range_is_one_line(invoke, words, said):
     code, printed = invoke(*words)

@@ -1,5 +1,6 @@
 """Recording in the town: what is kept, how far drives go astray, and going on after an interruption."""
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -9,7 +10,7 @@ import needs
 from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window, record, record_along
-from roadproof.drives.folder import write_settings
+from roadproof.drives.folder import read_settings, write_settings
 from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.homographies import apply_homography
@@ -65,7 +66,11 @@ def test_a_recording_knows_a_map_by_what_is_in_it_wherever_it_lies(drives, tmp_p
     own = tmp_path / "own.xodr"
     own.write_text("<OpenDRIVE/>")
     settings = dataclasses.replace(drives.settings, scenario=dataclasses.replace(LEFT, map_name=str(own)))
-    assert write_settings(settings, tmp_path / "record")
+    with contextlib.chdir(tmp_path):
+        near = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name="own.xodr"))
+        assert write_settings(near, tmp_path / "record")
+    assert read_settings(tmp_path / "record").scenario.map_name == str(own), "found from everywhere"
+    assert not write_settings(settings, tmp_path / "record")
     moved = own.rename(tmp_path / "record" / "own.xodr")
     settings = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name=str(moved)))
     assert not write_settings(settings, tmp_path / "record")

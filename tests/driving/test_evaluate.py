@@ -4,6 +4,8 @@ import dataclasses
 import functools
 import json
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,11 +25,13 @@ from roadproof.driving.rollout import rollout
 from roadproof.driving.starts import StartPlan, StartRange
 from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
+from roadproof.roads.maps import builtin_map_file
 from roadproof.scenarios import find_scenario, identity
 
 needs.town()
 from roadproof.simulators.protocol import world_of
 from roadproof.simulators.town.simulator import TownSimulator
+from runs import write_evaluation
 
 MAGENTA = magenta(380.0)
 WEATHERS = (Weather.CLEAR_NOON, Weather.CLOUDY_NOON)
@@ -396,3 +400,13 @@ def test_a_damaged_evaluation_is_refused_by_name(done, tmp_path, message):
     path.write_text(DAMAGE[message](path.read_text()))
     with pytest.raises(EpisodeError, match=message):
         Evaluation.load(tmp_path)
+
+
+def test_an_evaluation_on_a_map_of_any_name_can_be_read_again(tmp_path):
+    own = tmp_path / "O'Hare.xodr"
+    shutil.copy(builtin_map_file("town"), own)
+    write_evaluation(
+        tmp_path / "run", scenario=dataclasses.replace(find_scenario("left-03"), map_name=str(own)), runs=0
+    )
+    found = Evaluation.load(tmp_path / "run")
+    assert Path(found.scenario.map_name).read_bytes() == own.read_bytes()

@@ -285,6 +285,13 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     assert (code, said.out) == (2, "")
     assert "runs what its author wrote" in said.err
     assert not any(path.exists() for path in left)
+    # What nobody's check has left is nobody's to take away.
+    own = tmp_path / "own" / "summary.md"
+    own.parent.mkdir()
+    own.write_text("mine")
+    code, said = invoke(*command[:2], "--out", own.parent)
+    assert (code, own.read_text()) == (2, "mine")
+    assert "is no check's, without drives beside it" in said.err
     code, said = invoke(*command, "--accept")
     assert code == 2
     assert "names none; add [change]" in said.err

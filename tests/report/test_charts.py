@@ -78,6 +78,14 @@ def test_a_chart_has_no_colour_of_its_own_and_the_page_has_all_it_asks_for(drive
         assert not re.search(r'<svg[^>]* (width|height)="', chart.svg), "as wide as the page allows"
 
 
+def test_lines_of_many_runs_look_different_and_all_are_in_the_legend(drives):
+    names = ["_before", "run-2", "c", "d", "e", "f", "g", "h"]
+    chart = charts.offsets([(name, *drives) for name in names], SCENARIO.canvas)
+    assert {"_before", "run-2"} <= {text.strip() for text in re.findall(r"<text[^>]*>([^<]*)</text>", chart.svg)}
+    looks = re.findall(r'style="fill: none; (stroke[^"]*stroke-width: 1\.8[^"]*)"', chart.svg)
+    assert len(set(looks)) == len(names)
+
+
 def test_dollars_in_names_are_no_mathematics(tmp_path):
     name = r"$\foo$ of $x"
     chart = charts.search(np.zeros((5, 1, 3)), [name], "path deviation, m", driven=True)

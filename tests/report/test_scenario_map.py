@@ -71,5 +71,8 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
         draw_scenarios([], load_map("town"), tmp_path / "map.png")
     with pytest.raises(ScenarioError, match="straight-01"):
         draw_scenarios(builtin_scenarios(), load_map("second"), tmp_path / "map.png")
-    with pytest.raises(OutputError, match=r"cannot be drawn to .*map\.picture"):
-        draw_scenarios(builtin_scenarios(), load_map("town"), tmp_path / "map.picture")
+    for name in ("map.picture", "map.pgf", "map"):
+        with pytest.raises(
+            OutputError, match=rf"cannot be drawn to .*{name}, expected a name that ends in one of .png"
+        ):
+            draw_scenarios(builtin_scenarios(), load_map("town"), tmp_path / name)

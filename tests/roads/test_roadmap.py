@@ -261,6 +261,24 @@ def test_a_road_goes_on_into_the_next(tmp_path: Path) -> None:
     assert back_home.length_m == pytest.approx(70.0)
 
 
+@pytest.mark.parametrize("gap_m", [0.4, -0.4])
+def test_a_route_ends_at_its_goal_where_lanes_do_not_quite_meet(tmp_path: Path, gap_m: float) -> None:
+    def link(number: int) -> str:
+        after = f'<successor elementType="road" elementId="{number + 1}" contactPoint="start"/>'
+        before = f'<predecessor elementType="road" elementId="{number - 1}" contactPoint="end"/>'
+        return before * (number > 1) + after * (number < 8)
+
+    road_map = loaded(tmp_path, *(street(k, (k - 1) * (40.0 + gap_m), link=link(k)) for k in range(1, 9)))
+    goal = 7 * (40.0 + gap_m) + 30.0
+    route = road_map.route(VehicleState(5.0, -1.75, 0.0, 0.0, 0.0), (goal, -1.75))
+    assert route.points[-1, :2] == pytest.approx((goal, -1.75), abs=0.01)
+
+
+def test_a_map_without_a_way_to_go_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match="no lane of type driving"):
+        loaded(tmp_path, street(1, 0.0).replace('length="40"', 'length="1e-7"'))
+
+
 def test_a_route_keeps_to_driving_lanes(tmp_path: Path) -> None:
     roads = [
         street(1, 0.0, link='<successor elementType="road" elementId="2" contactPoint="start"/>'),

@@ -192,7 +192,7 @@ def test_what_cannot_be_is_refused() -> None:
     road_map = load_map("town")
     with pytest.raises(SimulatorError, match="-1 cars were asked for"):
         Traffic(road_map, cars=-1, pedestrians=0, seed=0, ego=PARKED)
-    with pytest.raises(SimulatorError, match="the seed of the traffic is -1, expected 0 or more"):
+    with pytest.raises(SimulatorError, match="the seed of the traffic is -1, expected a whole number, 0 or more"):
         Traffic(road_map, cars=1, pedestrians=0, seed=-1, ego=PARKED)
     with pytest.raises(SimulatorError, match="5000 cars do not fit"):
         Traffic(road_map, cars=5000, pedestrians=0, seed=0, ego=PARKED)

@@ -41,7 +41,8 @@ def calibrate(
     if not runs:
         raise RecordingError(f"{folder} holds no run with a folder named record; make one with `roadproof record`")
     recorded = {path: Drives.load(path / "record") for path in runs}
-    hold(folder)
+    for place in dict.fromkeys((folder, *runs)):
+        hold(place)
 
     for path, drives in recorded.items():
         done = Calibrated.kept(path, drives, how)

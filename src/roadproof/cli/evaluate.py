@@ -101,6 +101,8 @@ def evaluate(
     if recorded is not None and recorded.canvas is not None and where.scenario is not None:
         check_recorded_canvas(where.scenario.canvas, recorded.canvas)
     who = options.driver_of(controller, device)
+    if recorded is not None and not isinstance(who, Controller):
+        raise RoadproofError(f"--recordings compares answers to pictures, but {controller} looks at none; leave it out")
     runs = 10 if runs is None else runs
     if runs and not cars + pedestrians:
         raise RoadproofError(f"--runs is {runs}, but --cars and --pedestrians are 0; ask for some, or for 0 runs")

@@ -7,6 +7,8 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from roadproof.errors import RoadproofError
+
 SEVERAL = {
     "albedo": "DARKEST BRIGHTEST",
     "contrast": "LEAST MOST",
@@ -40,6 +42,10 @@ def _plain(options: list[Any]) -> list[Any]:
 class _Verb(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401  # as below
         global _words
+        for word in args:
+            if not word or not word.isprintable():
+                what = "empty" if not word else f"{word!r:.60}"
+                raise RoadproofError(f"a word of the command is {what}, expected letters and signs that can be shown")
         _words = ("roadproof", *ctx.command_path.split()[1:], *args)
         return super().parse_args(ctx, args)
 

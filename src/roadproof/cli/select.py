@@ -12,6 +12,7 @@ from roadproof.cli.verbs import keep_command
 
 if TYPE_CHECKING:
     from roadproof.attacks import AttackResult, Candidate
+    from roadproof.patterns import Pattern
     from roadproof.pipeline.selection import Selection
 
 
@@ -63,13 +64,25 @@ def select(
             on_drive=show,
         )
     keep_command(run / "selection")
-    before = (run / "pattern.json").read_bytes() if (run / "pattern.json").exists() else b""
-    save_pattern(selection.pattern, run / "pattern.json")
-    if (run / "pattern.json").read_bytes() != before:
+    if not _is_in(run / "pattern.json", selection.pattern):
         # It is of another pattern; the stress test makes it again.
         (run / "prediction.npz").unlink(missing_ok=True)
+    save_pattern(selection.pattern, run / "pattern.json")
     _summarise(selection, found, run)
     answer(stored(run / "selection" / "selection.json"))
+
+
+def _is_in(path: Path, pattern: Pattern) -> bool:
+    """Whether a file holds this pattern."""
+    from roadproof.errors import PatternError
+    from roadproof.io.identity import stated
+    from roadproof.io.known import known_by
+    from roadproof.patterns import load_pattern
+
+    try:
+        return stated(known_by(load_pattern(path))) == stated(known_by(pattern))
+    except PatternError:
+        return False
 
 
 def _summarise(selection: Selection, found: AttackResult, run: Path) -> None:

@@ -9,7 +9,7 @@ A drive's folder is there when the drive is finished. Nothing is pickled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
@@ -208,6 +208,10 @@ def write_settings(settings: Settings, folder: Path) -> bool:
         now = _SETTINGS.stated(settings) | {"scenario": scenario}
         require_same(folder, "a recording", before, now, RecordingError)
         return False
+    if scenario["map"]:
+        # Whoever goes on with it may stand elsewhere.
+        place = str(Path(settings.scenario.map_name).resolve())
+        settings = replace(settings, scenario=replace(settings.scenario, map_name=place))
     _SETTINGS.write(path, settings, **({"map": scenario["map"]} if scenario["map"] else {}))
     return True
 

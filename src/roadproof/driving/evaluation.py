@@ -26,7 +26,7 @@ from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
 from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.io.files import AnyPath, as_path, write_atomically
+from roadproof.io.files import AnyPath, as_path, is_plain_name, write_atomically
 from roadproof.io.html import table
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
@@ -270,8 +270,10 @@ def _save_scenario(scenario: Scenario, folder: Path) -> None:
     """Write the scenario, and its map if that is a file."""
     source = Path(scenario.map_name)
     if source.suffix == ".xodr" and source.resolve().parent != folder.resolve():
-        write_atomically(folder / source.name, lambda part: shutil.copyfile(source, part))
-        scenario = replace(scenario, map_name=str(folder / source.name))
+        # Names in files are plain ones; a user's map may have any.
+        own = folder / (source.name if is_plain_name(source.name) else "map.xodr")
+        write_atomically(own, lambda part: shutil.copyfile(source, part))
+        scenario = replace(scenario, map_name=str(own))
     save_scenarios([scenario], folder / "scenario.toml")
 
 

@@ -50,7 +50,7 @@ from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, begun_in
 
 SUMMARY = "summary.md"
-PATTERNS = "patterns"
+PATTERNS, DRIVES = "patterns", "drives"
 OUTPUTS = (FILE, "junit.xml", SUMMARY, WORST)
 
 
@@ -118,15 +118,19 @@ def clear(folder: Path, references: Path | None) -> None:
         references: the folder in which the plan keeps its references; None where it names none.
 
     Raises:
-        CheckError: the folder is one for references, or holds a result that no check left there.
+        CheckError: the folder is one for references, or holds a result, or files of such names, that no check left
+            there.
     """
     named = references is not None and folder.resolve().parent == references.resolve()
     # A check leaves its result beside its summary; a result alone is one that somebody keeps, whatever a plan says.
     if named or ((folder / FILE).is_file() and not (folder / SUMMARY).is_file()):
         whose = "kept for a reference of the plan" if named else f"no check's own, without {SUMMARY} beside it"
         raise CheckError(f"{folder / FILE} is {whose}; choose another folder for the results")
-    for name in OUTPUTS:
-        (folder / name).unlink(missing_ok=True)
+    found = [folder / name for name in OUTPUTS if (folder / name).exists()]
+    if found and not (folder / DRIVES).is_dir():
+        raise CheckError(f"{found[0]} is no check's, without {DRIVES} beside it; choose another folder for the results")
+    for path in found:
+        path.unlink()
 
 
 def _keep_apart(folder: Path, plan: CheckPlan) -> None:
@@ -170,7 +174,7 @@ class _Check:
             if attacks:
                 paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
             images = {paint.name: raster(paint.pattern) for paint in paints}
-            drives = self.folder / "drives" / scenario.name
+            drives = self.folder / DRIVES / scenario.name
             episodes = Episodes.of(world, self.controller, scenario, images, drives)
             stretch = Stretch(plan=plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
             told = {
@@ -257,7 +261,7 @@ class _Check:
             return None
         case, worst = max(wrong or painted, key=lambda each: each[1].deviation_m)
         place = next(p for p in places if p.scenario.name == case.scenario and case.weather in p.weathers)
-        drives = self.folder / "drives" / case.scenario
+        drives = self.folder / DRIVES / case.scenario
         paint = read_paint(Path(worst.paint))
         with place.factory() as world:
             start = worst.start.of(begun_in(world, place.scenario))

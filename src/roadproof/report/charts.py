@@ -18,6 +18,7 @@ from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from roadproof.datatypes import Weather
 from roadproof.driving.deviation import HORIZON_M, Path2D, beside_m, lateral_m, path_of
 from roadproof.driving.episode import Episode
 from roadproof.geometry import CanvasPlacement
@@ -171,19 +172,24 @@ def offsets(
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     names = list(dict.fromkeys(name for name, _, _ in drives))
     width = 1.8 if len(drives) == len(names) else 1.1
-    labels = {name: in_words(name) for name in names}
+    labels = {name: in_words(name) if name in {*Weather} else _in_legend(name) for name in names}
     marks: list[Mark] = []
     for name, clean, painted in drives:
         beside = -beside_m(clean, painted)
         k, label = names.index(name), labels.pop(name, None)
         where, colour = metres_past(path_of(painted), canvas)[: len(beside)], SERIES[k % len(SERIES)]
-        axes.plot(where, beside, color=colour, linestyle=LINE_STYLES[k % 4], linewidth=width, label=label)
+        axes.plot(where, beside, color=colour, linestyle=LINE_STYLES[(k + k // 4) % 4], linewidth=width, label=label)
         if not marks:
             shown = np.minimum(steps, len(beside) - 1)
             marks = [Mark("painted", np.stack([where[shown], beside[shown]], 1))]
     predicted = any(painted.paint.predicted for _, _, painted in drives)
     words = f"Distance from the clean path along the drive, alone on the road{', predicted' if predicted else ''}"
     return _finished(figure, axes, "offsets", words, marks=marks)
+
+
+def _in_legend(name: str) -> str:
+    """A run's name for a legend, which would leave out one that begins with "_"."""
+    return f" {name}" if name.startswith("_") else name
 
 
 def predicted_path(prediction: Prediction, canvas: CanvasPlacement) -> Chart:

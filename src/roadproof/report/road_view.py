@@ -19,7 +19,7 @@ from PIL import Image
 from roadproof.errors import ScenarioError
 from roadproof.geometry import CanvasPlacement
 from roadproof.roads.maps import load_map
-from roadproof.roads.roadmap import RoadMap
+from roadproof.roads.roadmap import SURFACE_OF_KIND, RoadMap, Surface
 from roadproof.simulators.protocol import PatternImage
 
 ASPHALT = (92, 94, 98)
@@ -107,15 +107,17 @@ def draw_road(axes: Axes, road: RoadMap, around: Callable[[Points], Points], box
         ground: the colours of the road.
     """
     left, low, right, high = box
-    colours = {"sidewalk": ground.sidewalk, "shoulder": ground.shoulder or ground.asphalt, "driving": ground.asphalt}
+    beside = ground.shoulder or ground.asphalt
+    colours = {Surface.SIDEWALK: ground.sidewalk, Surface.SHOULDER: beside, Surface.DRIVING: ground.asphalt}
 
     def inside(points: Points) -> bool:
         outside = (points.max(0) < (left, low)) | (points.min(0) > (right, high))
         return not bool(outside.any())
 
-    for kind, colour in colours.items():
-        outlines = [np.concatenate([lane.left, lane.right[::-1]])[:, :2] for lane in road.lanes if lane.kind == kind]
-        if kind == "driving":
+    for surface, colour in colours.items():
+        lanes = [lane for lane in road.lanes if SURFACE_OF_KIND.get(lane.kind) is surface]
+        outlines = [np.concatenate([lane.left, lane.right[::-1]])[:, :2] for lane in lanes]
+        if surface is Surface.DRIVING:
             outlines += [area.outline[:, :2] for area in road.junctions]
         shapes = [plan for plan in map(around, outlines) if inside(plan)]
         axes.add_collection(PolyCollection(shapes, facecolors=colour, edgecolors=colour, linewidths=0.4))

@@ -20,6 +20,7 @@ from roadproof.scenarios import Scenario
 COLOURS = {"straight": "#2166ac", "left": "#b2182b", "right": "#1b7837"}
 WIDTH_IN, DPI = 13.0, 110
 MARGIN_M = 15.0
+FORMATS = (".png", ".jpg", ".svg", ".pdf")
 
 SHORT = 4
 """A name of more characters reaches back to its start, or out of the map, from where a short one stands beside it."""
@@ -34,6 +35,10 @@ def draw_scenarios(scenarios: Sequence[Scenario], road_map: RoadMap, path: Path)
     """
     if not scenarios:
         raise ScenarioError("there is no scenario to draw, expected at least one")
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(
+            f"the map cannot be drawn to {path}, expected a name that ends in one of {', '.join(FORMATS)}"
+        )
     routes = [scenario_route(scenario, road_map) for scenario in scenarios]
     x0, y0, x1, y1 = road_map.bounds_m
     box = (x0 - MARGIN_M, y0 - MARGIN_M, x1 + MARGIN_M, y1 + MARGIN_M)

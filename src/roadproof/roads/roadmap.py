@@ -22,7 +22,7 @@ from roadproof.roads.junctions import Corner, JunctionArea, junction_areas, tria
 from roadproof.roads.lanes import Lane, MarkLine, build_lanes
 from roadproof.roads.opendrive import read_opendrive
 from roadproof.roads.routes import Route, route_along, shortest_path
-from roadproof.roads.spatial import SegmentIndex, TriangleIndex
+from roadproof.roads.spatial import SHORTEST_M, SegmentIndex, TriangleIndex
 
 MAX_EXTENT_M = 5000.0
 HEADING_WEIGHT_M = 2.0
@@ -83,7 +83,7 @@ class RoadMap:
         self.mark_lines = mark_lines
         self.junctions = junctions
         self._driving = np.array([lane.index for lane in lanes if lane.kind == "driving"], dtype=np.intp)
-        if len(self._driving) == 0:
+        if not any(lanes[index].length_m > SHORTEST_M for index in self._driving):
             raise ScenarioError("the map has no lane of type driving, expected at least one")
         everything = np.concatenate([line[:, :2] for lane in lanes for line in (lane.left, lane.right)])
         (x0, y0), (x1, y1) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()

@@ -6,6 +6,7 @@ import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,6 +19,7 @@ from roadproof.roads.polylines import interpolated, polyline_stations
 SPACING_M = 0.5
 COMMAND_LEAD_M = 20.0
 TURN_RAD = math.radians(35.0)
+_APART_M = 1e-4  # nearer points are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,16 +145,16 @@ def shortest_path(lanes: Sequence[Lane], start: tuple[int, float], goal: tuple[i
 def route_along(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, to_m: float) -> Route:
     """The route along consecutive lanes, from an arc length of the first to one of the last."""
     centre = np.concatenate([lanes[index].centre for index in way])
-    keep = np.concatenate([[True], np.linalg.norm(np.diff(centre, axis=0), axis=1) > 1e-4])
+    keep = np.concatenate([[True], np.linalg.norm(np.diff(centre, axis=0), axis=1) > _APART_M])
     centre = centre[keep]
     stations = polyline_stations(centre)
-    total = sum(lanes[index].length_m for index in way)
-    end_m = max(total - lanes[way[-1]].length_m + to_m, from_m + SPACING_M)
+    ends = _ends(lanes, way)
+    end_m = max(float(ends[-1]) - lanes[way[-1]].length_m + to_m, from_m + SPACING_M)
     count = max(1, math.ceil((end_m - from_m) / SPACING_M)) + 1
     at = np.linspace(from_m, end_m, count)
     points = interpolated(at, stations, centre)
     along = np.gradient(points[:, :2], axis=0)
-    crossings = _crossings(lanes, way, from_m, end_m)
+    crossings = _crossings(lanes, way, ends, from_m, end_m)
     return Route(
         points=points,
         headings_rad=np.unwrap(np.arctan2(along[:, 1], along[:, 0])),
@@ -162,8 +164,16 @@ def route_along(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, to_m
     )
 
 
-def _crossings(lanes: Sequence[Lane], way: tuple[int, ...], from_m: float, end_m: float) -> tuple[Crossing, ...]:
-    ends = np.cumsum([lanes[index].length_m for index in way])
+def _ends(lanes: Sequence[Lane], way: tuple[int, ...]) -> Float[np.ndarray, " w"]:
+    """Where each lane of a way ends along the line that joins them, with the gaps where lanes do not quite meet."""
+    lines = [lanes[index].centre for index in way]
+    gaps = np.array([0.0, *(np.linalg.norm(after[0] - before[-1]) for before, after in pairwise(lines))])
+    return np.cumsum([lanes[index].length_m for index in way]) + np.cumsum(np.where(gaps > _APART_M, gaps, 0.0))
+
+
+def _crossings(
+    lanes: Sequence[Lane], way: tuple[int, ...], ends: Float[np.ndarray, " w"], from_m: float, end_m: float
+) -> tuple[Crossing, ...]:
     crossings: list[Crossing] = []
     k = 0
     while k < len(way):

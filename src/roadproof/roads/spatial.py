@@ -16,6 +16,10 @@ SMALL_M = 4.0
 """Pieces of lanes are smaller and many, those of junctions larger and few: each have a tree of their own."""
 
 
+SHORTEST_M = 1e-6
+"""Segments that are not longer have no direction."""
+
+
 class TriangleIndex:
     """Which triangles hold a point; each triangle has a code, and the largest code wins.
 
@@ -76,7 +80,7 @@ class SegmentIndex:
         sloped = np.linalg.norm(np.concatenate([np.diff(line, axis=0) for line in lines]), axis=1)
         total = np.cumsum(sloped) - sloped
         station = total - total[np.searchsorted(owner, np.arange(len(lines)))][owner]
-        keep = length > 1e-6
+        keep = length > SHORTEST_M
         self.start: Float[np.ndarray, "s 2"] = start[keep]
         self.along: Float[np.ndarray, "s 2"] = step[keep] / length[keep, None]
         self.length_m: Float[np.ndarray, " s"] = length[keep]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from roadproof.datatypes import VehicleState
 from roadproof.errors import SimulatorError
+from roadproof.limits import is_whole
 from roadproof.roads.roadmap import RoadMap
 from roadproof.traffic.agents import Agents
 from roadproof.traffic.cars import Cars
@@ -27,10 +28,10 @@ class Traffic:
             SimulatorError: a number or the seed is negative, or they do not fit on the map.
         """
         for what, count in (("cars", cars), ("pedestrians", pedestrians)):
-            if count < 0:
-                raise SimulatorError(f"{count} {what} were asked for, expected 0 or more")
-        if seed < 0:
-            raise SimulatorError(f"the seed of the traffic is {seed}, expected 0 or more")
+            if not is_whole(count) or count < 0:
+                raise SimulatorError(f"{count} {what} were asked for, expected a whole number, 0 or more")
+        if not is_whole(seed) or seed < 0:
+            raise SimulatorError(f"the seed of the traffic is {seed}, expected a whole number, 0 or more")
         self._cars = Cars(road_map, cars, seed, ego)
         self._pedestrians = Pedestrians(road_map, pedestrians, seed)
         self.cars: Agents = self._cars.agents

@@ -1,6 +1,7 @@
 """The unmodified CARLA client against `roadproof carla serve` in another process."""
 
 import contextlib
+import pathlib
 import queue
 import select
 import socket
@@ -277,6 +278,8 @@ def test_a_camera_that_cannot_be_served_is_refused_and_leaves_nothing(world):
         sensor(world, ego, "camera.rgb", carla.Transform(carla.Location(z=2.0), carla.Rotation(pitch=400.0)))
     with pytest.raises(RuntimeError, match="out of range"):
         sensor(world, ego, "camera.rgb", fov=170)
+    with pytest.raises(RuntimeError, match="sensor_tick 1 s cannot be served"):
+        sensor(world, ego, "camera.rgb", sensor_tick=1.0)
     world.tick()
     assert [actor.type_id for actor in world.get_actors()] == ["vehicle.ford.mustang"]
 
@@ -354,6 +357,13 @@ def test_what_cannot_be_served_is_one_clear_line(arguments, complaint):
     with pytest.raises(RuntimeError, match=complaint) as caught, serving(*arguments):
         pass
     assert "Traceback" not in str(caught.value)
+
+
+def test_a_map_that_clients_could_not_be_given_is_one_clear_line(street, tmp_path):
+    text = "<?xml version='1.0' encoding='ISO-8859-1'?><!-- ß -->" + pathlib.Path(street).read_text().partition("?>")[2]
+    (tmp_path / "own.xodr").write_text(text, encoding="ISO-8859-1")
+    told = roadproof("carla", "serve", "--port", free_port(), "--map", tmp_path / "own.xodr")
+    assert (told.returncode, "own.xodr is not UTF-8" in told.stderr, told.stderr.count("\n")) == (2, True, 1)
 
 
 def test_a_taken_port_is_one_clear_line(street):

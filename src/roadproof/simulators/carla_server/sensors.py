@@ -39,7 +39,8 @@ def check_camera(world: World, sensor: Actor) -> None:
     """Refuse a camera that cannot be served.
 
     Raises:
-        SimulatorError: its size, field of view, pitch or roll is out of range, or all cameras together are too large.
+        SimulatorError: its size, field of view, pitch or roll is out of range, it is to see less often than at every
+            step, or all cameras together are too large.
     """
     width, height, fov = _optics(sensor)
     if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX and 1.0 <= fov <= 115.0):
@@ -50,6 +51,8 @@ def check_camera(world: World, sensor: Actor) -> None:
         raise SimulatorError(f"a camera pitched by {sensor.pose[3]:.1f}° cannot be served, expected −90 to 90")
     if abs(sensor.pose[5]) > MAX_ROLL_DEG:
         raise SimulatorError(f"a camera rolled by {sensor.pose[5]:.1f}° cannot be served, expected 0")
+    if every := float(sensor.values.get("sensor_tick", 0.0)):
+        raise SimulatorError(f"a camera of sensor_tick {every:g} s cannot be served, expected 0: one picture a step")
     sizes = [_optics(actor)[:2] for actor in world.actors.values() if actor.name in CAMERAS]
     pixels = sum(width * height for width, height in sizes)
     if pixels > limits.CAMERA_PIXELS:

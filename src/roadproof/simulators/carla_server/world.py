@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from roadproof.datatypes import Control, VehicleState, Weather
-from roadproof.errors import SimulatorError
+from roadproof.errors import ScenarioError, SimulatorError
 from roadproof.geometry import CIL_CAMERA, CIL_INPUT
 from roadproof.roads.maps import BUILTIN_MAPS, builtin_map_file, load_map
 from roadproof.roads.roadmap import RoadMap
@@ -140,6 +140,10 @@ class World:
         if self.town is None or self.town.name != name:
             file = self.maps[name]
             roads = load_map(name if name in BUILTIN_MAPS else str(file))
+            try:
+                file.read_text(encoding="utf-8")
+            except UnicodeDecodeError:
+                raise ScenarioError(f"map {file} is not UTF-8, as clients get it; save it as UTF-8") from None
             scenery = build_scenery(roads)
             if self.town is not None:
                 self.town.close()
