@@ -125,7 +125,7 @@ def kornia_step(
     response = response_on(recordings.colour.response, device, torch.float32)
     rows, columns = np.mgrid[0:CANVAS_SIZE_PX, 0:CANVAS_SIZE_PX]
     centre = np.stack([columns.ravel(), rows.ravel()], -1).astype(float)
-    squares = Footprints.of(centre, np.broadcast_to(np.eye(2), (len(centre), 2, 2)), "area", device=device)
+    squares = Footprints.of(centre, np.broadcast_to(np.eye(2), (len(centre), 2, 2)), 0.5, device=device)
     size = clean.shape[-2:]
 
     def step() -> Tensor:

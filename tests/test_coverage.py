@@ -6,8 +6,16 @@ import torch
 
 from references import approach, supersampled
 from roadproof.compositing.view import canvas_pixels
-from roadproof.coverage import Footprints, Shape, coverage, polygon_vertices, tent_share
-from roadproof.geometry import CIL_INPUT
+from roadproof.coverage import (
+    FOOTPRINT_VARIANCE,
+    Footprints,
+    Shape,
+    coverage,
+    footprint_variance,
+    polygon_vertices,
+    tent_share,
+)
+from roadproof.geometry import CIL_INPUT, CropResize
 
 BOX = torch.tensor([200.0, 200.0, 60.0, 300.0, 35.0], dtype=torch.float64)
 
@@ -21,7 +29,7 @@ def random_box(rng):
 def view_of(homography, resampling, every=1):
     index, centre, jacobian = (part[::every] for part in canvas_pixels(homography[None], CIL_INPUT))
     pixels = np.stack([index % 200, index // 200], -1).astype(float)
-    return pixels, Footprints.of(centre, jacobian, resampling, dtype=torch.float64)
+    return pixels, Footprints.of(centre, jacobian, FOOTPRINT_VARIANCE[resampling], dtype=torch.float64)
 
 
 def mean_error(homographies, shape, resampling, seed, count=16):
@@ -52,7 +60,30 @@ def test_coverage_is_that_of_a_supersampled_rectangle_on_real_homographies(carla
 def flat(resampling="area", step=4.0):
     """Footprints seen straight from above, `step` canvas px a pixel."""
     grid = np.stack(np.meshgrid(np.arange(100), np.arange(100)), -1).reshape(-1, 2) * step + 1.5
-    return Footprints.of(grid, np.broadcast_to(np.eye(2) * step, (10_000, 2, 2)), resampling, dtype=torch.float64)
+    slope, variance = np.broadcast_to(np.eye(2) * step, (10_000, 2, 2)), FOOTPRINT_VARIANCE[resampling]
+    return Footprints.of(grid, slope, variance, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("resampling", ["area", "antialiased-bilinear"])
+@pytest.mark.parametrize("camera_px", [0.5, 1, 4])
+def test_an_edge_is_as_sharp_as_the_input_has_it_larger_smaller_or_as_large_as_its_crop(resampling, camera_px):
+    crop, edges = 120, np.linspace(60, 60 + camera_px, 9)
+    side = round(crop / camera_px)
+    box = {"left_px": 0, "top_px": 0, "right_px": crop, "bottom_px": crop}
+    view = CropResize(**box, width_px=side, height_px=side, resampling=resampling)
+    place = np.linalg.inv(view.input_from_camera) @ np.stack([np.arange(side), np.full(side, side // 2), np.ones(side)])
+    slope = np.broadcast_to(np.eye(2) * camera_px, (side, 2, 2))
+    footprints = Footprints.of(place[:2].T, slope, footprint_variance(view), dtype=torch.float64)
+    worst = 0.0
+    for edge in edges:
+        # Straight from above, a canvas px is a pixel of the camera.
+        seen = np.clip(edge - (np.arange(crop) - 0.5), 0, 1)
+        picture = np.broadcast_to((255 * seen).round().astype(np.uint8)[None, :, None], (crop, crop, 3))
+        painted = torch.tensor([edge - 500.0, 60.0, 1000.0, 1000.0, 0.0], dtype=torch.float64)
+        made = coverage(Shape.RECTANGLE, painted, footprints).numpy()
+        worst = max(worst, np.abs(made - view(picture)[side // 2, :, 0] / 255).max())
+    # Boxes enlarged by boxes are steps, which no smooth edge follows.
+    assert worst < (0.3 if (resampling, camera_px) == ("area", 0.5) else 0.08)
 
 
 @pytest.mark.parametrize("shape", list(Shape))

@@ -13,7 +13,8 @@ width and `e_v` along the length; rotation turns them clockwise on the picture, 
 The antialiased bilinear filter that makes a controller's input is a tent two pixels wide in x and y. Projected on any
 direction e it is, to a good approximation, again a tent, of half-width σ(e) (same variance exactly; the same tent
 exactly along the pixel axes). So the coverage of a box is a product of two differences of S: closed form, C¹ smooth,
-and one small matrix product for all pixels. An area filter (a box one pixel wide) has half that variance.
+and one small matrix product for all pixels. An area filter (a box one pixel wide) has half that variance; so have the
+camera's own pixels, which an input has that is as large as its crop (`footprint_variance`).
 """
 
 from __future__ import annotations
@@ -28,10 +29,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.constants import constant, placed
-from roadproof.geometry import CANVAS_SIZE_PX, Resampling
+from roadproof.geometry import CANVAS_SIZE_PX, CropResize, Resampling
 
 FOOTPRINT_VARIANCE: dict[Resampling, float] = {"antialiased-bilinear": 1.0, "area": 0.5}
-"""Squared half-width, in picture px, of the tent that stands for each resampling filter."""
+"""Squared half-width, in picture px, of the tent that stands for each filter where it makes pictures smaller."""
+
+
+def footprint_variance(view: CropResize) -> float:
+    """Squared half-width, in input px, of the tent that stands for the footprint of a controller's input.
+
+    Where the input is as large as its crop nothing is filtered, and where it is larger the filter is as wide as pixels
+    of the camera: to each comes the box of the camera's own pixel.
+    """
+    crop = (view.right_px - view.left_px) * (view.bottom_px - view.top_px)
+    camera_px = (crop / (view.width_px * view.height_px)) ** 0.5  # of its side, for each of the input
+    if camera_px > 1.0:
+        return FOOTPRINT_VARIANCE[view.resampling]
+    enlarged = 1.0 if camera_px < 1.0 and view.resampling != "area" else 0.0
+    return (0.5 + enlarged) / camera_px**2
+
 
 MIN_VARIANCE = 1e-4
 """Least σ², canvas px²: far footprints are so long that rounding could make it negative across them."""
@@ -63,7 +79,7 @@ class Footprints:
         jacobian: canvas px per picture px, (*v, P, 2, 2).
         features: (6, P): x, y, 1 and the entries xx, 2·xy, yy of footprint² · J Jᵀ; a figure's u, v, σ²(e_u), σ²(e_v)
             are linear in them.
-        variance: footprint², the value of `FOOTPRINT_VARIANCE` for the picture's resampling.
+        variance: footprint² of the picture (`footprint_variance`).
     """
 
     centre: Float[Tensor, "*v p 2"]
@@ -75,20 +91,17 @@ class Footprints:
     def of(
         centre: Float[np.ndarray, "p 2"],
         jacobian: Float[np.ndarray, "p 2 2"],
-        resampling: Resampling,
+        variance: float,
         *,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> Footprints:
         """Footprints from canvas coordinates and Jacobians, computed in float64 and stored as `dtype`."""
-        return placed(Footprints.made(torch.tensor(centre), torch.tensor(jacobian), resampling), device, dtype)
+        return placed(Footprints.made(torch.tensor(centre), torch.tensor(jacobian), variance), device, dtype)
 
     @staticmethod
-    def made(
-        centre: Float[Tensor, "*v p 2"], jacobian: Float[Tensor, "*v p 2 2"], resampling: Resampling
-    ) -> Footprints:
+    def made(centre: Float[Tensor, "*v p 2"], jacobian: Float[Tensor, "*v p 2 2"], variance: float) -> Footprints:
         """Footprints from canvas coordinates and Jacobians, on their device and in their precision."""
-        variance = FOOTPRINT_VARIANCE[resampling]
         x, y = centre.unbind(-1)
         (a, b), (c, d) = (row.unbind(-1) for row in jacobian.unbind(-2))
         moments = (variance * (a * a + b * b), 2 * variance * (a * c + b * d), variance * (c * c + d * d))

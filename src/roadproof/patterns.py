@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from roadproof.constants import constant
-from roadproof.coverage import Footprints, Shape, coverage
+from roadproof.coverage import FOOTPRINT_VARIANCE, Footprints, Shape, coverage
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.io.files import AnyPath, as_path, write_atomically
@@ -120,8 +120,8 @@ def coverages(pattern: Pattern, footprints: Footprints) -> Float[Tensor, "*b k p
     """The mask M of every figure at every footprint, in [0, 1]."""
     if len(set(pattern.shapes)) == 1:
         return coverage(pattern.shapes[0], pattern.boxes, footprints)
-    parts = [coverage(shape, pattern.boxes[..., k, :], footprints) for k, shape in enumerate(pattern.shapes)]
-    return torch.stack(parts, -2)
+    parts = [coverage(shape, pattern.boxes[..., k : k + 1, :], footprints) for k, shape in enumerate(pattern.shapes)]
+    return torch.cat(parts, -2)
 
 
 def visibilities(masks: Float[Tensor, "*b k p"]) -> Float[Tensor, "*b k p"]:
@@ -156,7 +156,7 @@ def raster(pattern: Pattern, size_px: int = CANVAS_SIZE_PX) -> UInt8[np.ndarray,
     rows, columns = np.mgrid[0:size_px, 0:size_px]
     centre = (np.stack([columns.ravel(), rows.ravel()], -1) + 0.5) * scale - 0.5
     jacobian = np.broadcast_to(np.eye(2) * scale, (size_px**2, 2, 2))
-    footprints = Footprints.of(centre, jacobian, "area")
+    footprints = Footprints.of(centre, jacobian, FOOTPRINT_VARIANCE["area"])
     single = pattern.mapped(lambda part: part.detach().cpu().float())
     seen = visibilities(coverages(single, footprints))
     alpha = seen.sum(0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from roadproof.datatypes import VehicleState
+from roadproof.datatypes import Obstacle, VehicleState
 from roadproof.errors import RecordingError
 from roadproof.geometry import CIL_CAMERA, CameraModel, CanvasPlacement, CropResize, homography_from_pose
 from roadproof.homographies import apply_homography
@@ -166,6 +166,16 @@ def test_another_time_step_or_unit_of_speed_is_refused():
         placed(recording_set(drive("clean", approach())), dt_s=DT_S / 2)
     with pytest.raises(RecordingError, match=r"poses move 0\.28 times .* unit of speed_mps"):
         placed(recording_set(drive("clean", approach(), speed_mps=21.6)), dt_s=DT_S)
+    # So far off that the car seems to stand.
+    for given in (0.0, 0.3):
+        with pytest.raises(RecordingError, match=r"poses move \d+\.\d\d times as fast as the recorded speed"):
+            placed(recording_set(drive("clean", approach(), speed_mps=given)), dt_s=DT_S)
+
+
+def test_what_lies_in_another_world_does_not_come_along():
+    there = Obstacle(x_m=200.0, y_m=3.0, yaw_rad=0.0, half_length_m=5.0, half_width_m=0.1)
+    one = replace(recording_set(drive("clean", approach())), obstacles=(there,), marks=())
+    assert (placed(one, dt_s=DT_S).obstacles, placed(one, dt_s=DT_S).marks) == (None, None)
 
 
 def test_a_frame_that_sees_another_canvas_is_named():

@@ -19,10 +19,10 @@ KNOWN = Vehicle(
 )
 
 
-def driven(vehicle, steer, throttle, brake):
+def driven(vehicle, steer, throttle, brake, speed_mps=6.0):
     """The track of a car that is told so."""
     one = torch.ones(1, dtype=torch.float64)
-    car = Motion(0 * one, 0 * one, 0.3 * one, 6.0 * one, 0 * one, float(steer[0]) * one)
+    car = Motion(0 * one, 0 * one, 0.3 * one, speed_mps * one, 0 * one, float(steer[0]) * one)
     rows = []
     for controls in zip(steer, throttle, brake, strict=True):
         rows.append([float(value) for value in (car.x_m, car.y_m, car.yaw_rad, car.speed_mps)])
@@ -70,6 +70,34 @@ def test_what_the_drives_do_not_show_stays_with_the_prior():
     steer, throttle, brake = lively(0)
     found = Vehicle.identified([driven(KNOWN, steer, throttle, 0 * brake)])
     assert found.pulling[1] == pytest.approx(-8.0, abs=0.01)
+
+
+def test_a_driver_who_gives_gas_where_the_road_climbs_does_not_make_throttle_a_brake():
+    """A speed held on slopes that poses do not show: throttle and pull have opposite signs all along."""
+    plain, one = Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, dt_s=0.05), torch.ones(1, dtype=torch.float64)
+    car = Motion(0 * one, 0 * one, 0 * one, 6.0 * one, 0 * one, 0 * one)
+    rows = []
+    for k in range(1200):
+        throttle, steer = min(max(0.04 + 0.3 * (6.0 - float(car.speed_mps)), 0.0), 1.0), 0.2 * math.sin(k / 15)
+        rows.append([*(float(value[0]) for value in car[:4]), steer, throttle])
+        car = plain.step(car, steer * one, throttle * one, 0 * one)
+        pull = 0.05 * 9.81 * math.sin(0.3 * k / 20)
+        car = car._replace(speed_mps=car.speed_mps - 0.05 * pull)
+    x, y, yaw, speed, steer, throttle = np.array(rows).T
+    pose = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed}
+    found = Vehicle.identified(
+        [Track(dt_s=0.05, step=np.arange(1200), **pose, steer=steer, throttle=throttle, brake=0 * steer)]
+    )
+    assert found.pulling[0] == pytest.approx(4.0), "an ordinary car's"
+
+
+@pytest.mark.parametrize("dt_s", [0.05, 0.005])
+def test_a_log_may_be_of_many_steps_a_second(dt_s):
+    true = Vehicle.bicycle(wheelbase_m=2.8, steer_range_rad=0.7, lag_s=0.0, dt_s=dt_s)
+    steer = 0.3 * np.sin(np.arange(int(10 / dt_s)) * dt_s)
+    track = driven(true, steer, np.full(len(steer), 0.15 / 4.0), 0 * steer, 3.5)
+    slow = Vehicle.identified([track])
+    assert slow.curving[1] == pytest.approx(true.curving[1], rel=0.02)
 
 
 def test_the_identified_vehicle_repeats_a_drive_it_has_not_seen():

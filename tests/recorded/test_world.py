@@ -90,6 +90,39 @@ def test_bright_paint_pulls_to_the_right_and_dark_paint_to_the_left(world):
     assert deviations[0] > 5 * deviations[1]
 
 
+def test_figures_of_several_shapes_are_driven_over_as_those_of_one(world):
+    boxes = torch.tensor([[[150.0, 200.0, 80.0, 380.0, 0.0], [260.0, 200.0, 60.0, 380.0, 0.0]]]).repeat(2, 1, 1)
+    colours = torch.tensor([[[1.0] * 3, [0.0] * 3]]).repeat(2, 1, 1)
+    with torch.no_grad():
+        mixed, alike = (
+            world.roll(RampFollower(), Pattern(shapes, boxes, colours)).right_m
+            for shapes in ((Shape.RECTANGLE, Shape.ELLIPSE), (Shape.RECTANGLE, Shape.RECTANGLE))
+        )
+    assert mixed.shape == alike.shape
+    assert torch.allclose(mixed[0], mixed[1], atol=1e-6)
+    # A drive over the other order of figures that do not overlap is the same.
+    swapped = Pattern((Shape.ELLIPSE, Shape.RECTANGLE), boxes.flip(1), colours.flip(1))
+    with torch.no_grad():
+        assert torch.allclose(world.roll(RampFollower(), swapped).right_m, mixed, atol=2e-3)
+    assert (mixed - alike).abs().max() > 1e-3
+
+
+def test_a_car_begins_with_its_wheels_where_they_were_not_where_they_were_told_to_be():
+    road = recorded_road()
+    clean = road.clean
+    first = int(clean.track.rows(clean.frame_number[:1])[0])
+    steer = clean.track.steer.copy()
+    steer[first - 1] += 0.6
+    jumped = dataclasses.replace(clean, track=dataclasses.replace(clean.track, steer=steer))
+    made = RecordedWorld(
+        dataclasses.replace(road, recordings=(jumped, *road.recordings[1:])),
+        vehicle=dataclasses.replace(VEHICLE, steer_rate_per_s=2.0),
+    )
+    assert float(made.begin().steer) == pytest.approx(
+        float(clean.track.steer[first - 2]) + 2.0 * VEHICLE.dt_s, abs=0.02
+    )
+
+
 def test_a_batch_is_its_parts_and_the_same_twice(world):
     rows, starts = ((150, 80, 1.0), (260, 60, 0.0)), (BiasedStart(), BiasedStart(right_m=0.3))
     with torch.no_grad():

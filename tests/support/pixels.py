@@ -5,7 +5,7 @@ import torch
 
 from roadproof.compositing.composite import blend
 from roadproof.compositing.view import CanvasPixels
-from roadproof.coverage import Footprints
+from roadproof.coverage import FOOTPRINT_VARIANCE, Footprints
 from roadproof.patterns import coverages, visibilities
 from roadproof.photometry import AffineResponse
 
@@ -16,7 +16,7 @@ def some_pixels(many, own=None, seed=0, device="cpu"):
     rows = () if own is None else (own,)
     centre = rng.uniform(-5, 405, (*rows, many, 2))
     jacobian = rng.normal(size=(*rows, many, 2, 2)) * rng.uniform(0.5, 20, (*rows, many, 1, 1))
-    made = Footprints.made(torch.tensor(centre).float(), torch.tensor(jacobian).float(), "area")
+    made = Footprints.made(torch.tensor(centre).float(), torch.tensor(jacobian).float(), FOOTPRINT_VARIANCE["area"])
     parts = (part if own is None else part[:, None] for part in (made.centre, made.jacobian, made.features))
     clean, gain, bias = (torch.tensor(rng.uniform(low, 1, (*rows, many, 3))).float() for low in (0, 0.3, -0.8))
     response = AffineResponse(torch.eye(3) * 1.2, torch.full((3,), -0.1))

@@ -27,7 +27,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from roadproof.calibration.compiled import canvas_shares
-from roadproof.coverage import FOOTPRINT_VARIANCE
+from roadproof.coverage import footprint_variance
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
 
@@ -95,7 +95,7 @@ def predicted_contrast(
     near = _may_see_canvas(input_from_canvas, canvas_from_input, through)
     # Behind a lens lines are curves, which corners do not bound.
     frame, pixel = np.nonzero(near if camera.lens is None else np.ones_like(near))
-    variance = FOOTPRINT_VARIANCE[view.resampling]
+    variance = footprint_variance(view)
     whole = np.zeros((2, *shape))
     shares = canvas_shares(canvas_from_input, frame, through.T[pixel], bend[pixel], variance)
     whole.reshape(2, shape[0], -1)[:, frame, pixel] = shares
@@ -146,7 +146,7 @@ class _Outline:
         moves: Float[np.ndarray, "f 6"],
     ) -> None:
         self._prior, self._camera, self._view = prior, camera, view
-        self._variance = FOOTPRINT_VARIANCE[view.resampling] + blur_px**2
+        self._variance = footprint_variance(view) + blur_px**2
         _, expected = predicted_contrast(moved(prior, moves, camera), view, camera)
         blurred, whole = _blurred(_over_gain(contrast, expected), blur_px)
         self._frame, row, column = np.nonzero(whole & _near_edge(blurred))

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from roadproof.coverage import Footprints, Shape, axis_rows, canvas_share, polygon_vertices
+from roadproof.coverage import Footprints, Shape, axis_rows, canvas_share, footprint_variance, polygon_vertices
 from roadproof.errors import GeometryError
 from roadproof.geometry import CANVAS_SIZE_PX, CameraModel, CropResize, sight
 from roadproof.homographies import Homographies
@@ -188,7 +188,7 @@ def view_canvas(
         GeometryError: no frame shows the canvas.
     """
     index, centre, jacobian = canvas_pixels(image_from_canvas, view, camera)
-    footprints = Footprints.of(centre, jacobian, view.resampling, device=device, dtype=dtype)
+    footprints = Footprints.of(centre, jacobian, footprint_variance(view), device=device, dtype=dtype)
     levels = torch.tensor(frames, device=device).to(dtype) / 255
     place = torch.as_tensor(index, device=device)
     clean = levels.reshape(-1, 3)[place]

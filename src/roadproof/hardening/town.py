@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.compositing.view import OwnViews, picked_pixels
-from roadproof.coverage import Footprints, canvas_share
+from roadproof.coverage import Footprints, canvas_share, footprint_variance
 from roadproof.geometry import CameraModel, CanvasPlacement, CropResize
 from roadproof.hardening.views import Views
 from roadproof.photometry.responses import AffineResponse
@@ -70,7 +70,7 @@ class Town:
         by = canvas_from_input[:, :, :2, None]
         jacobian = (by[:, :2] - at[:, :, None] * by[:, 2:]) / depth[:, None, None]
         footprints = Footprints.made(
-            at.mT[:, None].float(), jacobian.permute(0, 3, 1, 2)[:, None].float(), self._view.resampling
+            at.mT[:, None].float(), jacobian.permute(0, 3, 1, 2)[:, None].float(), footprint_variance(self._view)
         )
         share, pixel = canvas_share(footprints)[:, 0, :, None], self._inside.expand(len(frames), -1)
         light = (share * light_on_paint(picked_pixels(frames.flatten(2), pixel)).mT, share, 0.0)

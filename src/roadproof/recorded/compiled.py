@@ -19,8 +19,8 @@ from torch import Tensor
 from roadproof.compiling import Kernel, inline, run
 from roadproof.compositing.tents import interval_share
 from roadproof.compositing.view import OwnViews
-from roadproof.coverage import FOOTPRINT_VARIANCE, MIN_VARIANCE, Footprints
-from roadproof.geometry import CANVAS_SIZE_PX, Resampling
+from roadproof.coverage import MIN_VARIANCE, Footprints
+from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.photometry import Response
 from roadproof.recorded.light import Light
 
@@ -67,7 +67,7 @@ def lit_canvas(
     frame: Int[Tensor, " r"],
     source: Float[Tensor, "r 2 3 3"],
     light: Light,
-    resampling: Resampling,
+    variance: float,
     response: Response,
 ) -> OwnViews | None:
     """The canvas' pixels of R pictures with the light on them; None if no picture shows the canvas.
@@ -79,7 +79,7 @@ def lit_canvas(
         frame: index of the recorded frame that each picture was drawn from.
         source: place in that frame, as for `draw`.
         light: the light on the canvas in recorded frames.
-        resampling: filter that made the controller's input.
+        variance: of the footprint of the controller's input (`coverage.footprint_variance`).
         response: response from painted to seen colour.
     """
     many, width = len(frames), frames.shape[-1]
@@ -93,7 +93,6 @@ def lit_canvas(
     centre, jacobian = frames.new_empty(many, 1, most, 2), frames.new_empty(many, 1, most, 2, 2)
     features = frames.new_empty(many, 1, 6, most)
     clean, gain, bias = frames.new_empty(3, many, most, 3)
-    variance = FOOTPRINT_VARIANCE[resampling]
     lit = (light.values, light.of_frames, variance)
     found = (pixel, valid, centre, jacobian, features, clean, gain, bias)
     run(_light, (frames, canvas, rows.start, touches, frame, source, *lit, *found), many, worth=WORTH)

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from roadproof.compositing.view import camera_points, canvas_pixels
-from roadproof.coverage import Footprints, canvas_share
+from roadproof.coverage import Footprints, canvas_share, footprint_variance
 from roadproof.geometry import CameraModel, CropResize
 from roadproof.homographies import Homographies
 from roadproof.photometry import PixelMaps
@@ -93,7 +93,7 @@ def _maps(recordings: RecordingSet) -> Float[Tensor, "n 7"] | None:
 def _expected_share(homographies: Homographies, view: CropResize, camera: CameraModel) -> Float[Tensor, "f h w"]:
     """Share of every pixel that would lie on the canvas if nothing stood in its way."""
     index, centre, jacobian = canvas_pixels(homographies, view, camera)
-    footprints = Footprints.of(centre, jacobian, view.resampling)
+    footprints = Footprints.of(centre, jacobian, footprint_variance(view))
     share = torch.zeros(len(homographies) * view.height_px * view.width_px)
     share[torch.as_tensor(index)] = canvas_share(footprints)
     return share.view(-1, view.height_px, view.width_px)

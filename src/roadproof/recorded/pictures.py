@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from roadproof.compositing.view import OwnViews, dilated, picked_pixels
-from roadproof.coverage import Footprints
+from roadproof.coverage import Footprints, footprint_variance
 from roadproof.errors import RecordingError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement, sight
 from roadproof.photometry.responses import response_on
@@ -221,7 +221,7 @@ class FrameBank:
         if rows is None:
             return Views(frames, None)
         canvas_from_input = self._canvas_from_ground @ moved.ground_from_input
-        told = (moved.frame, source, self._light, view.resampling, self._response)
+        told = (moved.frame, source, self._light, footprint_variance(view), self._response)
         return Views(frames, lit_canvas(frames, rows, canvas_from_input, *told))
 
     def _plain(self, poses: Poses, moved: Moved, to_paint: bool) -> Views:
@@ -306,7 +306,7 @@ class FrameBank:
         by = canvas_from_input[:, :, :2, None] if straight else canvas_from_input[..., None]
         jacobian = ((by[:, :2] - at[:, :, None] * by[:, 2:]) / scale[:, None, None]).permute(0, 3, 1, 2)
         jacobian = jacobian if straight else jacobian @ self._bend[flat]
-        footprints = Footprints.made(at.mT[:, None], jacobian[:, None], self.view.resampling)
+        footprints = Footprints.made(at.mT[:, None], jacobian[:, None], footprint_variance(self.view))
         gain, offset, share = self._light.at(flat, picked_pixels(source, flat).mT, moved.frame, footprints)
         share = torch.where(real, share, 0.0)[..., None]
         light = (share * gain, share, offset)

@@ -52,7 +52,8 @@ def placed(
 
     Args:
         recordings: a set whose camera model is right: field of view, pitch, height above the road, place on the car.
-            What the set says of its canvas or tracks already is replaced.
+            What the set says of its canvas or tracks already is replaced; marks and obstacles, which lie in another
+            world, are left out.
         dt_s: seconds from one frame number to the next.
         controls: by name of the drive, steer, throttle and brake that were applied from each frame on, (F, 3). A drive
             left out gets the recorded controller's steer and no pedals.
@@ -81,6 +82,8 @@ def placed(
     _check_speeds(drives, tracks)
     return replace(
         recordings,
+        marks=None,
+        obstacles=None,
         canvas=CanvasPlacement(
             x_m=0.0, y_m=0.0, width_m=width_px_m * CANVAS_SIZE_PX, length_m=length_px_m * CANVAS_SIZE_PX
         ),
@@ -193,9 +196,12 @@ def _check_views(ground: _Ground, names: list[str]) -> None:
 
 
 def odd_ratio(moved_m: Float[np.ndarray, " n"], way_m: Float[np.ndarray, " n"], least_m: float) -> float | None:
-    """How far poses move against the way that a speed makes, in the median of ways above the least; None if alike."""
-    moving = way_m > least_m
-    ratio = float(np.median(moved_m[moving] / way_m[moving])) if moving.any() else 1.0
+    """How far poses move against the way that a speed makes, in the median of ways above the least; None if alike.
+
+    Where no way is above it by the speed, those count that are by the poses: a speed in other units may seem to stand.
+    """
+    moving = way_m > least_m if (way_m > least_m).any() else moved_m > least_m
+    ratio = float(np.median(moved_m[moving] / np.maximum(way_m[moving], 1e-6))) if moving.any() else 1.0
     return None if _SPEED_RATIO[0] < ratio < _SPEED_RATIO[1] else ratio
 
 

@@ -34,7 +34,7 @@ from roadproof.errors import RecordingError
 from roadproof.recordings import Track
 from roadproof.traffic.agents import CAR_WHEELBASE_M
 
-_MOVING_MPS = 2.0
+_MOVING_MPS, _STANDING_MPS = 2.0, 0.4
 _LEAST_STEPS = 12
 _PRIOR_WEIGHT = 1e-3
 _LEAST_R2 = 0.5
@@ -142,10 +142,7 @@ class Vehicle:
             )
         pulling, pulled = _stacked([(part.pulling, part.pulled) for part in parts])
         slipping, slipped = _stacked([(part.slipping, part.slipped) for part in parts])
-        e, f, g, h, j = _fitted(pulling, pulled, prior.pulling).tolist()
-        if h > 0:
-            # A car that pulls more the faster it goes runs away: what the drives seem to say is their noise.
-            e, f, g, h, j = _fitted(pulling * (1, 1, 1, 0, 1), pulled, prior.pulling).tolist()
+        e, f, g, h, j = _pull(pulling, pulled, prior.pulling)
         slope, level = _fitted(slipping, slipped, prior.slipping, weight=(0.01, 1.0)).tolist()
         b, c, d, k = a.tolist()
         return Vehicle(
@@ -188,8 +185,8 @@ _PULLING = (4.0, -8.0, -0.15, 0.0, 0.0)
 def curvatures(track: Track, rows: slice) -> Float[np.ndarray, " m"]:
     """κ of each step of a stretch, one fewer than its rows; 0 where the car hardly moves."""
     yaw, v = np.unwrap(track.yaw_rad[rows]), track.speed_mps[rows]
-    way = 0.5 * (v[1:] + v[:-1]) * track.dt_s
-    return np.where(way > 0.02, np.diff(yaw) / np.maximum(way, 0.02), 0.0)
+    way, least = 0.5 * (v[1:] + v[:-1]) * track.dt_s, _STANDING_MPS * track.dt_s
+    return np.where(way > least, np.diff(yaw) / np.maximum(way, least), 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +202,7 @@ class _Rows:
 
     @staticmethod
     def of(track: Track, rows: slice, steer_rate_per_s: float) -> _Rows:
-        v, u = track.speed_mps[rows], _followed(track.steer[rows], steer_rate_per_s * track.dt_s)
+        v, u = track.speed_mps[rows], followed(track.steer[rows], steer_rate_per_s * track.dt_s)
         throttle, brake = track.throttle[rows], track.brake[rows]
         kappa = curvatures(track, rows)
         count = max(len(kappa) - 1, 0)
@@ -223,7 +220,26 @@ class _Rows:
         return _Rows(curving[moving], kappa[now][moving], pulling, pull, slipping[moving], slip[moving])
 
 
-def _followed(steer: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
+def _pull(
+    left: Float[np.ndarray, "m 5"], right: Float[np.ndarray, " m"], prior: Sequence[float]
+) -> tuple[float, float, float, float, float]:
+    """The coefficients e, f, g, h and j that explain a car's pull, of those that a car can have.
+
+    Throttle pulls, brakes and turned wheels hold back, and a car that pulled more the faster it goes would run away.
+    Where drives seem to say otherwise it is their noise, or a driver who gives gas where the road climbs; such a
+    coefficient stays the prior's.
+    """
+    signs, free = np.array([1.0, -1.0, 0.0, -1.0, 1.0]), np.ones(5)
+    while True:
+        found = _fitted(left * free, right, prior)
+        wrong = (signs * found < 0) & (free > 0)
+        if not wrong.any():
+            e, f, g, h, j = found.tolist()
+            return e, f, g, h, j
+        free[wrong] = 0.0
+
+
+def followed(steer: Float[np.ndarray, " n"], reach: float) -> Float[np.ndarray, " n"]:
     """The steer that the wheels follow when they turn by at most `reach` per step."""
     if not math.isfinite(reach):
         return steer
@@ -263,7 +279,7 @@ def _explained(stretches: Sequence[tuple[Track, slice]], rate: float, law: Float
     a, b, c, k = law.tolist()
     for track, rows in stretches:
         kappa = curvatures(track, rows)
-        steer = _followed(track.steer[rows], rate * track.dt_s).tolist()
+        steer = followed(track.steer[rows], rate * track.dt_s).tolist()
         at = float(kappa[0]) if kappa.size else 0.0
         for step in range(1, len(kappa)):
             at = a * at + b * steer[step] + c * steer[step - 1] + k

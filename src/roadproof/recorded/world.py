@@ -27,7 +27,7 @@ from roadproof.recorded.course import Course, Place
 from roadproof.recorded.nearest import Gap, Poses
 from roadproof.recorded.obstacles import Obstacles
 from roadproof.recorded.pictures import FrameBank
-from roadproof.recorded.vehicle import Motion, Vehicle
+from roadproof.recorded.vehicle import Motion, Vehicle, followed
 from roadproof.recordings import RecordingSet
 
 PAST_M = 1.0
@@ -164,6 +164,8 @@ class RecordedWorld:
                 f"the vehicle has steps of {self.vehicle.dt_s} s, the recordings have {self.course.dt_s} s; expected "
                 "one and the same"
             )
+        reach, first = self.vehicle.steer_rate_per_s * self.vehicle.dt_s, self.course.first
+        self._wheels = float(followed(self.course.steer.cpu().numpy(), reach)[max(first - 1, 0)])
         path = torch.stack(self.course.poses[:2], 1).cpu().numpy()
         middle = (self.course.canvas.x_m, self.course.canvas.y_m)
         self.obstacles = Obstacles(recordings.obstacles or (), path, middle, device=device)
@@ -360,7 +362,7 @@ class RecordedWorld:
             yaw + turned,
             (course.speed_mps[first] + faster).clamp_min(0.0),
             o + course.curvature[first],
-            o + course.steer[max(first - 1, 0)],
+            o + self._wheels,
         )
 
     def _offsets_of(self, starts: tuple[BiasedStart, ...]) -> Float[Tensor, "s 4"]:
