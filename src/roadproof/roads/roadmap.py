@@ -83,7 +83,7 @@ class RoadMap:
         self.mark_lines = mark_lines
         self.junctions = junctions
         self._driving = np.array([lane.index for lane in lanes if lane.kind == "driving"], dtype=np.intp)
-        if not any(lanes[index].length_m > SHORTEST_M for index in self._driving):
+        if not any(lane.kind == "driving" and lane.length_m > SHORTEST_M for lane in lanes):
             raise ScenarioError("the map has no lane of type driving, expected at least one")
         everything = np.concatenate([line[:, :2] for lane in lanes for line in (lane.left, lane.right)])
         (x0, y0), (x1, y1) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()
