@@ -164,3 +164,16 @@ def drive_columns(trial: Trial) -> DriveColumns:
 
 def _as_json(events: Sequence[Event]) -> str:
     return json.dumps([(each.kind, each.time_s, each.detail) for each in events])
+
+
+def made_by_all(transfers: Frame) -> Frame:
+    """The rows of a transfer whose drives all controllers made, over patterns of one origin and from one start.
+
+    A controller that never comes to the canvas from some start has no drive from there; means over what each of them
+    made would be over other drives.
+    """
+    # Rows of an older roadproof do not say from where.
+    start = ("weather", "start_right_m", "start_turned_rad", "start_faster_mps")
+    drive = ["found_on", *JobId._fields, *(column for column in start if column in transfers)]
+    asked = transfers.groupby("found_on")["controller"].transform("nunique")
+    return transfers[transfers.groupby(drive)["controller"].transform("nunique") == asked]

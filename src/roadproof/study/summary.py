@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from roadproof.study.rows import Frame, JobId
+from roadproof.study.rows import Frame, JobId, made_by_all
 
 _OTHERS = [name for name in JobId._fields if name != "method"]
 
@@ -35,8 +35,8 @@ def failures(rows: Frame) -> tuple[str, ...]:
 
 
 def transfer_summary(rows: Frame) -> tuple[str, ...]:
-    """A line for each method and controller of a transfer: the mean deviation."""
-    means = rows.groupby(["method", "found_on", "controller"], sort=False)["deviation_m"].mean()
+    """A line for each method and controller of a transfer: the mean deviation, over the drives that all made."""
+    means = made_by_all(rows).groupby(["method", "found_on", "controller"], sort=False)["deviation_m"].mean()
     return tuple(
         f"{method}, found against {found_on}: {deviation_m:.2f} m deviation of {controller}"
         for (method, found_on, controller), deviation_m in means.items()

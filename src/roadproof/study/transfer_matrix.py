@@ -10,12 +10,9 @@ from roadproof.errors import StudyError
 from roadproof.report.formatting import MISSING
 from roadproof.study.charts import INK, MUTED, Picture, plain
 from roadproof.study.results import DEVIATION, JOB, Metric, check_finite, check_names
-from roadproof.study.rows import Frame
+from roadproof.study.rows import Frame, made_by_all
 from roadproof.study.statistics import mean_over_scenarios
 from roadproof.study.table import Cell, Heading, Number, Table, headings, slug
-
-START = ["weather", "start_right_m", "start_turned_rad", "start_faster_mps"]
-"""Columns that tell a drive over a pattern from others; rows of an older roadproof have none."""
 
 
 def transfer_table(rows: Frame, metric: Metric = DEVIATION) -> Table:
@@ -92,12 +89,10 @@ def _matrix(rows: Frame, metric: Metric) -> Frame:
             raise StudyError(f"the transfer's rows have no column {column!r}; run the transfer again")
     check_names(rows, pairs)
     check_finite(rows, metric.column)
-    of_row = rows.groupby("found_on")["controller"].transform("nunique")
-    drive = ["found_on", *JOB, *(column for column in START if column in rows)]
-    by_all = rows.groupby(drive)["controller"].transform("nunique") == of_row
-    if not by_all.any():
+    shared = made_by_all(rows)
+    if shared.empty:
         raise StudyError("no pattern of the transfer was driven over by every controller; run the transfer again")
-    patterns = rows[by_all].groupby([*JOB, *pairs], sort=False)[metric.column].mean()
+    patterns = shared.groupby([*JOB, *pairs], sort=False)[metric.column].mean()
     means = patterns.groupby(level=pairs, sort=False).apply(mean_over_scenarios)
     # Controllers that stand on both sides first and in one order, so that the diagonal is their own patterns.
     found, drivers = list(rows["found_on"].unique()), list(rows["controller"].unique())
