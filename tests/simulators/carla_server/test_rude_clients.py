@@ -618,7 +618,7 @@ def test_a_port_that_cannot_be_is_refused_before_anything_begins(port):
     assert told.stderr == f"roadproof: --port is {port}, expected 0 to 65,534\n"
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_other_addresses_than_loopback_need_a_word(street, host):
     told = roadproof("carla", "serve", "--map", street, "--port", "0", "--host", host)
     assert told.returncode == 2
