@@ -80,8 +80,8 @@ def evaluate(
     from roadproof.driving.evaluate import evaluate as run
     from roadproof.driving.starts import StartRange
     from roadproof.patterns import read_paint
-    from roadproof.pipeline.fidelity import FIDELITY, measure_fidelity
-    from roadproof.pipeline.film import FILM, POSTER, STRIP, film_drives
+    from roadproof.pipeline.fidelity import measure_fidelity
+    from roadproof.pipeline.film import film_drives
     from roadproof.pipeline.workload import of_evaluation
     from roadproof.recorded.simulator import check_recorded_canvas
     from roadproof.recordings import load_recordings
@@ -109,6 +109,9 @@ def evaluate(
     spent = of_evaluation(len(skies), starts, runs, random=random, film=film, processes=processes)
     begin(replace(spent, drives=0) if where.recorded is not None else spent, out)
     before = _shown_in(out)
+    if before[1:] != (paint.tobytes(),):
+        # Not after the drives: an interruption would leave them beside the results of this paint.
+        _forget_pictures(out)
     with where.open() as (world, driven):
         with stages() as show:
             evaluation = run(
@@ -130,8 +133,7 @@ def evaluate(
                 on_drive=lambda done, total: show(f"Driving {driven.name}", done, total, "drives"),
             )
         if _shown_in(out) != before:
-            for name in (FILM, POSTER, STRIP, FIDELITY):
-                (out / name).unlink(missing_ok=True)
+            _forget_pictures(out)
         if film:
             shown = evaluation.shown()
             film_drives(world, shown.start.of(driven), (shown.clean, shown.painted), paint, out)
@@ -161,6 +163,15 @@ def _shown_in(out: Path) -> tuple[object, ...]:
         return Evaluation.load(out).trials, load_paint(out).tobytes()
     except RoadproofError:
         return ()
+
+
+def _forget_pictures(out: Path) -> None:
+    """Take away the film and the composites beside an evaluation, which are of other drives."""
+    from roadproof.pipeline.fidelity import FIDELITY
+    from roadproof.pipeline.film import FILM, POSTER, STRIP
+
+    for name in (FILM, POSTER, STRIP, FIDELITY):
+        (out / name).unlink(missing_ok=True)
 
 
 def _figures(pattern: Path, *, needed: bool) -> Pattern | None:
