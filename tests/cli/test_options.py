@@ -41,7 +41,7 @@ REFUSED = [
 def test_a_word_that_cannot_be_shown_again_is_refused_before_any_work(invoke, word, said):
     code, printed = invoke("record", "left-03", "--out", word)
     assert code == 2
-    assert f"a word of the command {said}, expected letters and signs" in printed.err
+    assert f"a word of the command {said}, expected text in one line" in printed.err
 
 
 @pytest.mark.parametrize(("words", "said"), REFUSED, ids=[" ".join(words[-2:])[:40] for words, _ in REFUSED])

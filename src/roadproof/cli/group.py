@@ -43,9 +43,10 @@ class _Verb(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401  # as below
         global _words
         for word in args:
-            if not word or not word.isprintable():
-                what = "empty" if not word else f"{word!r:.60}"
-                raise RoadproofError(f"a word of the command is {what}, expected letters and signs that can be shown")
+            # Commands are kept as text, one a line; a byte that is no text is a surrogate.
+            if word.splitlines() != [word] or any("\ud800" <= sign <= "\udfff" for sign in word):
+                what = f"{word!r:.60}" if word else "empty"
+                raise RoadproofError(f"a word of the command is {what}, expected text in one line")
         _words = ("roadproof", *ctx.command_path.split()[1:], *args)
         return super().parse_args(ctx, args)
 
