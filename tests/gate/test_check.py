@@ -291,7 +291,7 @@ def test_the_command_ends_with_0_1_or_2(failed, team, tmp_path, invoke, monkeypa
     own.write_text("mine")
     code, said = invoke(*command[:2], "--out", own.parent)
     assert (code, own.read_text()) == (2, "mine")
-    assert "is no check's, without drives beside it" in said.err
+    assert "is no check's, without check.json or drives beside it" in said.err
     code, said = invoke(*command, "--accept")
     assert code == 2
     assert "names none; add [change]" in said.err

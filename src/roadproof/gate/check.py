@@ -127,8 +127,8 @@ def clear(folder: Path, references: Path | None) -> None:
         whose = "kept for a reference of the plan" if named else f"no check's own, without {SUMMARY} beside it"
         raise CheckError(f"{folder / FILE} is {whose}; choose another folder for the results")
     found = [folder / name for name in OUTPUTS if (folder / name).exists()]
-    if found and not (folder / DRIVES).is_dir():
-        raise CheckError(f"{found[0]} is no check's, without {DRIVES} beside it; choose another folder for the results")
+    if found and not ((folder / FILE).is_file() or (folder / DRIVES).is_dir()):
+        raise CheckError(f"{found[0]} is no check's, without {FILE} or {DRIVES} beside it; choose another folder")
     for path in found:
         path.unlink()
 
