@@ -15,7 +15,7 @@ MANY = 1_000_000
 
 def is_whole(number: object) -> bool:
     """Whether something is a whole number, of Python or numpy."""
-    return isinstance(number, Integral) and type(number) is not bool
+    return not isinstance(number, bool) and isinstance(number, Integral)
 
 
 def check_seed(seed: object, what: str, error: type[RoadproofError]) -> None:
