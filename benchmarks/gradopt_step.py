@@ -48,7 +48,7 @@ from roadproof.attacks.step import state_at
 from roadproof.controllers import CIL, Controller, pilotnet_controller
 from roadproof.controllers.asking import controls_of
 from roadproof.controllers.precision import multiply_in
-from roadproof.coverage import Footprints, Shape
+from roadproof.coverage import FOOTPRINT_VARIANCE, Footprints, Shape
 from roadproof.datatypes import VehicleState
 from roadproof.geometry import CANVAS_SIZE_PX, CIL_CAMERA, CIL_INPUT, CanvasPlacement, homography_from_pose
 from roadproof.io.files import write_json
@@ -125,7 +125,8 @@ def kornia_step(
     response = response_on(recordings.colour.response, device, torch.float32)
     rows, columns = np.mgrid[0:CANVAS_SIZE_PX, 0:CANVAS_SIZE_PX]
     centre = np.stack([columns.ravel(), rows.ravel()], -1).astype(float)
-    squares = Footprints.of(centre, np.broadcast_to(np.eye(2), (len(centre), 2, 2)), 0.5, device=device)
+    slopes = np.broadcast_to(np.eye(2), (len(centre), 2, 2))
+    squares = Footprints.of(centre, slopes, FOOTPRINT_VARIANCE["area"], device=device)
     size = clean.shape[-2:]
 
     def step() -> Tensor:

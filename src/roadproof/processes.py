@@ -345,18 +345,18 @@ def _pickled_for_the_processor(thing: object) -> bytes:
         return file.getvalue()
 
 
-_opens: Opens[Any] | None = None
-_opened = ExitStack()
-_stop: Event | None = None
-_folder: Path | None = None
-
-
 def _travelling(function: Callable[..., object]) -> bytes:
     """A function as it travels to a process, with whatever controller is in it."""
     try:
         return _pickled_for_the_processor(function)
     except Exception as error:  # of a user's controller
         raise ControllerError(f"a controller cannot travel to another process: {error}; {_PICKLED}") from error
+
+
+_opens: Opens[Any] | None = None
+_opened = ExitStack()
+_stop: Event | None = None
+_folder: Path | None = None
 
 
 def _begin_work(opens: Opens[Any], stop: Event, threads: int, folder: Path) -> None:

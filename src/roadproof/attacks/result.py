@@ -27,7 +27,6 @@ from roadproof.search_space import SearchSpace
 
 _UNITS = {"steering shift": "steer a frame", "path deviation": "predicted m", "speed change": "predicted m/s"}
 _DRIVEN = {"steering shift": "steer, summed over the drives that chose", "path deviation": "m in the drives that chose"}
-_OWN = "its own unit"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -138,7 +137,7 @@ class AttackResult(Candidate):
     def made_large(self) -> str:
         """What was made large, with the unit of its values: "path deviation, predicted m"."""
         aim = self.objective.removesuffix(" over variations")
-        unit = (_UNITS if self.driven is None else _DRIVEN).get(aim, _OWN)
+        unit = (_UNITS if self.driven is None else _DRIVEN).get(aim, "its own unit")
         if isinstance(self.method, Published):
             unit = "steer, summed over frames"
         return f"{self.objective}, {unit}"

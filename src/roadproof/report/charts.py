@@ -24,7 +24,7 @@ from roadproof.driving.episode import Episode
 from roadproof.geometry import CanvasPlacement
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.prediction import Prediction
-from roadproof.report.formatting import in_words
+from roadproof.report.formatting import in_words, plain
 from roadproof.report.plots import LINE_STYLES, draw_search, show_as_it_is
 from roadproof.roads.polylines import polyline_stations
 
@@ -172,7 +172,7 @@ def offsets(
     axes.axhline(0.0, color=CLEAN, linewidth=1.4)
     names = list(dict.fromkeys(name for name, _, _ in drives))
     width = 1.8 if len(drives) == len(names) else 1.1
-    labels = {name: in_words(name) if name in {*Weather} else _in_legend(name) for name in names}
+    labels = {name: in_words(name) if name in {*Weather} else plain(name) for name in names}
     marks: list[Mark] = []
     for name, clean, painted in drives:
         beside = -beside_m(clean, painted)
@@ -185,11 +185,6 @@ def offsets(
     predicted = any(painted.paint.predicted for _, _, painted in drives)
     words = f"Distance from the clean path along the drive, alone on the road{', predicted' if predicted else ''}"
     return _finished(figure, axes, "offsets", words, marks=marks)
-
-
-def _in_legend(name: str) -> str:
-    """A run's name for a legend, which would leave out one that begins with "_"."""
-    return f" {name}" if name.startswith("_") else name
 
 
 def predicted_path(prediction: Prediction, canvas: CanvasPlacement) -> Chart:

@@ -16,6 +16,11 @@ def in_words(name: str) -> str:
     return name.replace("-", " ")
 
 
+def plain(text: str) -> str:
+    """A name that Matplotlib lists among its labels, whatever it begins with."""
+    return (" " if text.startswith("_") else "") + text
+
+
 def mean_in_words(mean: Estimate | None, digits: int) -> str:
     """A mean with half the width of its 95 % interval, "1.33 ± 0.21"; without it where there was one run."""
     if mean is None:

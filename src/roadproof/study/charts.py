@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from roadproof.report.formatting import in_words
+from roadproof.report.formatting import in_words, plain
 from roadproof.study.history import Progress
 from roadproof.study.kept_jobs import KeptJob
 from roadproof.study.results import DEVIATION, Block, Results
@@ -205,8 +205,3 @@ def legend(figure: Figure) -> None:
         labelcolor=INK,
         handlelength=3.0,
     )
-
-
-def plain(text: str) -> str:
-    """A name that Matplotlib lists among its labels, whatever it begins with."""
-    return (" " if text.startswith("_") else "") + text

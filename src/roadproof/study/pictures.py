@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from roadproof.patterns import raster
 from roadproof.pipeline.film import FILMED_M
 from roadproof.recordings import evenly
-from roadproof.report.formatting import in_words
+from roadproof.report.formatting import in_words, plain
 from roadproof.report.road_view import Ground, around_canvas, draw_canvas, draw_road, on_asphalt, road_of
 from roadproof.scenarios import KINDS
-from roadproof.study.charts import INK, LETTER_IN, MUTED, Picture, legend, plain, style
+from roadproof.study.charts import INK, LETTER_IN, MUTED, Picture, legend, style
 from roadproof.study.kept_jobs import KeptJob
 from roadproof.study.results import Results
 from roadproof.study.rows import JobId

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from roadproof.driving.intervals import Estimate
 from roadproof.errors import StudyError
-from roadproof.report.formatting import MISSING
-from roadproof.study.charts import INK, MUTED, Picture, plain
+from roadproof.report.formatting import MISSING, plain
+from roadproof.study.charts import INK, MUTED, Picture
 from roadproof.study.results import DEVIATION, JOB, Metric, check_finite, check_names
 from roadproof.study.rows import Frame, made_by_all
 from roadproof.study.statistics import mean_over_scenarios
