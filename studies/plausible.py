@@ -134,7 +134,7 @@ class Cell:
             self.controller,
             self.scenario,
             pattern,
-            folder=self.folder / "judged",  # of all limits, so that the bare road is driven once
+            folder=self.folder / "evaluation",  # of all limits, so that nothing is driven twice
             driver_name=self.spec,
             weathers=BUDGET.weathers,
             starts=STARTS,

@@ -137,7 +137,7 @@ SUSPENDED = """
 
     def healthy():
         print("begun", flush=True)
-        until = time.process_time() + 0.3
+        until = time.process_time() + 0.1
         while time.process_time() < until:
             pass
         return "done"

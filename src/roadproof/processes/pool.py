@@ -1,39 +1,31 @@
-"""Processes that work beside this one."""
+"""Processes that share out work, each in what it has opened."""
 
 from __future__ import annotations
 
 import atexit
-import io
-import multiprocessing
 import os
 import pickle
-import shutil
-import signal
-import sys
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, partial
+from functools import cache, cached_property, partial
 from itertools import count
-from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar, cast
 
 import torch
 
-from roadproof import foreign
-from roadproof.errors import ControllerError, OutputError, RoadproofError, SimulatorError
-from roadproof.machine import digits, keep_digits, keep_freed_memory
+from roadproof.errors import OutputError, RoadproofError, SimulatorError
+from roadproof.processes.fresh import Fresh, processes_beside, remove_if_orphaned
+from roadproof.processes.travel import arrived, pickled, travelling
 
-DIED = "a driving process died; is there memory for all of them? try with fewer processes"
+_DIED = "a driving process died; is there memory for all of them? try with fewer processes"
 """What is said of one that did not even raise an exception."""
-
-_PICKLED = "several processes need a controller that can be pickled: define its class in a module, or use one process"
 
 Inside = TypeVar("Inside")
 Work = TypeVar("Work")
@@ -70,7 +62,7 @@ class Pool(Generic[Inside]):
         if self.processes > 1:
             # Never more than here: a controller's last digits depend on how many threads compute them.
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
-            self._stop = _Fresh().Event()
+            self._stop = Fresh().Event()
             self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
             given = (self._opens, self._stop, threads, Path(self._folder.name))
             self._beside = [processes_beside(1, _begin_work, *given) for _ in range(self.processes)]
@@ -104,7 +96,7 @@ class Pool(Generic[Inside]):
             function: as of `each`; what it raises is not told.
         """
         if self.processes > 1:
-            travelled = _travelling(function)
+            travelled = travelling(function)
             for process in self._beside:
                 process.submit(_call, travelled, None)
 
@@ -122,18 +114,15 @@ class Pool(Generic[Inside]):
             return Settled(function, None)
         if self._settled is None or self._settled.function is not function:
             path = Path(self._folder.name) / f"settled-{next(self._number)}"
+            content = travelling(function)
             try:
-                with path.open("wb") as file:
-                    _Processor(file).dump(function)
+                path.write_bytes(content)
             except OSError as error:
                 path.unlink(missing_ok=True)
                 raise OutputError(
                     f"cannot write what the processes of a search need to {self._folder.name}: {error.strerror}; let "
                     "TMPDIR be a folder with room for some hundred MB, or use one process"
                 ) from None
-            except Exception as error:  # of a user's controller
-                path.unlink(missing_ok=True)
-                raise ControllerError(f"a search's controller cannot travel: {error}; {_PICKLED}") from error
             before, self._settled = self._settled, Settled(function, path)
             if before is not None and before.file is not None:
                 before.file.unlink(missing_ok=True)
@@ -170,7 +159,7 @@ class Pool(Generic[Inside]):
             for work in works:
                 yield work, asked(self._here, work)
             return
-        call = partial(_call, file or _travelling(asked))
+        call = partial(_call, file or travelling(asked))
         left = _Left(works, alike)
         try:
             free = self._beside if file is None else self._beside * -(-len(works) // self.processes)
@@ -183,7 +172,7 @@ class Pool(Generic[Inside]):
                 for future, (_, work) in finished.items():
                     yield work, cast("Result", pickle.loads(future.result()))  # noqa: S301  # of a process of ours
         except BrokenProcessPool:
-            raise SimulatorError(DIED) from None
+            raise SimulatorError(_DIED) from None
 
 
 def here_or_beside(inside: Inside, opens: Opens[Inside] | None, processes: int) -> Pool[Inside]:
@@ -218,23 +207,6 @@ def stopping() -> bool:
     return _stop is not None and _stop.is_set()
 
 
-def processes_beside(count: int, begin: Callable[..., object] | None = None, *arguments: object) -> ProcessPoolExecutor:
-    """A pool of fresh processes that end with this one, however it ends.
-
-    Fresh, since graphics and torch's threads do not survive a fork. One that outlived its parent would go on writing to
-    the folder in which the next run goes on. As in `load_controller` the current directory is importable, for
-    controllers that travel; foreign calls end, and a GPU multiplies, as in this process. Ctrl-C in a terminal reaches
-    the parent alone.
-
-    Args:
-        count: number of processes, at least 1.
-        begin: function of a module that each process calls before its first work; None for none.
-        arguments: arguments of `begin`.
-    """
-    given = (foreign.limit_s(), digits(), begin, arguments)
-    return ProcessPoolExecutor(count, mp_context=_Fresh(), initializer=_begin, initargs=given)
-
-
 def require_opened(processes: int, opens: object | None) -> None:
     """Refuse several processes where nothing opens a simulator for each, and fewer than one.
 
@@ -245,71 +217,6 @@ def require_opened(processes: int, opens: object | None) -> None:
         raise RoadproofError(
             f"{processes} processes; expected 1, or more with a factory that opens a simulator for each"
         )
-
-
-def require_picklable(driver: object) -> None:
-    """Refuse a controller, or another driver, that cannot travel to processes beside this one.
-
-    Raises:
-        ControllerError: the driver cannot be pickled; the message says why and what to do.
-    """
-    try:
-        foreign.call("pickling the controller", pickle.dumps, driver)
-    except ControllerError as error:
-        raise ControllerError(f"{error}; {_PICKLED}") from error.__cause__
-
-
-class _FreshProcess(SpawnProcess):
-    """A process to which a terminal's Ctrl-C does not come: it ends with its parent, and has nothing to say itself.
-
-    Its handler stays, so that a foreign call that does not come back can be ended by it.
-    """
-
-    def start(self) -> None:
-        """Begin; what is blocked here meanwhile stays so there, from its first import on."""
-        with _ctrl_c_later():
-            super().start()
-
-
-@contextmanager
-def _ctrl_c_later() -> Generator[None]:
-    """Block this thread's SIGINT, and let one that comes to the process meanwhile interrupt it at the end.
-
-    A process whose beginning is interrupted half way would complain of it.
-    """
-    came, handler = list[int](), signal.getsignal(signal.SIGINT)
-    defers = callable(handler) and threading.current_thread() is threading.main_thread()
-    masks = hasattr(signal, "pthread_sigmask")
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set[Any]()
-    if defers:
-        signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        if defers:
-            signal.signal(signal.SIGINT, handler)
-        if masks:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if came:
-            signal.raise_signal(signal.SIGINT)
-
-
-class _Fresh(SpawnContext):
-    Process = _FreshProcess  # pyright: ignore[reportAssignmentType]  # as the standard library's contexts have theirs
-
-
-class _Processor(pickle.Pickler):
-    """Pickles what is on a GPU as if it were on the processor."""
-
-    def reducer_override(self, thing: Any) -> Any:  # noqa: ANN401  # as of `pickle`
-        if isinstance(thing, torch.device) and thing.type == "cuda":
-            return torch.device, ("cpu",)
-        if not isinstance(thing, torch.Tensor) or not thing.is_cuda:
-            return NotImplemented
-        here = thing.detach().cpu().requires_grad_(thing.requires_grad)
-        parameter = isinstance(thing, torch.nn.Parameter)
-        here = torch.nn.Parameter(here, thing.requires_grad) if parameter else here
-        return cast("Any", here).__reduce_ex__(2)
 
 
 class _Left(Generic[Work]):
@@ -339,29 +246,15 @@ def _end(process: ProcessPoolExecutor, _: Event) -> None:
     process.shutdown(cancel_futures=True)
 
 
-def _pickled_for_the_processor(thing: object) -> bytes:
-    with io.BytesIO() as file:
-        _Processor(file).dump(thing)
-        return file.getvalue()
-
-
-def _travelling(function: Callable[..., object]) -> bytes:
-    """A function as it travels to a process, with whatever controller is in it."""
-    try:
-        return _pickled_for_the_processor(function)
-    except Exception as error:  # of a user's controller
-        raise ControllerError(f"a controller cannot travel to another process: {error}; {_PICKLED}") from error
-
-
 _opens: Opens[Any] | None = None
 _opened = ExitStack()
 _stop: Event | None = None
-_folder: Path | None = None
 
 
 def _begin_work(opens: Opens[Any], stop: Event, threads: int, folder: Path) -> None:
-    global _opens, _stop, _folder  # one of each a process, made by its initialiser
-    _opens, _stop, _folder = opens, stop, folder
+    global _opens, _stop  # one of each a process, made by its initialiser
+    _opens, _stop = opens, stop
+    remove_if_orphaned(folder)
     atexit.register(_opened.close)
     torch.set_num_threads(threads)
 
@@ -373,37 +266,4 @@ def _inside() -> Any:  # noqa: ANN401  # whatever the process works in
 
 
 def _call(travelled: bytes | Path, work: object) -> bytes:
-    """What the function gives, as bytes: torch would have shared memory hold it, of which containers have little."""
-    return _pickled_for_the_processor(_function(travelled)(_inside(), work))
-
-
-@lru_cache(maxsize=1)
-def _function(travelled: bytes | Path) -> Callable[[object, object], object]:
-    """What a process is to call; a controller that came with it stays as the pieces before left it."""
-    content = travelled.read_bytes() if isinstance(travelled, Path) else travelled
-    return foreign.call("a controller that travelled to another process", pickle.loads, content)
-
-
-def _begin(
-    limit_s: float, kept: tuple[bool, str], begin: Callable[..., object] | None, arguments: tuple[object, ...]
-) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    keep_freed_memory()
-    foreign.end_calls_after(limit_s)
-    keep_digits(*kept)
-    # What a user's code prints is none of the results, for which standard output is.
-    sys.stdout = sys.stderr
-    # Last, so that nothing in the folder hides an installed module.
-    sys.path.append(str(Path.cwd()))
-    if begin is not None:
-        begin(*arguments)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    if _folder is not None:
-        # A parent that was killed has left it.
-        shutil.rmtree(_folder, ignore_errors=True)
-    os._exit(1)
+    return pickled(arrived(travelled)(_inside(), work))

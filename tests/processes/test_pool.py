@@ -1,4 +1,4 @@
-"""Processes beside this one end with it, also when it is killed; pieces of work are done once, and nobody is left."""
+"""Pieces of work are done once, in processes that stay open, and nobody is left."""
 
 import ctypes
 import multiprocessing
@@ -17,38 +17,8 @@ import pytest
 import torch
 
 from roadproof.errors import ControllerError, OutputError, TrainingError
-from roadproof.processes import Pool, _Left, processes_beside, spread, stopping
-
-SCRIPT = """
-import os, time
-from roadproof.processes import processes_beside
-if __name__ == "__main__":
-    with processes_beside(1) as pool:
-        print(pool.submit(os.getpid).result(), flush=True)
-        pool.submit(time.sleep, 120).result()
-"""
-
-
-def alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks processes up in Linux's /proc")
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGTERM])
-def test_a_process_at_work_ends_when_its_parent_is_killed(blow):
-    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True) as parent:
-        child = int(parent.stdout.readline())
-        assert alive(child)
-        parent.send_signal(blow)
-        parent.wait()
-    deadline = time.monotonic() + 20
-    while alive(child) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not alive(child)
-
+from roadproof.processes import Pool, spread, stopping
+from roadproof.processes.pool import _Left
 
 KILLED_WITH_A_FILE = """
 import sys
@@ -102,43 +72,6 @@ if __name__ == "__main__":
 def test_processes_that_have_only_just_begun_have_nothing_to_say_when_all_is_refused():
     ended = subprocess.run([sys.executable, "-c", ENDED_AT_ONCE], capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (0, "")
-
-
-INTERRUPTED = """
-import signal, sys
-from contextlib import nullcontext
-from roadproof.processes import processes_beside
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, lambda *_: None)  # a parent that is not interrupted itself
-    with processes_beside(1) as pool:
-        work = pool.submit(sum, [1, 2])
-        print("begins", flush=True)
-        print(work.result(), flush=True)
-        print(pool.submit(signal.getsignal, signal.SIGINT).result() is signal.default_int_handler, flush=True)
-"""
-
-
-def test_ctrl_c_in_a_terminal_reaches_the_parent_alone():
-    asked = [sys.executable, "-c", INTERRUPTED]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(asked, **pipes, text=True, start_new_session=True) as parent:
-        assert parent.stdout.readline() == "begins\n"
-        for _ in range(20):
-            os.killpg(parent.pid, signal.SIGINT)
-            time.sleep(0.05)
-        assert parent.communicate() == ("3\nTrue\n", "")
-
-
-def test_what_one_prints_is_none_of_the_results(capfd):
-    with processes_beside(1) as pool:
-        pool.submit(print, "loud", flush=True).result()
-    assert tuple(capfd.readouterr()) == ("", "loud\n")
-
-
-def test_each_begins_as_told():
-    with processes_beside(2, os.putenv, "ROADPROOF_TOLD", "yes") as pool:
-        assert pool.submit(subprocess.getoutput, "echo $ROADPROOF_TOLD").result() == "yes"
-        assert pool.submit(os.getpid).result() != os.getpid()
 
 
 def squared(inside, number):
