@@ -72,6 +72,12 @@ def test_one_frame_becomes_a_batch_in_unit_range():
     assert (speed.tolist(), command.tolist()) == ([6.0], [2])
 
 
+def test_one_frame_goes_where_the_network_is_also_if_all_it_has_are_buffers():
+    frozen = torch.nn.BatchNorm2d(3, affine=False).to("meta")
+    batch = one_frame_batch(frozen, np.zeros((4, 5, 3), np.uint8), 6.0, 2)
+    assert {each.device.type for each in batch} == {"meta"}
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

@@ -17,7 +17,7 @@ from roadproof.controllers import (
     pilotnet_controller,
     save_controller,
 )
-from roadproof.controllers.loading import files_of, load_trainable
+from roadproof.controllers.loading import files_of, load_trainable, runs_code
 from roadproof.errors import ControllerError, DeviceError
 
 
@@ -77,6 +77,102 @@ def test_a_network_with_convolutions_over_time_is_loaded(tmp_path, monkeypatch):
     )
     monkeypatch.chdir(tmp_path)
     assert load_controller("over_time:OverTime").over_time.weight.ndim == 5
+
+
+def test_a_users_own_convolution_may_look_at_its_weights_in_their_order(tmp_path, monkeypatch):
+    (tmp_path / "standardised.py").write_text(
+        "from torch import nn\n"
+        "from roadproof.controllers import CIL\n"
+        "class Standardised(nn.Conv2d):\n"
+        "    def forward(self, x):\n"
+        "        rows = self.weight.view(len(self.weight), -1)\n"
+        "        rows = rows / rows.std(1, keepdim=True)\n"
+        "        return self._conv_forward(x, rows.view_as(self.weight), self.bias)\n"
+        "class Standard(CIL):\n"
+        "    def __init__(self):\n"
+        "        super().__init__(width=0.1)\n"
+        "        self.first = Standardised(3, 3, 3, padding=1)\n"
+        "    def folded(self):\n        return self\n"
+        "    def image_feature(self, frames):\n        return super().image_feature(self.first(frames))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    controller = load_controller("standardised:Standard")
+    assert controller.steer(*drive()).isfinite().all()
+    assert controller.convolutions[0][0].weight.is_contiguous(memory_format=torch.channels_last), "torch's own are faster"
+
+
+SHARED = """
+import torch
+from torch import nn
+class Shared(nn.Module):
+    input_size = None
+    def __init__(self):
+        super().__init__()
+        self.fixed, self.scale = nn.Linear(3, 3), nn.Parameter(torch.tensor(1.1234567))
+        self.fixed.requires_grad_(False)
+    def steer(self, frames, speed_mps, command):
+        return self.scale * self.fixed(frames.mean((2, 3)).to(self.scale.dtype)).sum(1).to(frames.dtype)
+    def act(self, frame, speed_mps, command):
+        raise NotImplementedError
+ONE = Shared()
+def make():
+    return ONE
+class Normed(Shared):
+    def __init__(self):
+        super().__init__()
+        self.fixed = torch.nn.utils.weight_norm(nn.Linear(3, 3))
+OTHER = Normed()
+def normed():
+    return OTHER
+"""
+
+
+@pytest.mark.filterwarnings("ignore:.*weight_norm.*:FutureWarning")
+def test_one_object_of_a_factory_is_not_changed_under_another_that_holds_it(tmp_path, monkeypatch):
+    (tmp_path / "shared_driver.py").write_text(SHARED)
+    monkeypatch.chdir(tmp_path)
+    before = load_controller("shared_driver:make")
+    answer = before.steer(*drive()).clone()
+    tuned = load_trainable("shared_driver:make")
+    assert [name for name, each in tuned.named_parameters() if each.requires_grad] == ["scale"], "the rest stays frozen"
+    with torch.no_grad():
+        tuned.scale += 1.0
+    save_file(dict(tuned.state_dict()), tmp_path / "tuned.safetensors")
+    after = load_controller(f"shared_driver:make@{tmp_path / 'tuned.safetensors'}")
+    load_controller("shared_driver:make", dtype="bfloat16")
+    assert torch.equal(before.steer(*drive()), answer)
+    assert not torch.allclose(after.steer(*drive()), answer)
+    # Torch cannot copy this one: a new one each time it can use, the same one it cannot.
+    assert [name for name, _ in load_trainable("shared_driver:Normed").named_parameters()]
+    with pytest.raises(ControllerError, match=r"copying what shared_driver:normed returns each time \(let it return a"):
+        load_trainable("shared_driver:normed")
+
+
+def test_what_no_weights_file_holds_is_said_before_anything_learns(tmp_path, monkeypatch):
+    (tmp_path / "keeps_more.py").write_text(
+        "from roadproof.controllers import CIL\n"
+        "class KeepsMore(CIL):\n"
+        "    def __init__(self):\n        super().__init__(width=0.1)\n"
+        "    def get_extra_state(self):\n        return {}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ControllerError, match=r"KeepsMore keeps _extra_state beside its tensors"):
+        load_trainable("keeps_more:KeepsMore")
+
+
+@pytest.mark.parametrize(
+    ("spec", "runs"),
+    [
+        ("my_driver:make", True),
+        ("pack.my_driver:make@net.safetensors", True),
+        ("net.pt2", True),
+        ("2026-11-29T10:30:00/net.safetensors", False),
+        ("pilotnet:net.safetensors", False),
+        ("pilotnet", False),
+    ],
+)
+def test_what_runs_its_authors_code_is_known_by_its_spec(spec, runs):
+    assert runs_code(spec) is runs
 
 
 def test_a_factory_is_found_in_the_current_directory(tmp_path, monkeypatch):

@@ -141,6 +141,7 @@ CASES = [
     ("Pad", [IMAGE, ints(0, 0, 1, 2, 0, 0, 3, 4)], {"mode": "reflect"}),
     ("Pad", [IMAGE, ints(1, 2, 3, 4), None, ints(2, -1)], {"mode": "edge"}),
     ("Pow", [POSITIVE, scalar(1.7)], {}),
+    ("Pow", [ints(2, 3), scalar(2.5)], {}),
     ("Reshape", [IMAGE, ints(0, -1)], {}),
     ("Reshape", [IMAGE, ints(7, 8, 9)], {"allowzero": 1}),
     ("Shape", [IMAGE], {"start": 1, "end": -1}),
@@ -208,7 +209,16 @@ def test_an_operator_is_that_of_the_reference(operator, inputs, attributes, tmp_
         ("AveragePool", [IMAGE], {**SAME, "dilations": [2, 2]}, "dilations"),
         ("AveragePool", [IMAGE], {**SAME, "pads": [1, 1, 1, 1], "ceil_mode": 1}, "ceil_mode with pads"),
         ("MaxPool", [IMAGE], {**SAME, "pads": [1, 1, 1, 1], "ceil_mode": 1}, "ceil_mode with pads"),
+        ("BatchNormalization", [IMAGE, *CHANNEL], {"training_mode": 1}, "training_mode"),
+        ("Dropout", [IMAGE, scalar(0.5), np.array(True)], {}, "training_mode"),
         ("LSTM", [STEPS, GATES, GATES], {"hidden_size": 2, "input_forget": 1}, "input_forget"),
+        (
+            "Resize",
+            [IMAGE, None, None, ints(2, 8, 7, 9)],
+            {"mode": "nearest"},
+            "another number of pictures or channels",
+        ),
+        ("Resize", [IMAGE, None, 2 * FACTORS], {"mode": "nearest"}, "another number of pictures or channels"),
         ("Pad", [IMAGE, ints(0, 1, 0, 0, 0, 0, 0, 0)], {"mode": "edge"}, "replicate along the first two axes"),
         ("Resize", [IMAGE, None, FACTORS], {"mode": "cubic", "cubic_coeff_a": -0.5}, "cubic_coeff_a other than"),
         (
@@ -325,6 +335,13 @@ def test_todays_exporter_writes_what_is_read(network, size, tmp_path):
     (expected,) = torch.autograd.grad(network(frames).sum(), frames)
     np.testing.assert_allclose(steer.detach().numpy(), network(frames).detach().numpy(), atol=1e-5)
     np.testing.assert_allclose(gradient.numpy(), expected.numpy(), atol=1e-5)
+
+
+def test_a_whole_number_is_given_as_the_fraction_that_the_file_declares(tmp_path):
+    made = model([helper.make_node("Div", ["x", "c"], ["y"])], [("x", MATRIX[0])], constants={"c": scalar(5.0)})
+    commands = torch.tensor([2, 3, 4, 5, 2])
+    answer = OnnxGraph(written(made, tmp_path))(commands)
+    np.testing.assert_allclose(answer.numpy(), commands / 5.0, rtol=1e-6)
 
 
 def test_constants_move_with_the_module_and_are_cast_with_it(tmp_path):

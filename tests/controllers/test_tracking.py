@@ -80,6 +80,7 @@ def test_a_path_that_ends_goes_on_straight():
     [
         (lambda: PurePursuit(wheelbase_m=0.0), "wheelbase_m of the tracking law is 0.0, expected above 0, below 100"),
         (lambda: PurePursuit(sight_m=math.nan), "sight_m of the tracking law is nan"),
+        (lambda: PurePursuit(sight_m=1.4), "sight_m of the tracking law is 1.4, expected above 1.4"),
         (lambda: LinearMPC(pieces=1000), "pieces of the tracking law is 1000, expected above 0, below 33"),
         (lambda: LinearMPC(smooth_m4=0.0), "smooth_m4"),
     ],

@@ -17,6 +17,7 @@ from roadproof.controllers import (
     pilotnet_controller,
     save_controller,
 )
+from roadproof.controllers.weights_file import fill_from
 from roadproof.errors import ControllerError, OutputError
 
 
@@ -76,6 +77,34 @@ def test_damaged_and_unfitting_weights_are_refused(cil, tmp_path):
     refused(full | {"join.0.bias": eighths}, r"join\.0\.bias has NaN")
 
 
+class Masked(torch.nn.Module):
+    """A network with a mask of attention, which no weights change."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(2))
+        self.register_buffer("mask", torch.tensor([0.0, -torch.inf]))
+
+
+def test_a_mask_of_a_networks_own_may_be_infinite_and_no_other_number(tmp_path):
+    path, network = tmp_path / "masked.safetensors", Masked()
+    save_file({"scale": torch.full((2,), 3.0), "mask": network.mask}, path)
+    fill_from(path, network)
+    assert network.scale.tolist() == [3.0, 3.0]
+    save_file({"scale": torch.full((2,), 3.0), "mask": -network.mask}, path)
+    with pytest.raises(ControllerError, match="tensor mask has NaN or infinite values"):
+        fill_from(path, network)
+
+
+def test_a_card_beside_weights_counts_also_where_the_architecture_is_named(tmp_path):
+    path, card = tmp_path / "net.safetensors", ControllerCard(architecture="pilotnet", target_speed_mps=9.0)
+    save_file(pilotnet_controller().network.state_dict(), path)
+    path.with_suffix(".json").write_text(card.to_json())
+    assert load_controller(f"pilotnet:{path}").cruise.target_mps == 9.0
+    with pytest.raises(ControllerError, match=r"net\.json says that it is 'pilotnet', not 'cil'; give the path alone"):
+        load_controller(f"cil:{path}")
+
+
 def test_what_cannot_be_saved_is_said(cil, tmp_path):
     with pytest.raises(ControllerError, match="folded CIL"):
         save_controller(cil.folded(), tmp_path / "x.safetensors")
@@ -84,6 +113,13 @@ def test_what_cannot_be_saved_is_said(cil, tmp_path):
         save_controller(controller, tmp_path / "x.safetensors")
     with pytest.raises(ControllerError, match=r"a card cannot hold CruiseControl\(.*hold=0\.1\), expected"):
         save_controller(pilotnet_controller(cruise=CruiseControl(hold=0.1)), tmp_path / "x.safetensors")
+    with pytest.raises(ControllerError, match="dtype is 'bfloat16', expected 'float16' or 'float32'"):
+        save_controller(cil, tmp_path / "x.safetensors", dtype="bfloat16")
+    large = CIL(width=0.1)
+    with torch.no_grad():
+        large.join[0].bias[0] = 70_000.0
+    with pytest.raises(ControllerError, match=r"join\.0\.bias has NaN or numbers too large for float16"):
+        save_controller(large, tmp_path / "x.safetensors", dtype="float16")
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         save_controller(cil, tmp_path / "file" / "x.safetensors")

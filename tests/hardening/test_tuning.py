@@ -9,8 +9,10 @@ import torch
 from hardening_road import SPACE, RampNet
 from painted_ground import RampFollower
 from roadproof.attacks.checkpoint import Checkpoint
+from roadproof.controllers import pilotnet_controller
 from roadproof.errors import ControllerError, TrainingError
 from roadproof.hardening import HardeningBudget, Tuning, TuningBatch, views
+from roadproof.hardening.batches import answers
 from roadproof.hardening.tuning import training_step, tune
 
 TUNING = Tuning(steps=20, repeats=3, batch=16, learning_rate=0.3)
@@ -165,3 +167,19 @@ def test_every_second_pass_over_the_streets_paints_what_attacks_do_not(street, m
 def test_tunings_that_make_no_sense_are_refused(changes):
     with pytest.raises(TrainingError, match="expected"):
         Tuning(**changes)
+
+
+def test_steering_that_controls_cut_can_still_be_learnt_from():
+    network = pilotnet_controller()
+    with torch.no_grad():
+        network.network.fc[-1].bias += 3.0
+    frames = torch.rand(2, 3, 88, 200, generator=torch.Generator().manual_seed(0))
+    given = frames, torch.full((2,), 6.0), torch.full((2,), 2)
+    said = answers(network, *given)
+    assert network.controls(*given)[:, 0].tolist() == [1.0, 1.0]
+    torch.testing.assert_close(said[:, 0], network.steer(*given), atol=0.05, rtol=0.0)
+    torch.testing.assert_close(said[:, 1:], network.controls(*given)[:, 1:])
+    assert said[:, 0].min() > 2.0
+    loss = training_step(network, TuningBatch(*given, torch.zeros(2, 3)))
+    loss.backward()
+    assert float(network.network.fc[-1].bias.grad.abs().sum()) > 0.0

@@ -16,7 +16,7 @@ Only `format` and `version` must be there. An exported network (`.onnx`, `.pt2`)
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, cast
 
 from roadproof.controllers.frames import FramePreparation
@@ -31,6 +31,15 @@ CARD_VERSION = 1
 
 PLANNERS = ("waypoint", "temporal")
 """Architectures that answer with points."""
+
+_USED = {
+    None: ("target_speed_mps", "preparation", "tracking", "dt_s", "frames_apart_s"),
+    "cil": ("width",),
+    "pilotnet": ("activation", "target_speed_mps", "preparation"),
+    "conditional-pilotnet": ("preparation",),
+    **dict.fromkeys(PLANNERS, ("preparation", "tracking")),
+}
+"""What a card may say besides the architecture and the origin, by architecture; None is an exported network."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -66,7 +75,8 @@ class ControllerCard(_Stated):
         origin: what the weights were made from, in words; None if it is not said.
 
     Raises:
-        ControllerError: a law for a network that steers, or a time between points or frames that has nothing to act on.
+        ControllerError: a law for a network that steers, a time between points or frames that has nothing to act on,
+            or anything else that would change nothing.
     """
 
     tracking: PurePursuit | LinearMPC | None = None
@@ -87,6 +97,14 @@ class ControllerCard(_Stated):
                 f"frames_apart_s is {self.frames_apart_s}, but only exported networks may take several frames at once, "
                 f"and this is {self.architecture}; drop it"
             )
+
+        # An architecture that is not known is refused where its network is made.
+        used = _USED.get(self.architecture, tuple(each.name for each in fields(self)))
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in ("architecture", "origin", *used) and value != field.default:
+                whose = self.architecture or "an exported network"
+                raise ControllerError(f"{field.name} is {value!r:.80}, for which {whose} has no use; drop it")
 
     def to_json(self) -> str:
         """The card as text, with its format version."""

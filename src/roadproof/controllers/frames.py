@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import torch
@@ -100,7 +101,8 @@ def one_frame_batch(
     network: object, frame: UInt8[np.ndarray, "h w 3"], speed_mps: float, command: int
 ) -> tuple[Float[Tensor, "1 3 h w"], Float[Tensor, " 1"], Int[Tensor, " 1"]]:
     """One camera frame, speed and command as a batch of one on the network's device; the CPU's if it is no module."""
-    first = next(network.parameters(), None) if isinstance(network, nn.Module) else None
+    tensors = chain(network.parameters(), network.buffers()) if isinstance(network, nn.Module) else iter(())
+    first = next(tensors, None)
     device = None if first is None else first.device
     picture = torch.tensor(frame, device=device).permute(2, 0, 1)[None]
     return (

@@ -6,10 +6,11 @@ import copy
 import importlib.util
 import re
 import sys
+import weakref
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import nn
@@ -17,9 +18,10 @@ from torch import nn
 from roadproof.controllers.asking import frame_size_of
 from roadproof.controllers.cards import ControllerCard
 from roadproof.controllers.cil import CIL
+from roadproof.controllers.precision import lay_out
 from roadproof.controllers.protocol import Controller, missing_members
 from roadproof.controllers.shipped import shipped_weights
-from roadproof.controllers.weights_file import ARCHITECTURES, card_beside, existing, fill_from, from_weights
+from roadproof.controllers.weights_file import ARCHITECTURES, card_beside, existing, fill_from, from_weights, tensors_of
 from roadproof.errors import ControllerError, DeviceError
 from roadproof.foreign import call
 
@@ -33,8 +35,7 @@ SPECS = (
 
 def runs_code(spec: str) -> bool:
     """Whether loading a controller from this spec runs its author's code: an exported network, or Python."""
-    head, _, tail = spec.partition(":")
-    return spec.endswith(".pt2") or (bool(tail) and head not in ARCHITECTURES)
+    return spec.endswith(".pt2") or _python_of(spec) is not None
 
 
 def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "float32") -> Controller:
@@ -68,7 +69,8 @@ def load_controller(spec: str | Path, *, device: str = "cpu", dtype: str = "floa
     if dtype == "tf32" and place.type != "cuda":
         raise DeviceError(f"dtype tf32 is how GPUs multiply, {device} does not; use float32")
     text = str(spec)
-    controller = _found(text, place, precision)
+    # A factory may give the same object each time: what another holds keeps its digits.
+    controller = _found(text, place, precision, own=precision != torch.float32)
     return call(f"moving the controller to {place} in {dtype}", _placed, controller, place, precision)
 
 
@@ -80,39 +82,38 @@ def load_trainable(spec: str) -> nn.Module:
             its author left with gradients, or all if there are none.
 
     Raises:
-        ControllerError: as `load_controller`; or the controller is an exported network, or no module with parameters.
+        ControllerError: as `load_controller`; or the controller is an exported network, or no module with parameters,
+            or keeps more than tensors.
     """
     if spec.endswith((".pt2", ".onnx")):
         raise ControllerError(
             f"{spec} is an exported network; to train on, give the Python it came from: module:factory"
         )
-    network = _found(spec, torch.device("cpu"), torch.float32)
+    network = _found(spec, torch.device("cpu"), torch.float32, own=True)
     if not isinstance(network, nn.Module) or not any(True for _ in network.parameters()):
         raise ControllerError(
             f"{spec} gives a {type(network).__name__}, expected a torch.nn.Module with parameters, so that it can learn"
         )
     if not any(each.requires_grad for each in network.parameters()):
         network.requires_grad_(True)
-    # A factory may give the same object each time.
-    return copy.deepcopy(network).eval()
+    tensors_of(network)  # refused here rather than once it has learnt
+    return network.eval()
 
 
-def _found(text: str, device: torch.device, dtype: torch.dtype) -> Controller | nn.Module:
-    """The controller of a spec as its maker returns it, before it is set up for use."""
+def _found(text: str, device: torch.device, dtype: torch.dtype, *, own: bool) -> Controller | nn.Module:
+    """The controller of a spec as its maker returns it, before it is set up for use; of its own, where it changes."""
     head, _, tail = text.partition(":")
-    factory, at, weights = tail.partition("@")
     if head in ARCHITECTURES and tail:
         return from_weights(Path(tail), ControllerCard(architecture=head))
     if re.fullmatch(r"[a-z][a-z0-9-]*", text):
         return from_weights(shipped_weights(text), None)
-    if factory and all(part.isidentifier() for part in (*head.split("."), *factory.split("."))):
-        made = _from_python(head, factory)
-        if at:
+    if (python := _python_of(text)) is not None:
+        maker = f"{python.module}:{python.factory}"
+        made = _from_python(maker) if python.weights is None and not own else _own_from_python(maker)
+        if python.weights is not None:
             if not isinstance(made, nn.Module):
-                raise ControllerError(
-                    f"{head}:{factory} gives a {type(made).__name__}, which has no weights to replace"
-                )
-            fill_from(Path(weights), made)
+                raise ControllerError(f"{maker} gives a {type(made).__name__}, which has no weights to replace")
+            fill_from(python.weights, made)
         return made
     if text.endswith(".safetensors"):
         return from_weights(Path(text), None)
@@ -137,15 +138,14 @@ def files_of(spec: str) -> tuple[Path, ...]:
     Nothing is imported, but for the packages that a module lies in. A controller that comes with roadproof has none.
     """
     head, _, tail = spec.partition(":")
-    factory, at, weights = tail.partition("@")
     named: list[Path] = []
     if head in ARCHITECTURES and tail:
         named = [Path(tail)]
-    elif factory and all(part.isidentifier() for part in (*head.split("."), *factory.split("."))):
+    elif (python := _python_of(spec)) is not None:
         with _current_directory_importable(), suppress(ImportError, ValueError):
-            found = importlib.util.find_spec(head)
+            found = importlib.util.find_spec(python.module)
             named += [Path(found.origin)] if found and found.origin else []
-        named += [Path(weights)] if at else []
+        named += [] if python.weights is None else [python.weights]
     elif (path := Path(spec)).suffix:
         named = [path, path.with_suffix(".json")]
         if path.suffix == ".onnx":
@@ -188,8 +188,41 @@ def imported(spec: str, expected: str) -> Callable[..., object]:
     return found
 
 
-def _from_python(module_name: str, factory_name: str) -> Controller:
-    spec = f"{module_name}:{factory_name}"
+class _Python(NamedTuple):
+    module: str
+    factory: str
+    weights: Path | None
+
+
+def _python_of(spec: str) -> _Python | None:
+    """What a spec names of the user's Python, module:factory or module:factory@FILE; None where it is another."""
+    head, _, tail = spec.partition(":")
+    factory, at, weights = tail.partition("@")
+    names = (*head.split("."), *factory.split("."))
+    if head in ARCHITECTURES or not all(part.isidentifier() for part in names):
+        return None
+    return _Python(head, factory, Path(weights) if at else None)
+
+
+_learns: dict[int, list[bool]] = {}
+"""Which parameters of a module that a factory returned wanted gradients when it did so first, by its identity."""
+
+
+def _own_from_python(spec: str) -> Controller | nn.Module:
+    """What a factory returns, and if that is a module, one that nobody else holds and that is as it was made."""
+    made = _from_python(spec)
+    if not isinstance(made, nn.Module):
+        return made
+    again = _from_python(spec)
+    if again is not made:
+        return again
+    copied = call(f"copying what {spec} returns each time (let it return a new one)", copy.deepcopy, made)
+    for parameter, learns in zip(copied.parameters(), _learns[id(made)], strict=True):
+        parameter.requires_grad_(learns)
+    return copied
+
+
+def _from_python(spec: str) -> Controller:
     factory = imported(spec, f"a function without arguments; or give {SPECS}")
     with _current_directory_importable():
         controller: object = call(spec, factory)
@@ -198,6 +231,9 @@ def _from_python(module_name: str, factory_name: str) -> Controller:
         raise ControllerError(
             f"{spec} returned a {type(controller).__name__} without {', '.join(missing)}, expected a Controller"
         )
+    if isinstance(controller, nn.Module) and id(controller) not in _learns:
+        _learns[id(controller)] = [each.requires_grad for each in controller.parameters()]
+        weakref.finalize(controller, _learns.pop, id(controller), None)
     frame_size_of(made := cast("Controller", controller))
     return made
 
@@ -219,12 +255,8 @@ def _placed(controller: Controller | nn.Module, device: torch.device, dtype: tor
     if isinstance(controller, CIL):
         controller = controller.folded()
     if isinstance(controller, nn.Module):
-        controller.eval().requires_grad_(False)
-        # Measured on two processors: convolutions by channels-last weights run 1.3 times as fast, gradients included.
-        # Torch has it for pictures alone, not for weights over time as well.
-        flat = all(each.ndim != 5 for each in (*controller.parameters(), *controller.buffers()))
-        order = {"memory_format": torch.channels_last} if flat else {}
-        cast("Any", controller).to(device=device, dtype=dtype, **order)
+        controller.eval().requires_grad_(False).to(device=device, dtype=dtype)
+        lay_out(controller)
     assert isinstance(controller, Controller)
     return controller
 

@@ -107,7 +107,11 @@ class OnnxGraph(nn.Module):
         Raises:
             ControllerError: a node cannot be computed; the message names it and the shapes it met.
         """
-        values: dict[str, Tensor | None] = {"": None, **dict(zip(self.inputs, inputs, strict=True))}
+        # The graph says where it computes with fractions; a command comes as a whole number.
+        own = next((each.dtype for each in inputs if each.is_floating_point()), torch.float32)
+        given = zip(self.inputs, inputs, strict=True)
+        values: dict[str, Tensor | None] = {"": None}
+        values |= {name: each if name in self.whole else each.to(own) for name, each in given}
         values |= {name: cast("Tensor", getattr(self, buffer)) for name, buffer in self._buffer_of.items()}
         for node in self._nodes:
             arguments = [values[name] for name in node.inputs]

@@ -118,6 +118,10 @@ def _resize(a: Attributes, x: Inputs) -> Tensor:
     rounding = a.get("nearest_mode", b"round_prefer_floor") if mode == b"nearest" else None
     picture: Tensor = x[0]
     sizes, scales = _integers(_get(x, 3)), _get(x, 2)
+    if (sizes and sizes[:2] != [*picture.shape[:2]]) or (
+        not sizes and scales is not None and bool((scales[:2] != 1).any())
+    ):
+        raise ValueError("another number of pictures or channels")
     size = sizes[2:] if sizes else None
     factor = None if sizes or scales is None else [float(each) for each in scales[2:]]
     if (mode, places, rounding) == (b"nearest", b"half_pixel", b"round_prefer_floor"):
@@ -287,6 +291,19 @@ def _reduced(kind: Callable[..., Tensor]) -> Operator:
     return apply
 
 
+def _batch_normalization(a: Attributes, x: Inputs) -> Tensor:
+    if a.get("training_mode"):
+        raise ValueError("training_mode")
+    return functional.batch_norm(x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5))
+
+
+def _dropout(_: Attributes, x: Inputs) -> Tensor:
+    training = _get(x, 2)
+    if training is not None and bool(training):
+        raise ValueError("training_mode")
+    return x[0]
+
+
 def _length(x: Tensor, *, dim: tuple[int, ...], keepdim: bool) -> Tensor:
     return x.square().sum(dim, keepdim=keepdim).sqrt()
 
@@ -300,9 +317,7 @@ OPERATORS: dict[str, Operator] = {
     "Add": _elementwise(torch.add),
     "And": _elementwise(torch.logical_and),
     "AveragePool": _average_pool,
-    "BatchNormalization": lambda a, x: functional.batch_norm(
-        x[0], x[3], x[4], x[1], x[2], training=False, eps=a.get("epsilon", 1e-5)
-    ),
+    "BatchNormalization": _batch_normalization,
     "Cast": lambda a, x: x[0].to(DTYPES[a["to"]]),
     "Ceil": _elementwise(torch.ceil),
     "Celu": lambda a, x: functional.celu(x[0], a.get("alpha", 1.0)),
@@ -314,7 +329,7 @@ OPERATORS: dict[str, Operator] = {
     "Cos": _elementwise(torch.cos),
     "DepthToSpace": _depth_to_space,
     "Div": lambda _, x: torch.div(x[0], x[1], rounding_mode=None if x[0].is_floating_point() else "trunc"),
-    "Dropout": lambda _, x: x[0],
+    "Dropout": _dropout,
     "Einsum": lambda a, x: torch.einsum(a["equation"].decode(), *x),
     "Elu": lambda a, x: functional.elu(x[0], a.get("alpha", 1.0)),
     "Equal": _elementwise(torch.eq),
@@ -361,7 +376,7 @@ OPERATORS: dict[str, Operator] = {
     "Or": _elementwise(torch.logical_or),
     "PRelu": lambda _, x: torch.where(x[0] < 0, x[0] * x[1], x[0]),
     "Pad": _pad,
-    "Pow": _elementwise(torch.pow),
+    "Pow": lambda _, x: torch.pow(x[0], x[1]).to(x[0].dtype),
     "Range": lambda _, x: torch.arange(*(part.item() for part in x), dtype=x[0].dtype, device=x[0].device),
     "Reciprocal": _elementwise(torch.reciprocal),
     "ReduceL2": _reduced(_length),

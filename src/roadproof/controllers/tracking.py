@@ -70,7 +70,7 @@ class PurePursuit(TrackingLaw):
 
     Args:
         sight_s: how far along the path the point lies, in seconds of travel.
-        sight_m: the least distance of that point, metres.
+        sight_m: the least distance of that point from the rear axle, metres, more than half the wheelbase.
     """
 
     sight_s: float = 0.75
@@ -79,7 +79,7 @@ class PurePursuit(TrackingLaw):
     def ranges(self) -> tuple[tuple[str, float, float], ...]:
         """Name, lower and upper bound of each number."""
         # Named: `super()` without arguments does not find its class in dataclasses with slots.
-        return (*TrackingLaw.ranges(self), ("sight_s", -1e-9, 100.0), ("sight_m", 0.0, 1000.0))
+        return (*TrackingLaw.ranges(self), ("sight_s", -1e-9, 100.0), ("sight_m", 0.5 * self.wheelbase_m, 1000.0))
 
     def curvature(self, path: Float[Tensor, "b n 2"], speed_mps: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
         """Curvature of the arc that leads the car on to the path, 1/m, left positive."""

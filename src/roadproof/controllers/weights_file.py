@@ -70,7 +70,7 @@ def save_controller(
 
     Raises:
         ControllerError: the controller is another network, or a folded one, which is to be saved as it was trained; or
-            it keeps its speed as no card says.
+            it keeps its speed as no card says; or the format is unknown, or too small for a number.
         OutputError: the file cannot be written; an older file of that name stays whole.
     """
     network: nn.Module = controller
@@ -99,9 +99,28 @@ def save_controller(
         usual = CruiseControl(target_mps=card.target_speed_mps) if card.architecture == "pilotnet" else WAYPOINT_CRUISE
         if controller.cruise != usual:
             raise ControllerError(f"a card cannot hold {controller.cruise}, expected {usual}; save it with that")
+    if dtype not in ("float16", "float32"):
+        raise ControllerError(f"dtype is {dtype!r}, expected 'float16' or 'float32'")
     kept = torch.float16 if dtype == "float16" else torch.float32
-    tensors = {name: tensor.detach().cpu().to(kept).contiguous() for name, tensor in network.state_dict().items()}
+    tensors = {name: tensor.to(kept) for name, tensor in tensors_of(network).items()}
+    if too_large := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise ControllerError(f"tensor {too_large[0]} has NaN or numbers too large for {dtype}; save in float32")
     write_tensors(as_path(path), tensors, {_METADATA_KEY: replace(card, origin=origin).to_json()})
+
+
+def tensors_of(network: nn.Module) -> dict[str, Shaped[Tensor, "..."]]:
+    """What a file of a network's weights holds, each tensor for itself.
+
+    Raises:
+        ControllerError: the network has more than tensors to keep.
+    """
+    state: dict[str, object] = network.state_dict()
+    if other := [name for name, value in state.items() if not isinstance(value, Tensor)]:
+        raise ControllerError(
+            f"{type(network).__name__} keeps {other[0]} beside its tensors (get_extra_state), which no weights file "
+            "holds; let a buffer hold it"
+        )
+    return {name: cast("Tensor", value).detach().cpu().clone().contiguous() for name, value in state.items()}
 
 
 def from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
@@ -109,21 +128,19 @@ def from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
 
     Args:
         path: the weights file.
-        card: what the network is, where the file's own header does not say; None to read it beside the file then.
+        card: what the network is, where neither the file's header nor a card beside it says so.
 
     Raises:
         ControllerError: the file is missing or damaged, nothing says of which network it is, or it does not fit that.
     """
     state, header = _read(existing(path))
-    if header is not None:
-        own = read_card(header, str(path))
-        if card is not None and own.architecture != card.architecture:
-            raise ControllerError(
-                f"{path} says that it is {own.architecture!r}, not {card.architecture!r}; give the path alone"
-            )
-        card = own
-    elif card is None:
-        card = card_beside(path)
+    own = read_card(header, str(path)) if header is not None else card_beside(path)
+    if own is not None and card is not None and own.architecture != card.architecture:
+        raise ControllerError(
+            f"{path if header is not None else path.with_suffix('.json')} says that it is {own.architecture!r}, not "
+            f"{card.architecture!r}; give the path alone"
+        )
+    card = own or card
     if card is None or card.architecture not in ARCHITECTURES:
         found = "nothing" if card is None or card.architecture is None else repr(card.architecture)
         raise ControllerError(
@@ -167,7 +184,8 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
             raise ControllerError(f"{path}: tensor {key} has shape {shapes} for this {name}")
         if tensor.is_floating_point() != expected[key].is_floating_point():
             raise ControllerError(f"{path}: tensor {key} is of type {tensor.dtype}, expected {expected[key].dtype}")
-        if not tensor.float().isfinite().all():  # of numbers of 8 bits torch does not tell
+        # Of numbers of 8 bits torch does not tell. A mask of a network's own may be infinite.
+        if not tensor.float().isfinite().all() and not torch.equal(tensor.float(), expected[key].float()):
             raise ControllerError(f"{path}: tensor {key} has NaN or infinite values")
     network.load_state_dict(state)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from roadproof.controllers import Controller
-from roadproof.controllers.asking import next_controls_of
+from roadproof.controllers.asking import next_controls_of, steer_of
 from roadproof.controllers.conditional import ConditionalNetwork
 from roadproof.controllers.precision import mixed_precision
 from roadproof.hardening.town import Town
@@ -38,7 +38,7 @@ class TuningBatch(NamedTuple):
 def answers(
     controller: Controller, frames: Float[Tensor, "b 3 h w"], speed_mps: Float[Tensor, " b"], command: Int[Tensor, " b"]
 ) -> Float[Tensor, "b c"]:
-    """Steer, throttle and brake where a controller says them for batches, else steer alone.
+    """Steer, throttle and brake where a controller says them for batches, else steer alone; steer is not clipped.
 
     Those of a conditional network are its linear ones: the rules of its agent have no gradient where they cut. A
     temporal controller is asked about frames as the first ones of a drive.
@@ -49,7 +49,13 @@ def answers(
     with mixed_precision(frames.device):
         if isinstance(controller, ConditionalNetwork):
             return controller(frames, speed_mps, command).controls.float()
-        return next_controls_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
+        said = next_controls_of(controller, None, frames, speed_mps, command, 0.0)[0].float()
+        cut = said[:, 0].abs() >= 1.0
+        if said.shape[1] == 1 or not bool(cut.any()):
+            return said
+        # Controls have no gradient where steering is cut; what `steer` answers is not.
+        steer = steer_of(controller, frames, speed_mps, command).float()
+        return torch.cat([torch.where(cut, steer, said[:, 0])[:, None], said[:, 1:]], 1)
 
 
 class Shown(NamedTuple):

@@ -15,6 +15,7 @@ from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import CIL, ConditionalPilotNet, Controller, save_controller
 from roadproof.controllers.loading import load_trainable, runs_code
 from roadproof.controllers.steering import NetworkController
+from roadproof.controllers.weights_file import tensors_of
 from roadproof.errors import EpisodeError, RecordingError, TrainingError
 from roadproof.hardening.judgement import BareDrives, JudgedAttack, StreetJudge, clean_drives
 from roadproof.hardening.plan import HardeningPlan
@@ -142,14 +143,26 @@ class HardeningStages:
         judged: list[JudgedAttack] = []
         with self.ledger.stage("judge"):
             # All before come first: the one after also drives over what was found against the one before.
-            for number, when in ((0, "before"), (best, "after")):
-                self._together(f"Judging {when}", _judge_street, number, judge_on)
-            for scenario in judge_on:
-                for number, when in ((0, "before"), (best, "after")):
-                    told = self._under(f"Judging {when}, {scenario.name}")
-                    judged += StreetJudge(self.plan, self.simulator, number, scenario, told).judge()
+            judged += self._judged(0, "before", judge_on)
+            try:
+                judged += self._judged(best, "after", judge_on)
+            except (EpisodeError, RecordingError) as error:
+                raise TrainingError(
+                    f"it did not help: hardened in round {best} the controller no longer drives a street for judging "
+                    f"without paint: {error}; harden with other streets, another seed or fewer rounds"
+                ) from None
             self.ledger.calls("judge", sum(each.simulator_calls for each in judged))
         return tuple(judged)
+
+    def _judged(self, number: int, when: str, judge_on: Sequence[Scenario]) -> list[JudgedAttack]:
+        self._together(f"Judging {when}", _judge_street, number, judge_on)
+        return [
+            each
+            for scenario in judge_on
+            for each in StreetJudge(
+                self.plan, self.simulator, number, scenario, self._under(f"Judging {when}, {scenario.name}")
+            ).judge()
+        ]
 
     def drive_clean(self, best: int, scenarios: Sequence[Scenario]) -> tuple[BareDrives, BareDrives]:
         """Drive over the bare road with the controllers before and after."""
@@ -249,5 +262,4 @@ def _save(network: nn.Module, plan: HardeningPlan, number: int) -> None:
     if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(plan.spec):
         save_controller(network, path, origin=origin)
         return
-    tensors = {name: tensor.detach().cpu().clone().contiguous() for name, tensor in network.state_dict().items()}
-    write_tensors(path, tensors, {"roadproof-origin": origin})
+    write_tensors(path, tensors_of(network), {"roadproof-origin": origin})

@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from roadproof.attacks.checkpoint import Checkpoint
 from roadproof.controllers import Controller
-from roadproof.controllers.precision import mixed_precision
+from roadproof.controllers.precision import lay_out, mixed_precision
 from roadproof.datatypes import Command
 from roadproof.errors import TrainingError
 from roadproof.foreign import call
@@ -145,8 +145,7 @@ def tune(
         ControllerError: a controller or the training step raises, or a controller answers wrongly.
     """
     place = torch.device(device)
-    # Convolutions by channels-last pictures run 1.3 times as fast.
-    network.to(device=place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+    lay_out(network.to(place).eval())
     parameters = [each for each in network.parameters() if each.requires_grad]
     optimiser = torch.optim.AdamW(parameters, tuning.learning_rate, weight_decay=0.0)
     passes = _passes(teacher, spaces, found.to(device), tuning)
