@@ -321,6 +321,12 @@ def test_paints_that_show_nothing_are_refused():
         pixel_maps_from_two_paints(light, light)
     with pytest.raises(ColourError, match="saturated"):
         pixel_maps_from_two_paints(torch.full_like(light, 255), dark)
+    red = light.clone()
+    red[..., 0] += (red[..., 0] > 120).to(torch.uint8) * (255 - red[..., 0])
+    with pytest.raises(
+        ColourError, match=r"\d+% of what is seen of the white paint is saturated in a channel, expected"
+    ):
+        pixel_maps_from_two_paints(red, dark)
 
 
 def real_renders(folder: Path, keys: list[int]) -> tuple[torch.Tensor, torch.Tensor]:

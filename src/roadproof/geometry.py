@@ -58,8 +58,8 @@ class CameraModel:
     def __post_init__(self) -> None:
         if self.width_px < 1 or self.height_px < 1:
             raise GeometryError(f"camera picture is {self.width_px}×{self.height_px}, expected at least 1×1 pixels")
-        if not 0.0 < self.fov_deg < 180.0:
-            raise GeometryError(f"camera fov_deg is {self.fov_deg}, expected a value between 0 and 180")
+        if not 0.1 <= self.fov_deg <= 179.0:
+            raise GeometryError(f"camera fov_deg is {self.fov_deg}, expected 0.1 to 179")
         if self.width_px * self.height_px > MOST_PIXELS:
             raise GeometryError(f"camera picture is {self.width_px}×{self.height_px}, expected {MOST_PIXELS:,} at most")
         for name, most in (("forward_m", 1e4), ("left_m", 1e4), ("up_m", 1e4), ("pitch_deg", 360.0)):
@@ -183,6 +183,8 @@ class CropResize:
         if not (0 <= self.left_px < self.right_px and 0 <= self.top_px < self.bottom_px):
             box = (self.left_px, self.top_px, self.right_px, self.bottom_px)
             raise GeometryError(f"crop box (left, top, right, bottom) is {box}, expected a box that is not empty")
+        if max(self.right_px, self.bottom_px) > MOST_PIXELS:
+            raise GeometryError(f"crop box ends at {max(self.right_px, self.bottom_px):g} px, beyond any picture")
         if self.width_px < 1 or self.height_px < 1 or self.width_px * self.height_px > MOST_PIXELS:
             raise GeometryError(
                 f"controller input is {self.width_px}×{self.height_px}, expected at least 1×1 pixels and at most "

@@ -19,7 +19,7 @@ from roadproof.coverage import Shape
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.io.records import plain
-from roadproof.limits import MAX_FIGURES
+from roadproof.limits import MAX_FIGURES, is_whole
 from roadproof.paint.limits import PaintLimits, shrunk
 from roadproof.paint.site import Site
 from roadproof.patterns import Pattern, boxes_from_published, published_from_boxes
@@ -96,7 +96,7 @@ class SearchSpace:
     site: Site | None = None
 
     def __post_init__(self) -> None:
-        if not 1 <= self.figures <= MAX_FIGURES:
+        if not is_whole(self.figures) or not 1 <= self.figures <= MAX_FIGURES:
             raise PatternError(f"number of figures is {self.figures}, expected 1 to {MAX_FIGURES}")
         if self.family not in FAMILIES:
             raise PatternError(f"family is {self.family!r:.40}, expected one of {', '.join(FAMILIES)}")
@@ -107,7 +107,9 @@ class SearchSpace:
         if self.family != "free" and self.shape is not Shape.RECTANGLE:
             raise PatternError(f"the {self.family} family has rectangles only; use the free family for a {self.shape}")
         match self.albedo:
-            case (float() | int() as low, float() | int() as high) if 0.0 <= low < high <= 1.0:
+            case (float() | int() as low, float() | int() as high) if (
+                type(self.albedo) is tuple and 0 <= low < high <= 1
+            ):
                 pass
             case _:
                 raise PatternError(f"albedo is {self.albedo!r:.80}, expected two numbers, 0 ≤ lowest < highest ≤ 1")
@@ -218,6 +220,8 @@ class SearchSpace:
         boxes = pattern.boxes
         if self.shape is Shape.TRIANGLE:
             boxes = boxes * boxes.new_tensor(_HALF_TURN)
+        else:
+            boxes = torch.cat([boxes[..., :4], boxes[..., 4:].remainder(180.0)], -1)
         natural = boxes if self.family == "free" else published_from_boxes(boxes, rotate_about=self._rotate_about)
         low = natural.new_tensor([p.low for p in parameters])
         unit = (natural - low) / natural.new_tensor(self.shape_ranges)

@@ -11,7 +11,7 @@ import torch
 from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import GradOpt, PathDeviation, Published, SteeringShift, Surrogate, attack, method_of
 from roadproof.attacks.gradopt import Rung, gradopt
-from roadproof.attacks.groups import RIGHT_GROUP
+from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.compositing import Variation
 from roadproof.errors import RoadproofError
 from roadproof.recorded.vehicle import Vehicle
@@ -63,10 +63,10 @@ def test_the_value_is_the_mean_over_looks_and_the_gradient_is_its_own(road, obje
             name: getattr(looks, name)[k : k + 1]
             for name in ("gain", "blur", "shift_m", "turn_deg", "wear", "wave", "phase")
         }
-        measure._looks = replace(looks, noise=0.0, **one)
+        measure._looks, measure._bare = replace(looks, noise=0.0, **one), {}
         alone.append(measure.values(SPACE, unit))
     if not isinstance(measure, Surrogate):
-        measure._looks = replace(looks, noise=0.0)
+        measure._looks, measure._bare = replace(looks, noise=0.0), {}
         torch.testing.assert_close(measure.values(SPACE, unit), torch.stack(alone).mean(0), atol=1e-5, rtol=1e-3)
         return
     # The steering shift of this linear controller is checked against finite differences instead.
@@ -75,6 +75,14 @@ def test_the_value_is_the_mean_over_looks_and_the_gradient_is_its_own(road, obje
     step[0, 0, 0, 1] = 2e-3
     slope = (measure.values(SPACE, unit + step) - measure.values(SPACE, unit - step))[0, 0] / 4e-3
     torch.testing.assert_close(slope, gradient[0, 0, 0, 1], rtol=0.1, atol=1e-6)
+
+
+def test_what_looks_do_to_the_bare_road_is_not_the_paints(road):
+    nothing = SearchSpace(figures=2, max_painted_share=1e-12)
+    for groups in ([RIGHT_GROUP], [LEFT_GROUP]):
+        measure = PathDeviation(variation=Variation(draws=3)).measure(road, PullsToBrightPaint(), groups, device="cpu")
+        measure.redraw(11)
+        assert float(measure.values(nothing, units()).abs().max()) < 1e-3
 
 
 def test_every_step_has_looks_of_its_own_from_the_seed_and_an_interrupted_search_goes_on_to_the_same(road, tmp_path):

@@ -134,6 +134,19 @@ def test_the_same_seed_finds_the_same_and_an_interrupted_search_goes_on_to_it(ro
     assert np.array_equal(gone_on.history, whole.history)
 
 
+def test_a_search_for_a_faster_car_does_not_go_on_as_one_for_a_slower(road, tmp_path):
+    def interrupt(step, _):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    faster, slower = (parse_groups(word, road) for word in ("faster", "slower"))
+    stopped = tmp_path / "search.safetensors"
+    with pytest.raises(KeyboardInterrupt):
+        search(road, groups=faster, checkpoint=stopped, on_step=interrupt)
+    gone_on, whole = (search(road, groups=slower, checkpoint=path) for path in (stopped, None))
+    assert gone_on.by_group == whole.by_group
+
+
 def test_the_result_of_another_objective_is_not_gone_on_from(road, tmp_path):
     given = {"method": RandomSearch(calls=2)}
     found = kept_attack(tmp_path, road, Careful(), SPACE, objective=SpeedChange(), **given)

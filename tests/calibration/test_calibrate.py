@@ -161,6 +161,11 @@ def test_a_calibration_is_kept_for_its_own_drives_and_method(two_paint, drives, 
     again = dataclasses.replace(drives, drives=(steered, *others))
     with pytest.raises(CalibrationError, match=r"holds a calibration with drives\.clean '"):
         Calibrated.kept(tmp_path, again, CalibrationMethod.TWO_PAINT)
+    settings = drives.settings
+    canvas = dataclasses.replace(settings.scenario.canvas, length_m=settings.scenario.canvas.length_m + 1.0)
+    longer = dataclasses.replace(settings, scenario=dataclasses.replace(settings.scenario, canvas=canvas))
+    with pytest.raises(CalibrationError, match="holds a calibration with canvas"):
+        Calibrated.kept(tmp_path, dataclasses.replace(drives, settings=longer), CalibrationMethod.TWO_PAINT)
     two_paint.report.save(tmp_path / "calibration" / "report.json")  # alone, it does not say of which drives it is
     with pytest.raises(CalibrationError, match="holds a calibration that does not say what it was made of; choose ano"):
         Calibrated.kept(tmp_path, drives, CalibrationMethod.TWO_PAINT)

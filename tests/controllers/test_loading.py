@@ -98,7 +98,9 @@ def test_a_users_own_convolution_may_look_at_its_weights_in_their_order(tmp_path
     monkeypatch.chdir(tmp_path)
     controller = load_controller("standardised:Standard")
     assert controller.steer(*drive()).isfinite().all()
-    assert controller.convolutions[0][0].weight.is_contiguous(memory_format=torch.channels_last), "torch's own are faster"
+    assert controller.convolutions[0][0].weight.is_contiguous(memory_format=torch.channels_last), (
+        "torch's own are faster"
+    )
 
 
 SHARED = """

@@ -135,6 +135,10 @@ def test_pictures_and_steering_alone_are_imported(tmp_path):
     assert "the ground of 14 pictures, which agrees from one to the next with a correlation of 0." in recordings.origin
     stated = import_drives(written(tmp_path / "stated", pictures, steer=-rate, speed_mps=np.full(14, 7.0)))
     np.testing.assert_array_equal(stated.recordings[0].track.speed_mps, 7.0)
+    with pytest.raises(
+        RecordingError, match=r"the ground in the pictures moves 0\.\d\d times as fast as speed_mps says"
+    ):
+        import_drives(written(tmp_path / "kmh", pictures, steer=-rate, speed_mps=np.full(14, 3.6 * 7.0)))
 
 
 def test_a_table_without_steering_or_with_gaps_is_refused(tmp_path):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 import tracemalloc
 from dataclasses import replace
@@ -106,6 +107,44 @@ def test_a_speed_in_another_unit_than_the_poses_is_refused(tmp_path):
     assert import_drives(folder).is_placed
     write_table(table, [row | {"speed_mps": 3.6 * float(row["speed_mps"])} for row in rows])
     with pytest.raises(RecordingError, match=r"clean.csv: poses move 0\.28 times as fast as speed_mps says"):
+        import_drives(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "message"),
+    [
+        ("yaw_rad", lambda yaw: math.degrees(yaw), r"the car moves \d\.\d\d rad beside its yaw_rad .* give radians"),
+        ("yaw_rad", lambda yaw: math.pi / 2 - yaw, "rad beside its yaw_rad"),
+        ("yaw_rad", lambda yaw: yaw + math.pi, r"moves 3\.\d\d rad beside"),
+    ],
+)
+def test_headings_that_are_not_the_way_the_car_goes_are_refused(tmp_path, name, changed, message):
+    folder = write_own(tmp_path / "own", ["clean"])
+    rows = list(csv.DictReader((folder / "clean.csv").read_text().splitlines()))
+    write_table(folder / "clean.csv", [row | {name: changed(float(row[name]))} for row in rows])
+    with pytest.raises(RecordingError, match=message):
+        import_drives(folder)
+
+
+def test_poses_that_wait_and_jump_give_no_speed(tmp_path):
+    folder = write_own(tmp_path / "own", ["clean"])
+    rows = list(csv.DictReader((folder / "clean.csv").read_text().splitlines()))
+    held = [row | {name: rows[k - k % 5][name] for name in ("x_m", "y_m")} for k, row in enumerate(rows)]
+    write_table(folder / "clean.csv", held)
+    assert import_drives(folder).is_placed, "its speed is stated"
+    bare = [{name: value for name, value in row.items() if name != "speed_mps"} for row in held]
+    write_table(folder / "clean.csv", bare)
+    with pytest.raises(RecordingError, match=r"poses change in \d+ of \d+ steps, now and then"):
+        import_drives(folder)
+
+
+def test_a_yaw_rate_in_degrees_is_refused(tmp_path):
+    plan = PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 36.0")
+    folder = write_own(tmp_path / "own", ["clean"], ["yaw_rate_rad_s"], plan)
+    rows = list(csv.DictReader((folder / "clean.csv").read_text().splitlines()))
+    quick = [row | {"yaw_rate_rad_s": 3.0} for row in rows]
+    write_table(folder / "clean.csv", quick)
+    with pytest.raises(RecordingError, match=r"the car turns on circles of \d\.\d m, expected 3 m or more"):
         import_drives(folder)
 
 

@@ -96,6 +96,14 @@ def test_nothing_swerves_over_a_canvas_that_is_seen_from_one_place(side):
         offsets(side, 1.5, 10.0, 10.0, 60.0, np.random.default_rng(0))
 
 
+def test_weaves_to_any_side_begin_where_the_generator_says():
+    one, other = (
+        offsets(Side.RANDOM, 0.5, 15.0, 45.0, 60.0, np.random.default_rng(seed), weaves=True) for seed in (1, 2)
+    )
+    assert np.abs(one.offset_m - other.offset_m).max() > 0.1
+    assert max(np.abs(each.offset_m).max() for each in (one, other)) <= 0.5
+
+
 def test_a_weave_turns_the_car_both_ways_about_the_clean_path():
     path = CleanPath.of(episode(*drive(bend, 0.3)))
     length_m = float(path.arclength_m[-1])

@@ -206,4 +206,4 @@ def test_a_scenario_that_the_simulator_refuses_leaves_the_folder_to_the_mended_o
     nowhere = dataclasses.replace(LEFT, map_name="nope")
     with pytest.raises(ScenarioError, match="nope"):
         record(town, expert, nowhere, folder=tmp_path / "record", **ASKED)
-    assert not (tmp_path / "record" / "record.json").exists()
+    assert not (tmp_path / "record").exists()

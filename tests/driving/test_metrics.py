@@ -246,6 +246,21 @@ def test_beyond_the_end_of_a_drive_that_ended_early_nothing_is_beside_it():
     assert len(beyond) == 1
 
 
+@pytest.mark.parametrize("creep_m", [-0.0007, 0.0003])
+@pytest.mark.parametrize("turned", [0.0, 2.5])
+def test_a_drive_that_ends_standing_says_nothing_of_where_it_creeps(creep_m, turned):
+    way = line()
+    end = way[50] + 0.4 * np.array([math.cos(turned), math.sin(turned)])
+    # A car that was hit turns within half a metre; one that brakes creeps for fifteen seconds.
+    tail = end + np.column_stack([creep_m * np.arange(300), np.zeros(300)])
+    stands = on_path(*np.concatenate([way[:51], tail]).T, Ending.BLOCKED)
+    arrives = on_path(*(way + np.array([0.0, 0.3])).T, Ending.GOAL_REACHED)
+    beside = deviation.beside_m(stands, arrives)
+    np.testing.assert_allclose(beside[:48], 0.3, atol=1e-9)
+    assert len(beside) < 60
+    assert np.abs(beside).max() < 0.5
+
+
 @pytest.mark.parametrize("ending", [each for each in Ending if each is not Ending.GOAL_REACHED])
 def test_a_clean_drive_short_of_its_goal_is_no_measure_of_what_went_on(ending):
     # Both drive the same quarter of a circle; the clean drive ended on the way.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import needs
 import roadproof
 from command import answered, stored
 from roadproof.controllers import load_controller
@@ -154,6 +155,24 @@ def test_who_does_not_drive_well_without_paint_does_not_pass(team, tmp_path, con
     assert {found[name].status for name in ("green", "magenta")} == {Status.TOO_FEW}
     assert not (tmp_path / "worst.jpg").exists()
     assert "worst.jpg" not in (tmp_path / "summary.md").read_text()
+
+
+def test_a_full_check_of_who_does_not_drive_well_fails_and_attacks_nothing(team, tmp_path):
+    needs.town()
+    plan = (team / "check.toml").read_text().replace('scenario_file = "scenarios.toml"\n', "")
+    plan = plan.replace('patterns = "patterns"\n', "").replace("test-road", "left-03")
+    plan = plan.replace("[smoke]\nrecordings", "[full]\n# recordings")
+    plan = plan.replace("stored = { deviation_m = 0.2, left_lane = 0.0 }", "fresh = { deviation_m = 0.5 }")
+    (team / "full.toml").write_text(plan)
+    result = run_check(load_check(team / "full.toml", budget="full", trust=True), Blind(), tmp_path)
+    assert [(case.kind, case.status) for case in result.cases] == [
+        (Kind.BARE, Status.FAILED),
+        (Kind.FRESH, Status.TOO_FEW),
+        (Kind.FRESH, Status.TOO_FEW),
+    ]
+    assert not (tmp_path / "fresh").exists()
+    assert "not-searched-0.json" in result.cases[1].command
+    assert (tmp_path / "summary.md").exists() and (tmp_path / "junit.xml").exists()
 
 
 def test_a_case_some_of_whose_bare_drives_fail_has_too_few_drives(team, tmp_path, monkeypatch):

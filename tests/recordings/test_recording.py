@@ -486,6 +486,16 @@ def test_sets_are_pooled_only_where_the_canvas_lies_in_one_place():
             pooled({"noon": here, "rain": replace(here, canvas=other)})
 
 
+def test_sets_are_pooled_only_where_the_same_is_known_of_the_road():
+    here = placed_set()
+    marked = replace(here, marks=(LaneMark(points_m=((0.0, 0.0), (0.0, 5.0))),))
+    for other in (marked, replace(here, obstacles=())):
+        with pytest.raises(
+            RecordingError, match="the recordings rain have other lane marks or obstacles than the first"
+        ):
+            pooled({"noon": here, "rain": other})
+
+
 def test_frames_are_kept_evenly_and_the_last_of_all():
     assert evenly(10, 4).tolist() == [0, 3, 6, 9]
     assert evenly(10, 1).tolist() == [9]

@@ -62,6 +62,7 @@ def test_what_is_not_alike_is_said(runs, tmp_path):
     write_comparison([runs[0], tmp_path / "elsewhere"], tmp_path / "compare.html")
     page = Page((tmp_path / "compare.html").read_text())
     assert "different stretches of road" in page.text
+    assert compared([runs[0], tmp_path / "elsewhere"])[1].change is None
     assert "offsets" not in [each["id"] for _, each in page.tags if "id" in each]
 
 
@@ -99,6 +100,7 @@ def test_driven_and_predicted_never_share_a_column(runs, tmp_path):
     assert "driven, m" in page.text
     assert "predicted, m" in page.text
     assert "not of one kind" in page.text
+    assert page.text.count("leave the lane") == 2 and "leave the lane, predicted" in page.text
 
 
 def test_names_from_files_are_escaped(tmp_path):

@@ -14,6 +14,7 @@ from roadproof.attacks import CMAES, AttackResult, Candidate
 from roadproof.attacks.driven import Effect
 from roadproof.attacks.result import Cost
 from roadproof.coverage import Shape
+from roadproof.datatypes import Ending
 from roadproof.driving.evaluation import load_paint
 from roadproof.driving.starts import StartOffset
 from roadproof.errors import EpisodeError, RoadproofError
@@ -243,6 +244,22 @@ def test_the_verdict_follows_from_the_drives(tmp_path, key):
     write_evaluation(tmp_path / "evaluation", runs=0, **VERDICTS[key])
     report_of(tmp_path)
     assert read_result(tmp_path)["verdict"]["key"] == key
+
+
+@pytest.mark.parametrize(
+    ("endings", "title"),
+    [
+        ((Ending.GOAL_REACHED, Ending.GOAL_REACHED), "Holds its lane"),
+        ((Ending.GOAL_REACHED, Ending.BLOCKED), "Stops over the paint"),
+        ((Ending.BLOCKED, Ending.BLOCKED), "Fails without paint"),
+        (("", Ending.BLOCKED), "Holds its lane"),  # in files of earlier versions nobody said
+    ],
+)
+def test_a_car_that_stops_does_not_hold_its_lane(tmp_path, endings, title):
+    evaluation = write_evaluation(tmp_path / "evaluation", runs=0, aside_m=0.02)
+    clean, painted = map(str, endings)
+    trials = [dataclasses.replace(each, clean_ending=clean, ending=painted) for each in evaluation.trials]
+    assert _driven(dataclasses.replace(evaluation, trials=tuple(trials))).title == title
 
 
 @pytest.mark.parametrize(("failing", "key"), [(1, "holds"), (2, "holds"), (3, "unfit"), (4, "unfit")])

@@ -52,7 +52,7 @@ from roadproof.io.identity import digest, require_same
 from roadproof.io.identity import stated as as_text
 from roadproof.io.known import known_by
 from roadproof.io.records import plain
-from roadproof.limits import check_seed
+from roadproof.limits import check_seed, is_whole
 from roadproof.paint import Site, conspicuousness
 from roadproof.processes import Pool
 from roadproof.recordings import RecordingSet
@@ -181,8 +181,8 @@ def _begun(
         _refuse_in_simulator(method, groups=groups, device=str(device) != "cpu", random_patterns=random_patterns)
         return site_at(recordings.simulator, recordings.scenario), DrivenMeasure(recordings, controller, objective)
     device_of(str(device))
-    if random_patterns < 0:
-        raise RoadproofError(f"random_patterns is {random_patterns}, expected 0 or more")
+    if not is_whole(random_patterns) or random_patterns < 0:
+        raise RoadproofError(f"random_patterns is {random_patterns}, expected a whole number, 0 or more")
     groups = groups or method.groups(recordings, objective)
     require_names(groups)
     return site_of(recordings), method.measure(objective, recordings, controller, groups, device=device)

@@ -90,6 +90,7 @@ class Cheapest:
             OutputError: the folder cannot be written.
         """
         folder = as_path(folder)
+        (folder / "cheapest.json").unlink(missing_ok=True)
         save_pattern(self.pattern, folder / "pattern.json")
         FILE.write(folder / "cheapest.json", self, made_of=made_of or {})
 

@@ -104,9 +104,9 @@ class ClosedLoopMeasure(BatchedMeasure):
         """The measure from which a search begins."""
 
     def thinned(self, every: int) -> ClosedLoopMeasure:
-        """The same measure with a picture only every n steps: cheaper, for choosing among many starts."""
+        """The same measure with a picture only every n steps, or as seldom as before: to choose among many starts."""
         thin = copy.copy(self)
-        thin.every, thin.frames_evaluated = every, 0
+        thin.every, thin.frames_evaluated = max(self.every, every), 0
         return thin
 
     def of_groups(self, kept: Sequence[int]) -> ClosedLoopMeasure:
@@ -173,7 +173,9 @@ class ClosedLoopMeasure(BatchedMeasure):
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""
         # Variation, drives and controller are in the fingerprint of the steering shift.
-        more = repr((*self.told(), [each.vehicle for each in self.worlds]))
+        # Its groups are not these where a speed is measured.
+        directions = [str(group.direction) for group in self.groups]
+        more = repr((*self.told(), directions, [each.vehicle for each in self.worlds]))
         return digest(more, self._steering.fingerprint())
 
     def told(self) -> tuple[object, ...]:

@@ -6,6 +6,7 @@ pattern for a side is the mean, over weathers, starts and the instants at which 
     s tanh(d / s)
 
 with d the offset from the clean path to that side and s some metres: a car that has left the road need not go further.
+With a variation d is counted from the drive over the bare road in the same look.
 """
 
 from __future__ import annotations
@@ -53,8 +54,12 @@ class DeviationMeasure(ClosedLoopMeasure):
 
     def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
         """The mean offset of each drive, metres, right positive, hardly more than the saturation."""
-        del world
-        return (self._saturation_m * torch.tanh(rolled.right_m / self._saturation_m)).mean(1)
+        right_m = rolled.right_m
+        if self.variation is not None:
+            # What a look does to the drive over the bare road is not the paint's.
+            bare_m = self.bare(world).right_m
+            right_m = right_m - bare_m.repeat(len(right_m) // len(bare_m), 1)
+        return (self._saturation_m * torch.tanh(right_m / self._saturation_m)).mean(1)
 
     def predict(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The paper's deviation, metres, 0 or more, of R patterns in each of S drives."""

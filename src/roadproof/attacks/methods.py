@@ -166,10 +166,16 @@ class Published(Method):
         """The published divergence, a sum over frames, as the measure.
 
         Raises:
-            RoadproofError: the objective is not a steering shift without variation.
+            RoadproofError: the objective is not a steering shift without variation, or the recordings have pixel maps,
+                which binary masks know nothing of.
         """
         if not isinstance(objective, SteeringShift) or objective.variation is not None:
             raise RoadproofError(f"the published search enlarges the steering shift, not the {objective.name}")
+        if self.masks == "binary" and any(drive.maps is not None for drive in recordings.recordings):
+            raise RoadproofError(
+                "the published search knows light by a colour transform alone, and these recordings have it in pixel "
+                "maps; calibrate with --method published, or choose antialiased masks"
+            )
         return PublishedMeasure(recordings, controller, groups, masks=self.masks, device=device)
 
     def check_space(self, space: SearchSpace) -> None:

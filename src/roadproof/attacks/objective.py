@@ -26,6 +26,7 @@ from roadproof.compositing.variation import Variation
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
 from roadproof.io.known import known_by
+from roadproof.limits import is_whole
 from roadproof.recorded.world import BiasedStart
 from roadproof.recordings import RecordingSet
 from roadproof.search_space import SearchSpace
@@ -140,7 +141,7 @@ class ClosedLoop:
     variation: Variation | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if not self.starts or self.every < 1:
+        if not self.starts or not is_whole(self.every) or self.every < 1:
             raise RoadproofError(
                 f"{self.word} with {len(self.starts)} starts, a picture every {self.every} steps; expected one start "
                 "or more, and 1 or more"

@@ -34,8 +34,10 @@ class Cost:
     """The cost of an attack.
 
     Args:
-        controller_frames: number of frames the controller was shown, forward or forward and backward.
-        seconds: wall time of the search in seconds, without loading and checks.
+        controller_frames: number of frames the search showed the controller, forward or forward and backward; what its
+            best patterns are predicted to do takes some more.
+        seconds: wall time of the search and of those predictions, seconds, without loading and checks; of one that was
+            interrupted, in the process that ended it.
         simulator_calls: number of drives in a simulator, the clean one included; 0 on recordings.
     """
 
@@ -173,6 +175,8 @@ class AttackResult(Candidate):
             OutputError: the folder cannot be written.
         """
         folder = as_path(folder)
+        # The result goes first and comes last: a folder that was cut off between holds none.
+        (folder / "result.json").unlink(missing_ok=True)
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")

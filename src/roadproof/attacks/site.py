@@ -34,14 +34,13 @@ def site_of(recordings: RecordingSet) -> Site:
 
 def _asphalt(recordings: RecordingSet) -> Rgb | None:
     drive = recordings.clean or recordings.recordings[0]
-    # The last frames show the canvas largest; it may have left the very last one.
-    for k in reversed(range(len(drive.frames))):
-        flat = _flat(recordings, drive, k)
-        if flat is not None and len(flat):
-            painted = _painted(recordings.colour.response, flat.quantile(0.5, 0))
-            red, green, blue = cast("list[float]", painted.tolist())
-            return round(red, 4), round(green, 4), round(blue, 4)
-    return None
+    flats = (_flat(recordings, drive, k) for k in range(len(drive.frames)))
+    largest = max((flat for flat in flats if flat is not None), key=len, default=())
+    if not len(largest):
+        return None
+    painted = _painted(recordings.colour.response, largest.quantile(0.5, 0))
+    red, green, blue = cast("list[float]", painted.tolist())
+    return round(red, 4), round(green, 4), round(blue, 4)
 
 
 def _flat(recordings: RecordingSet, drive: Recording, k: int) -> Float[Tensor, "p 3"] | None:

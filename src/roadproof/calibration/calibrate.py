@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from enum import StrEnum
 from functools import partial
 from itertools import repeat
@@ -115,7 +115,10 @@ class Calibrated:
         if not (run / "recordings").exists():
             return None
         found = Calibrated.load(run)
-        require_same(run / "recordings", "a calibration", found.made_of, _parts(drives, method), CalibrationError)
+        now = _parts(drives, method)
+        # Calibrations are older than the last two parts.
+        known = {"canvas": now["canvas"], "world": now["world"], **found.made_of}
+        require_same(run / "recordings", "a calibration", known, now, CalibrationError)
         for recording in found.recordings.recordings:
             if not _same_frames(recording, drives):
                 raise CalibrationError(
@@ -140,7 +143,13 @@ def _same_frames(recording: Recording, drives: Drives) -> bool:
 
 
 def _parts(drives: Drives, method: CalibrationMethod) -> dict[str, object]:
-    return {"method": str(method), "drives": {drive.name: digest(*told_apart(drive))[:16] for drive in drives.drives}}
+    settings = drives.settings
+    return {
+        "method": str(method),
+        "drives": {drive.name: digest(*told_apart(drive))[:16] for drive in drives.drives},
+        "canvas": list(map(float, astuple(settings.scenario.canvas))),
+        "world": settings.world,
+    }
 
 
 def replays_needed(count: int, method: CalibrationMethod) -> int:

@@ -32,6 +32,7 @@ def calibrate(
     from roadproof.calibration import calibrate as run
     from roadproof.cli.progress import progress
     from roadproof.drives import Drives
+    from roadproof.drives.folder import require_same_map
     from roadproof.errors import RecordingError
     from roadproof.io.locks import hold
     from roadproof.simulators.loading import open_simulator
@@ -41,6 +42,8 @@ def calibrate(
     if not runs:
         raise RecordingError(f"{folder} holds no run with a folder named record; make one with `roadproof record`")
     recorded = {path: Drives.load(path / "record") for path in runs}
+    for path, drives in recorded.items():
+        require_same_map(drives.settings, path / "record")
     for place in dict.fromkeys((folder, *runs)):
         hold(place)
 

@@ -27,13 +27,15 @@ def compare(
 
     runs = write_comparison(folders, out)
     kinds = sorted({each.predicted for each in runs})
-    names = ("predicted m" if kind else "driven m" for kind in kinds)
-    shown = table(("run", "controller", "scenario"), (*names, "change m", "leaves lane"))
+    words = ("predicted" if kind else "driven" for kind in kinds)
+    names = (name for word in words for name in (f"{word} m", f"leaves lane, {word}"))
+    shown = table(("run", "controller", "scenario"), (*names, "change m"))
     for each in runs:
-        metres = (each.whole.metres if kind == each.predicted else "" for kind in kinds)
-        evaluation, left = each.judged.evaluation, f"{each.whole.left_lane:.0%}"
+        own = (each.whole.metres, f"{each.whole.left_lane:.0%}")
+        numbers = (number for kind in kinds for number in (own if kind == each.predicted else ("", "")))
+        evaluation = each.judged.evaluation
         shown.add_row(
-            each.name, evaluation.controller, evaluation.scenario.name, *metres, mean_in_words(each.change, 2), left
+            each.name, evaluation.controller, evaluation.scenario.name, *numbers, mean_in_words(each.change, 2)
         )
     say(shown, f"The page is {out}")
     answer({"runs": [_answer(each) for each in runs]})

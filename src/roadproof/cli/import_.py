@@ -20,9 +20,9 @@ def import_(
 
     check_free(out)
     recordings = import_drives(folder)
+    picture, shown = preview(recordings), out / "preview.png"
     save_recordings(recordings, out)
-    shown = out / "preview.png"
-    write_atomically(shown, preview(recordings).save)
+    write_atomically(shown, picture.save)
     camera, canvas = recordings.camera, recordings.canvas
     lens = "" if camera.lens is None else f", behind a {camera.lens.model} lens"
     say(f"camera {camera.up_m:.2f} m above the ground, pitch {camera.pitch_deg:.1f}°, {camera.fov_deg:.1f}° wide{lens}")

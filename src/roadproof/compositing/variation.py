@@ -24,6 +24,7 @@ from torch.nn.functional import conv2d, pad
 
 from roadproof.errors import RoadproofError
 from roadproof.geometry import CANVAS_SIZE_PX, CanvasPlacement
+from roadproof.limits import is_whole
 from roadproof.patterns import Pattern
 
 _WAVES, _WAVELENGTH_PX, _SOFT = 12, (12.0, 60.0), 0.15
@@ -61,6 +62,8 @@ class Variation:
         for field, (least, most) in zip(fields(self), _RANGES, strict=True):
             if not least <= (value := getattr(self, field.name)) <= most:
                 raise RoadproofError(f"variation: {field.name} is {value}, expected {least:g} to {most:g}")
+        if not is_whole(self.draws):
+            raise RoadproofError(f"variation: draws is {self.draws}, expected a whole number")
 
     def draw(self, seed: int, device: torch.device | str = "cpu", count: int | None = None) -> Looks:
         """Looks drawn from a seed, the same on every device.

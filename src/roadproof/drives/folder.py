@@ -9,6 +9,7 @@ A drive's folder is there when the drive is finished. Nothing is pickled.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NotRequired, TypedDict
@@ -217,8 +218,10 @@ def write_settings(settings: Settings, folder: Path) -> bool:
 
 
 def forget_settings(folder: Path) -> None:
-    """Take the settings of a recording away again, of which no drive could be made."""
+    """Take the settings of a recording away again, of which no drive could be made, and its folder if it is empty."""
     (folder / "record.json").unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def write_drive(drive: Drive, folder: Path) -> None:
@@ -258,6 +261,19 @@ def read_settings(folder: Path) -> Settings:
         raise RecordingError(f"{folder} has no record.json; expected what `roadproof record` writes")
     check_closed(folder, RecordingError)
     return _SETTINGS.read(folder / "record.json")
+
+
+def require_same_map(settings: Settings, folder: Path) -> None:
+    """Refuse to go on with drives in whose map something has changed since: they would be of another road.
+
+    Raises:
+        RecordingError: the map has changed, or the folder is damaged.
+    """
+    known = _SETTINGS.content(folder / "record.json").get("map", "")
+    if known and identity(settings.scenario)["map"] != known:
+        raise RecordingError(
+            f"{settings.scenario.map_name} has changed since the drives in {folder} were recorded on it; record again"
+        )
 
 
 class _Trajectories(TypedDict):

@@ -134,7 +134,7 @@ def offsets(
         from_m: arclength at which the canvas comes into view, metres.
         to_m: arclength at which the canvas is out of view, metres.
         length_m: length of the path, metres.
-        rng: random generator that draws where the offset rises and, for RANDOM, its sizes.
+        rng: random generator that draws where the offset rises and, for RANDOM, its sizes or where a weave begins.
         weaves: whether the offset weaves from side to side, to the named side first.
 
     Raises:
@@ -150,7 +150,8 @@ def offsets(
     if weaves:
         since_m = np.maximum(s - from_m, 0.0)
         grown = size_m * _smooth(np.minimum(since_m / _WEAVE_BEGINS_M, 1.0))
-        return Offsets.of(s, sign * grown * np.sin(math.tau / _WEAVE_M * since_m))
+        begins = rng.uniform(0.0, math.tau) if side is Side.RANDOM else 0.0
+        return Offsets.of(s, sign * grown * np.sin(math.tau / _WEAVE_M * since_m + begins))
     along = (s - from_m) / (to_m - from_m)
     if side is Side.RANDOM:
         knots = np.concatenate([[0.0], rng.uniform(-1.0, 1.0, 4)])

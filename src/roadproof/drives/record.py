@@ -211,8 +211,12 @@ def _clean(
     chosen = _chosen(film, settings, "clean")
     last_s = float(episode.time_s[chosen[0][-1]])
     harm = [event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= last_s]
-    note = f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas" if harm else ""
-    return _drive(plan, episode, chosen, episode.steer, note=note)
+    notes = [f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas"] if harm else []
+    canvas = settings.scenario.canvas
+    ahead_m = (episode.x_m[-1] - canvas.x_m) * math.cos(canvas.yaw_rad)
+    ahead_m += (episode.y_m[-1] - canvas.y_m) * math.sin(canvas.yaw_rad)
+    notes += [f"{episode.ending} before the canvas was passed"] if ahead_m < canvas.length_m / 2 else []
+    return _drive(plan, episode, chosen, episode.steer, note="; ".join(notes))
 
 
 def _perturbed(
@@ -228,8 +232,9 @@ def _perturbed(
         if not harm:
             chosen = _chosen(film, settings, plan.name)
             right_m = np.array([path.locate(film.states[int(k)], None)[1] for k in chosen[2]])
-            note = "" if tried == 0 else f"perturbed {share:.2f} times as much as asked, not to crash"
-            return _drive(plan, episode, chosen, answered, right_m, calls=tried + 1, note=note)
+            notes = [] if tried == 0 else [f"perturbed {share:.2f} times as much as asked, not to crash"]
+            notes += [] if behind_s < math.inf else [f"{episode.ending} before the canvas was passed"]
+            return _drive(plan, episode, chosen, answered, right_m, calls=tried + 1, note="; ".join(notes))
     raise RecordingError(
         f"drive {plan.name} of {settings.scenario.name} ends in {harm} before the canvas ends, {TRIES} times; "
         "ask for smaller perturbations, or choose another scenario"

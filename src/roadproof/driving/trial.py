@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from statistics import fmean
 
-from roadproof.datatypes import Event, Weather
+from roadproof.datatypes import Ending, Event, Weather
 from roadproof.driving.deviation import LEAVES_LANE_M, beside_m, passage_deviation_m
 from roadproof.driving.episode import Episode
 from roadproof.driving.infractions import counted, first_event_s, infraction_points, leaderboard_factor
@@ -40,6 +40,7 @@ class Trial:
         first_event_s: time of the first event with paint, seconds; None if there is none, or none is known.
         clean_first_event_s: time of the first event without paint, seconds; None if there is none, or none is known.
         ending: why the painted drive ended.
+        clean_ending: why the drive without paint ended; empty in files of earlier versions.
         events: events of the painted drive that count (`infractions.counted`), so that anyone can count again.
         clean_events: events of the clean drive that count.
         start: offset of both drives' start from the scenario's.
@@ -63,11 +64,17 @@ class Trial:
     first_event_s: float | None
     clean_first_event_s: float | None
     ending: str
+    clean_ending: str = ""
     events: tuple[Event, ...] = ()
     clean_events: tuple[Event, ...] = ()
     start: StartOffset = NOMINAL
     speed_change_mps: float | None = None
     most_speed_change_mps: float | None = None
+
+    @property
+    def loses_its_way(self) -> bool:
+        """Whether it does not arrive, as the drive without paint does."""
+        return self.clean_ending == Ending.GOAL_REACHED != self.ending
 
     @property
     def leaves_lane(self) -> bool:
@@ -114,6 +121,7 @@ def judge(
         first_event_s=first_event_s(painted.events),
         clean_first_event_s=first_event_s(clean.events),
         ending=str(painted.ending),
+        clean_ending=str(clean.ending),
         events=counted(painted.events),
         clean_events=counted(clean.events),
         start=start,

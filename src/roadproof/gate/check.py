@@ -170,13 +170,20 @@ class _Check:
             require_usable(self.controller, size=size, device=self.device, gradients=attacks)
             scenario = begun_in(world, place.scenario)
             site = site_of(world.recordings) if isinstance(world, RecordedSimulator) else site_at(world, scenario)
-            paints = known_paints(plan, scenario, site, self.folder / PATTERNS / scenario.name)
+            patterns = self.folder / PATTERNS / scenario.name
+            # Random ones keep to limits by the asphalt that is measured in each weather's recordings.
+            patterns = patterns if attacks else patterns.joinpath(*place.weathers)
+            paints = known_paints(plan, scenario, site, patterns)
+            stage = f"Driving {scenario.name}, {', '.join(place.weathers)}"
+            stretch = self._stretch(place, world, scenario, paints)
             if attacks:
-                paints += tuple(self._fresh(world, scenario, seed, size) for seed in plan.seeds)
-            images = {paint.name: raster(paint.pattern) for paint in paints}
-            drives = self.folder / DRIVES / scenario.name
-            episodes = Episodes.of(world, self.controller, scenario, images, drives)
-            stretch = Stretch(plan=plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
+                stretch.drive_bare(
+                    place.factory, self.processes, lambda done, total: self.on_progress(stage, done, total, "")
+                )
+                drives_well = any(not each.wrong for each in stretch.bare(plan.weathers[0]))
+                search = self._fresh if drives_well else self._unsearched
+                paints += tuple(search(world, scenario, seed, size) for seed in plan.seeds)
+                stretch = self._stretch(place, world, scenario, paints)
             told = {
                 key: (stretch.conditions(key, painted), painted)
                 for key in plan.keys
@@ -185,9 +192,13 @@ class _Check:
             }
             for key, (conditions, _) in told.items():
                 self._check_comparable(key, conditions)
-            stage = f"Driving {scenario.name}, {', '.join(place.weathers)}"
             stretch.drive(place.factory, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
             return [self._judged(place, stretch, key, *each) for key, each in told.items()]
+
+    def _stretch(self, place: Place, world: Simulator, scenario: Scenario, paints: tuple[Paint, ...]) -> Stretch:
+        images = {paint.name: raster(paint.pattern) for paint in paints}
+        episodes = Episodes.of(world, self.controller, scenario, images, self.folder / DRIVES / scenario.name)
+        return Stretch(plan=self.plan, world=world, weathers=place.weathers, paints=paints, episodes=episodes)
 
     def _check_comparable(self, key: Key, conditions: str) -> None:
         stored = self.before.get(key)
@@ -199,7 +210,7 @@ class _Check:
 
     def _judged(self, place: Place, stretch: Stretch, key: Key, conditions: str, paints: tuple[Paint, ...]) -> Case:
         plan, (scenario, weather, kind, name) = self.plan, key
-        drives = stretch.painted(weather, paints) if paints else stretch.bare(weather)
+        drives = stretch.bare(weather) if kind is Kind.BARE else stretch.painted(weather, paints)
         measures = measures_of(kind, drives)
         stored = self.before.get(key)
         left_out = sum(len(paint.drives) for paint in paints) - len(drives) if paints else 0
@@ -208,7 +219,8 @@ class _Check:
         status, reasons = judge(measures, plan.limits[kind], plan.change, against, left_out, is_new=is_new)
         # Where there is none over paint, the drives past the bare road are to be seen.
         shown = paints or stretch.paints
-        worst = worst_of(drives) or JudgedDrive(seed=shown[0].drives[0][0], start=NOMINAL, wrong="", clean="")
+        first = next((seed for paint in shown for seed, _ in paint.drives), plan.seeds[0])
+        worst = worst_of(drives) or JudgedDrive(seed=first, start=NOMINAL, wrong="", clean="")
         pattern = worst.paint or str(shown[0].path)
         return Case(
             scenario=scenario,
@@ -249,6 +261,14 @@ class _Check:
         save_pattern(found.pattern, path)
         drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
         return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
+
+    def _unsearched(self, world: Simulator, scenario: Scenario, seed: int, _: tuple[int, int]) -> Paint:
+        """Any pattern, to see the bare road beside: no attack begins where the car does not arrive without paint."""
+        space = SearchSpace(figures=self.plan.figures, limits=self.plan.paint).on(site_at(world, scenario))
+        path = self.folder / PATTERNS / scenario.name / f"not-searched-{seed}.json"
+        pattern = space.drawn(1, seed)[0]
+        save_pattern(pattern, path)
+        return Paint(path.stem, Kind.FRESH, fresh(seed), pattern, path, ())
 
     def film(self, places: Sequence[Place], cases: Sequence[Case]) -> Case | None:
         """Leave a picture, and say which case it shows.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -102,7 +103,8 @@ def least_drives(measure: str, limit: float) -> int:
     tail = (1 - CONFIDENCE) / 2
     if measure == "deviation_m":
         return math.ceil(math.log(tail) / math.log(0.5))
-    return 1 if limit in (0.0, 1.0) else math.ceil(math.log(tail) / math.log1p(-limit))
+    # No case has more drives than the largest number here.
+    return 1 if limit in (0.0, 1.0) else math.ceil(min(math.log(tail) / math.log1p(-limit), sys.maxsize))
 
 
 def judge(

@@ -18,7 +18,12 @@ MOST_PIXELS = 40_000_000
 
 
 def read_picture(
-    path: Path, error: type[RoadproofError], remedy: str, *, mode: str = "RGB"
+    path: Path,
+    error: type[RoadproofError],
+    remedy: str,
+    *,
+    mode: str = "RGB",
+    size: tuple[int, int] | None = None,
 ) -> UInt8[np.ndarray, "h w c"]:
     """Read a picture's pixels.
 
@@ -27,10 +32,11 @@ def read_picture(
         error: the type of error to raise.
         remedy: what the user can do where the picture is missing or damaged.
         mode: the channels to return, "RGB" or "RGBA".
+        size: (width, height) that the picture must have, looked at before it is unpacked; None for any.
 
     Raises:
-        error: the picture is missing, damaged, of another kind, larger than any picture here, has more than 8 bits a
-            channel, is animated or stored turned; or it is transparent where RGB is wanted.
+        error: the picture is missing, damaged, of another kind or size, larger than any picture here, has more than 8
+            bits a channel, is animated or stored turned; or it is transparent where RGB is wanted.
     """
     try:
         # Pillow leaves a file open whose first bytes cannot be read.
@@ -38,6 +44,9 @@ def read_picture(
             deep = picture.format == "PNG" and _png_depth(path) > 8
             if picture.width * picture.height > MOST_PIXELS:
                 raise ValueError(f"{picture.width}×{picture.height} pixels, expected at most {MOST_PIXELS}")
+            if size is not None and picture.size != size:
+                expected = "×".join(map(str, size))
+                raise ValueError(f"it has {picture.width}×{picture.height} pixels, expected {expected}")
             if (frames := getattr(picture, "n_frames", 1)) > 1:
                 raise ValueError(f"it is an animation of {frames} pictures, expected one")
             if (orientation := picture.getexif().get(Base.Orientation)) in range(2, 9):

@@ -13,10 +13,12 @@ over rectangles of the largest over axes: closed form, and differentiable in the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from roadproof.constants import constant
@@ -26,6 +28,8 @@ from roadproof.paint.site import Site, half_edges_m, metres_per_px
 LEAST_M = 0.1
 """A middle is at least so far from the keep-out, so that its figure is no speck."""
 
+_ALIKE = 8
+"""So many free cells may be as near as each other."""
 _CELL_M = 0.1
 _MOST_CANVAS_M = 100.0
 _INSIDE = 1 - 1e-5
@@ -134,6 +138,10 @@ def keep_out(site: Site, distance_m: float) -> KeepOut | None:
 def _nearest(cells: Float[np.ndarray, "r c 2"], free: Bool[np.ndarray, "r c"]) -> Float[np.ndarray, "r c 2"]:
     """For every cell, the nearest free cell."""
     places, found = cells[free], cells.copy()
-    for row, column in np.argwhere(~free):
-        found[row, column] = places[np.square(cells[row, column] - places).sum(-1).argmin()]
+    tree: Any = KDTree(places)
+    _, nearest = tree.query(cells[~free], k=list(range(1, min(_ALIKE, len(places)) + 1)))
+    # Of those equally near the first, row after row.
+    near: np.ndarray = np.sort(nearest, 1)
+    chosen = np.square(cells[~free][:, None] - places[near]).sum(-1).argmin(1)
+    found[~free] = places[near[np.arange(len(near)), chosen]]
     return found

@@ -20,6 +20,9 @@ from roadproof.errors import ColourError
 _SEEN = 6 / 255
 _BORDER_PX = 2
 
+MOST_CLIPPED = 0.1
+"""So much of what is seen of the white paint may be saturated, in the channel where most is."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelMaps:
@@ -77,8 +80,8 @@ def pixel_maps_from_two_paints(
         dark_frames: the same frames with the whole canvas painted black, of the same shape.
 
     Raises:
-        ColourError: frames of different shapes, no difference between them, or half of what is seen of the white paint
-            is saturated.
+        ColourError: frames of different shapes, no difference between them, or more of what is seen of the white
+            paint is saturated than `MOST_CLIPPED`.
     """
     if light_frames.shape != dark_frames.shape:
         raise ColourError(
@@ -93,9 +96,12 @@ def pixel_maps_from_two_paints(
         raise ColourError(
             "light and dark frames do not differ anywhere; check that the paint shows, and the same frames"
         )
-    if float((light_frames[seen] == 255).float().mean()) > 0.5:
+    clipped = float((light_frames[seen] == 255).float().mean(0).max())
+    if clipped > MOST_CLIPPED:
         raise ColourError(
-            "more than half of what is seen of the white paint is saturated; choose a darker weather or expose less"
+            f"{clipped:.0%} of what is seen of the white paint is saturated in a channel, expected at most "
+            f"{MOST_CLIPPED:.0%}: what lies between white and black could not be told; choose a darker weather or "
+            "expose less"
         )
     inside = seen & ~_dilate(~seen)
     near = _dilate(inside, _BORDER_PX)

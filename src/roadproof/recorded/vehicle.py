@@ -140,6 +140,12 @@ class Vehicle:
                 f"steering explains {max(r2, 0):.0%} of the way the cars took, expected {_LEAST_R2:.0%} or more; check "
                 "that poses and steer belong to the same steps, or give the vehicle's wheelbase and steering range"
             )
+        kept, at_once, before = a.tolist()[:3]
+        if at_once + before > 0.0 and kept < 1.0:
+            raise RecordingError(
+                "the cars turn left where they steer to the right; expected steer and yaw_rad as in "
+                "docs/recordings.md: steer is positive to the right, yaw to the left"
+            )
         pulling, pulled = _stacked([(part.pulling, part.pulled) for part in parts])
         slipping, slipped = _stacked([(part.slipping, part.slipped) for part in parts])
         e, f, g, h, j = _pull(pulling, pulled, prior.pulling)

@@ -205,7 +205,7 @@ def load_recordings(folder: AnyPath) -> RecordingSet:
         camera=manifest.camera,
         view=manifest.crop_resize,
         colour=manifest.colour,
-        recordings=tuple(_read_drive(folder, drive) for drive in manifest.drives),
+        recordings=tuple(_read_drive(folder, drive, manifest.crop_resize) for drive in manifest.drives),
         origin=manifest.origin,
         canvas=manifest.canvas,
         marks=manifest.marks,
@@ -213,7 +213,7 @@ def load_recordings(folder: AnyPath) -> RecordingSet:
     )
 
 
-def _read_drive(root: Path, drive: _Drive) -> Recording:
+def _read_drive(root: Path, drive: _Drive, view: CropResize) -> Recording:
     folder = inside(root, drive.name, f"{root / 'recordings.json'}: drive", RecordingError)
     if not folder.is_dir():
         raise RecordingError(f"drive {drive.name} is listed in recordings.json but {folder} is missing")
@@ -227,7 +227,7 @@ def _read_drive(root: Path, drive: _Drive) -> Recording:
         content,
         name=drive.name,
         side=drive.side,
-        frames=_read_frames(folder, numbers),
+        frames=_read_frames(folder, numbers, view),
         maps=_read_maps(folder / "shading.npz"),
         track=_read_track(folder / "track.npz", numbers),
         weather=drive.weather,
@@ -255,12 +255,9 @@ def _read_maps(path: Path) -> PixelMaps | None:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _read_frames(folder: Path, numbers: np.ndarray) -> np.ndarray:
+def _read_frames(folder: Path, numbers: np.ndarray, view: CropResize) -> np.ndarray:
     if (folder / "frames.npy").exists():
         return read_array(folder / "frames.npy", RecordingError, _AGAIN)
     pictures = (folder / "frames" / f"{number}.png" for number in numbers)
-    frames = [read_picture(path, RecordingError, _AGAIN) for path in pictures]
-    sizes = {frame.shape[1::-1] for frame in frames}
-    if len(sizes) != 1:
-        raise RecordingError(f"{folder / 'frames'} has pictures of sizes {sorted(sizes)}, expected one; {_AGAIN}")
-    return np.stack(frames)
+    size = view.width_px, view.height_px
+    return np.stack([read_picture(path, RecordingError, _AGAIN, size=size) for path in pictures])

@@ -239,8 +239,8 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
             unknown weather get its name as their weather.
 
     Raises:
-        RecordingError: there is no set, or one differs in camera, crop, colour transform or place of the canvas;
-            per-pixel maps may differ.
+        RecordingError: there is no set, or one differs in camera, crop, colour transform, place of the canvas, lane
+            marks or obstacles; per-pixel maps may differ.
     """
     first = next(iter(sets.values()), None)
     if first is None:
@@ -254,6 +254,8 @@ def pooled(sets: Mapping[str, RecordingSet]) -> RecordingSet:
                 f"the recordings {name} place the canvas at {each.canvas}, but the first at {first.canvas}; "
                 "expected one place for all"
             )
+        if (each.marks_digest(), each.obstacles) != (first.marks_digest(), first.obstacles):
+            raise RecordingError(f"the recordings {name} have other lane marks or obstacles than the first")
         before = f"{name}-" if number else ""
         drives += [replace(drive, name=before + drive.name, weather=drive.weather or name) for drive in each.recordings]
     origin = "; ".join(each.origin for each in sets.values())

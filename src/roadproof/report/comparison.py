@@ -81,7 +81,7 @@ def compared(folders: Sequence[AnyPath]) -> tuple[Compared, ...]:
         evaluation = run.judged.evaluation
         rows = {row.weather: row for row in evaluation.rows() if row.pattern == ATTACK and not row.traffic}
         first = found[0].judged.evaluation if found else None
-        alike = first is not None and first.predicted == evaluation.predicted
+        alike = first is not None and _kind(first) == _kind(evaluation)
         change = _change(first.of(traffic=False), evaluation.of(traffic=False)) if first and alike else None
         found.append(Compared(_name(path, paths), run.judged, verdict(run), rows, change))
     return tuple(found)
@@ -131,6 +131,11 @@ def _name(path: Path, paths: Sequence[Path]) -> str:
     own, *others = (each.resolve().parts for each in (path, *(each for each in paths if each != path)))
     depth = next(n for n in range(1, len(own) + 1) if all(other[-n:] != own[-n:] for other in others))
     return Path(*own[-depth:]).as_posix()
+
+
+def _kind(evaluation: Evaluation) -> tuple[object, ...]:
+    """What two runs have in common whose drives are compared one by one."""
+    return evaluation.predicted, evaluation.scenario.canvas, evaluation.scenario.start
 
 
 def _change(before: Sequence[Trial], after: Sequence[Trial]) -> Estimate | None:

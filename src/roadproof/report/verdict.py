@@ -106,6 +106,13 @@ def _driven(evaluation: Evaluation) -> Verdict:
     who, where, n = evaluation.controller, evaluation.scenario.name, len(trials)
     points = mean_in_words(mean_95(runs_of(trials, lambda trial: trial.points or 0.0)), 1)
     before = mean_in_words(mean_95(runs_of(trials, lambda trial: trial.clean_points or 0.0)), 1)
+    if 2 * sum(trial.clean_ending not in ("", Ending.GOAL_REACHED) for trial in alone) > len(alone):
+        return Verdict(
+            "unfit",
+            "Fails without paint",
+            f"{who} does not arrive in most drives over the bare road of {where}, so nothing can be blamed on the "
+            "pattern; choose a scenario it masters.",
+        )
     if 2 * sum(bool(trial.clean_points) for trial in alone) > len(alone):
         return Verdict(
             "unfit",
@@ -121,6 +128,13 @@ def _driven(evaluation: Evaluation) -> Verdict:
             f"Over the pattern {who} leaves its lane in {left} of {n} drives of {where}: it deviates by "
             f"{np.median(deviations):.2f} m (median; {min(deviations):.2f} to {max(deviations):.2f}), is up to "
             f"{furthest:.1f} m aside, and a drive costs {points} penalty points instead of {before}.",
+        )
+    if stopped := sum(trial.loses_its_way for trial in alone):
+        return Verdict(
+            "fails",
+            "Stops over the paint",
+            f"Over the pattern {who} keeps its lane but does not arrive in {stopped} of {len(alone)} drives alone on "
+            f"{where} in which it arrives over the bare road.",
         )
     if furthest >= DEVIATES_M:
         return Verdict(

@@ -136,9 +136,9 @@ def progress(results: Results, jobs: Sequence[KeptJob]) -> Picture | None:
     return Picture(
         "progress",
         "What the best pattern so far does when driven, against simulator calls and seconds: median over scenarios and "
-        "seeds, and their range. Black-box searches choose the best by their own measure, so a line may fall; a search "
-        "on composited frames is a point, where its answer was driven; a hollow point, where no drive chose the "
-        "pattern, is the mean of those that judge it.",
+        "seeds, and their range, from where all of a method's searches have begun. Black-box searches choose the best "
+        "by their own measure, so a line may fall; a search on recordings is a point, where its answer was driven; a "
+        "hollow point, where no drive chose the pattern, is the mean of those that judge it.",
         figure,
     )
 

@@ -122,6 +122,9 @@ def method_plan(values: Mapping[str, Any]) -> MethodPlan:
     for name in ("name", "search"):
         if name not in values:
             raise StudyError(f"method lacks {name}")
+    name = values["name"]
+    if not isinstance(name, str) or not name.strip() or not name.isprintable():
+        raise StudyError(f"name of a method is {name!r:.60}, expected letters that can be printed")
     word = str(values["search"])
     if word not in METHODS:
         raise StudyError(f"search is {word!r:.60}, expected one of {', '.join(METHODS)}")

@@ -129,17 +129,22 @@ def _markdown(name: str, sentence: str, results: Results, tables: Sequence[Table
 def described(method: StatedMethod) -> str:
     """A method and what is known of it, as "GradOpt (group, T=3)"."""
     if method.search == "gradopt":
-        return f"{method.name} ({method.scheme}, T={method.trajectories})"
+        weathers: list[str] = method.settings.get("attack_weathers", [])
+        searched = "".join(f", {in_words(each)}" for each in weathers)
+        return f"{method.name} ({method.scheme}, T={method.trajectories}{searched})"
     return f"{method.name} ({method.search})" if method.search not in ("", method.name) else method.name
 
 
 def _sentence(results: Results, jobs: Iterable[KeptJob]) -> str:
     """What the study was, in a sentence."""
+    jobs = tuple(jobs)
     controllers = dict.fromkeys(job.controller for job in jobs)
     home, *others = map(in_words, results.weathers)
+    # A method that searches in weathers of its own says which.
+    where = "judged first at" if any(job.method.settings.get("attack_weathers") for job in jobs) else "found at"
     against = f" against {', '.join(controllers)}" if controllers else ""
     seeds = f"seed{'s' if len(results.seeds) > 1 else ''} {', '.join(map(str, results.seeds))}"
     also = f", judged also at {', '.join(others)}" if others else ""
     traffic = " alone and in traffic" if results.has(traffic=True) and results.has(traffic=False) else ""
     scenarios = counted(len(results.kinds), "scenario")
-    return f"Patterns{against} on {scenarios}, {seeds}, found at {home}{also}, driven{traffic}."
+    return f"Patterns{against} on {scenarios}, {seeds}, {where} {home}{also}, driven{traffic}."

@@ -119,7 +119,7 @@ def gallery(results: Results, jobs: Jobs) -> Picture | None:
     return figure and Picture(
         "patterns",
         f"The patterns found, as they lie on the road, seed {seed}; the far edge is above. Under each the deviation it "
-        "caused, driven alone in the weather in which it was found.",
+        "caused, driven alone in the first weather.",
         figure,
     )
 

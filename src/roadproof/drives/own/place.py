@@ -23,6 +23,8 @@ _ORIGIN = VehicleState(0.0, 0.0, 0.0, 0.0, 0.0)
 _MOST_MISSED_PX = 5.0
 _MOST_OPEN = 0.2  # of the camera's height
 _LEAST_WAY_M = 0.5
+_MOST_BESIDE_RAD = 0.35
+_MOST_PER_M = 1 / 3
 
 
 def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
@@ -39,6 +41,9 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
     numbers, dt_s = table.numbers, own.dt_s
     if all(name in numbers for name in POSE):
         x_m, y_m, yaw_rad = (numbers[name] for name in POSE)
+        _check_heading(table, x_m, y_m, yaw_rad, dt_s)
+        if "speed_mps" not in numbers:
+            _check_every_row_moves(table, x_m, y_m)
         way = np.gradient(x_m) * np.cos(yaw_rad) + np.gradient(y_m) * np.sin(yaw_rad) if len(x_m) > 1 else x_m * 0
         speed = numbers.get("speed_mps", way / dt_s)
     elif "yaw_rate_rad_s" in numbers:
@@ -48,6 +53,7 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
                 "other; give x_m, y_m and yaw_rad, or import one drive"
             )
         speed, rate = table.needed("speed_mps"), numbers["yaw_rate_rad_s"]
+        _check_rate(table, speed, rate)
         yaw_rad = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * dt_s)])
         middle = (yaw_rad[1:] + yaw_rad[:-1]) / 2
         way = (speed[1:] + speed[:-1]) / 2 * dt_s
@@ -74,6 +80,51 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
     if "speed_mps" in numbers:
         _check_speed(table, track)
     return track
+
+
+def _check_heading(
+    table: Table,
+    x_m: Float[np.ndarray, " n"],
+    y_m: Float[np.ndarray, " n"],
+    yaw_rad: Float[np.ndarray, " n"],
+    dt_s: float,
+) -> None:
+    """Refuse headings in another unit, or counted from elsewhere, than the way that the poses take."""
+    # Over half a second: some log poses less often than rows.
+    steps = max(1, round(0.5 / dt_s))
+    dx, dy = x_m[steps:] - x_m[:-steps], y_m[steps:] - y_m[:-steps]
+    middle = np.unwrap(yaw_rad)[steps // 2 :][: len(dx)]
+    moves = np.hypot(dx, dy) > _LEAST_WAY_M / 2
+    if not moves.any():
+        return
+    turned = np.remainder(np.arctan2(dy, dx) - middle + np.pi, 2 * np.pi) - np.pi
+    beside = float(np.median(np.abs(turned[moves])))
+    if beside > _MOST_BESIDE_RAD:
+        raise RecordingError(
+            f"{table.drive.table}: the car moves {beside:.2f} rad beside its yaw_rad (median), expected about 0; give "
+            "radians, 0 along x and positive to the left"
+        )
+
+
+def _check_every_row_moves(table: Table, x_m: Float[np.ndarray, " n"], y_m: Float[np.ndarray, " n"]) -> None:
+    """Refuse poses that wait and jump in turn, of which no speed can be made from row to row."""
+    moves = np.hypot(np.diff(x_m), np.diff(y_m)) > 1e-6
+    turns = int((moves[1:] != moves[:-1]).sum())
+    if turns > max(6.0, len(moves) / 10):
+        raise RecordingError(
+            f"{table.drive.table}: poses change in {int(moves.sum())} of {len(moves)} steps, now and then, so they do "
+            "not say how fast the car was; give speed_mps, or a row for each pose"
+        )
+
+
+def _check_rate(table: Table, speed_mps: Float[np.ndarray, " n"], rate_rad_s: Float[np.ndarray, " n"]) -> None:
+    """Refuse yaw rates with which no car could turn."""
+    moves = speed_mps > 1.0
+    if moves.any() and (tight := float(np.percentile(np.abs(rate_rad_s[moves] / speed_mps[moves]), 95))) > _MOST_PER_M:
+        raise RecordingError(
+            f"{table.drive.table}: by yaw_rate_rad_s the car turns on circles of {1 / tight:.1f} m, expected "
+            f"{1 / _MOST_PER_M:.0f} m or more; give radians a second"
+        )
 
 
 def _check_speed(table: Table, track: Track) -> None:

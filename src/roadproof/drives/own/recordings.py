@@ -31,6 +31,7 @@ from roadproof.homographies import Homography, apply_homography, homogeneous, ho
 from roadproof.io.files import AnyPath, as_path
 from roadproof.photometry import AffineResponse, ColourTransform
 from roadproof.recorded import placed
+from roadproof.recorded.poses import odd_ratio
 from roadproof.recordings import Recording, RecordingSet, Side, Track, evenly
 from roadproof.recordings.recording import PER_FRAME
 
@@ -93,6 +94,9 @@ def _with_camera(folder: Path, own: OwnDrives) -> tuple[OwnDrives, str]:
     return replace(own, camera=camera, chessboard=None), told
 
 
+_LEAST_MPS = 1.0
+
+
 def _with_motion(folder: Path, own: OwnDrives, table: Table) -> tuple[list[Table], str]:
     table.needed("steer")
     if len(table.pictured) < len(table.pictures):
@@ -105,6 +109,12 @@ def _with_motion(folder: Path, own: OwnDrives, table: Table) -> tuple[list[Table
         seen = motion_of(own.camera, own.input, lambda k: _picture(folder, own, names[k]), len(names), own.dt_s)
     except RecordingError as error:
         raise RecordingError(f"{table.drive.table}: {error}") from None
+    stated = table.numbers.get("speed_mps")
+    if stated is not None and (ratio := odd_ratio(seen.speed_mps, stated, _LEAST_MPS)) is not None:
+        raise RecordingError(
+            f"{table.drive.table}: the ground in the pictures moves {ratio:.2f} times as fast as speed_mps says, "
+            "expected about 1; check its unit, dt_s, and how high the camera is"
+        )
     found = {"speed_mps": seen.speed_mps, "yaw_rate_rad_s": seen.yaw_rate_rad_s}
     low, median = np.percentile(seen.correlation, [5, 50])
     agreed = (
