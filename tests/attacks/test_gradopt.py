@@ -505,7 +505,7 @@ def test_a_seed_that_is_no_whole_number_in_its_range_is_one_line(seed):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"random_patterns": -3}, "random_patterns is -3, expected 0 or more"),
+        ({"random_patterns": -3}, "random_patterns is -3, expected a whole number, 0 or more"),
         ({"device": "gpu"}, "device 'gpu' is unknown, expected cpu, cuda"),
     ],
 )

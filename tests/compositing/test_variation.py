@@ -98,6 +98,9 @@ def test_noise_has_its_deviation_and_is_the_same_for_rows_of_one_look():
     assert float(seen.std()) == pytest.approx(0.05, rel=0.02)
     assert torch.equal(seen[0], seen[3])
     assert not torch.equal(seen[0], seen[1])
+    drives = looks.seen(torch.full((12, 3, 88, 200), 0.5), 6).unflatten(0, (6, 2))
+    assert torch.equal(drives[0], drives[3])
+    assert not torch.equal(drives[0, 0], drives[0, 1]), "every picture of a drive has noise of its own"
 
 
 @pytest.mark.parametrize("wear", [0.1, 0.5, 0.8])

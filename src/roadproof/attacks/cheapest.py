@@ -81,7 +81,7 @@ class Cheapest:
     @property
     def candidate(self) -> Candidate:
         """The pattern as a candidate, so that it can be driven over."""
-        return Candidate(self.pattern, self.group, 0.0, self.predicted_m)
+        return Candidate(self.pattern, self.group, None, self.predicted_m)
 
     def save(self, folder: AnyPath, made_of: object = None) -> None:
         """Write pattern.json, pattern.png and cheapest.json.

@@ -35,8 +35,8 @@ def site_of(recordings: RecordingSet) -> Site:
 def _asphalt(recordings: RecordingSet) -> Rgb | None:
     drive = recordings.clean or recordings.recordings[0]
     flats = (_flat(recordings, drive, k) for k in range(len(drive.frames)))
-    largest = max((flat for flat in flats if flat is not None), key=len, default=())
-    if not len(largest):
+    largest = max((flat for flat in flats if flat is not None and len(flat)), key=len, default=None)
+    if largest is None:
         return None
     painted = _painted(recordings.colour.response, largest.quantile(0.5, 0))
     red, green, blue = cast("list[float]", painted.tolist())

@@ -116,8 +116,8 @@ class Calibrated:
             return None
         found = Calibrated.load(run)
         now = _parts(drives, method)
-        # Calibrations are older than the last two parts.
-        known = {"canvas": now["canvas"], "world": now["world"], **found.made_of}
+        # Calibrations are older than the last two parts; one that says none of them is nobody's.
+        known = {"canvas": now["canvas"], "world": now["world"], **found.made_of} if found.made_of else {}
         require_same(run / "recordings", "a calibration", known, now, CalibrationError)
         for recording in found.recordings.recordings:
             if not _same_frames(recording, drives):

@@ -183,10 +183,10 @@ class Looks:
             soft = conv2d(soft, kernel.view(1, 1, 3, 1).expand(3, 1, 3, 1), groups=3)
             shown = torch.lerp(shown, soft, self.blur.to(frames)[which][:, None, None, None])
         if self.noise:
-            # Of one seed on every device; rows of one look have the same noise.
+            # Of one seed on every device; rows of one look have the same noise, and each of their pictures its own.
             generator = torch.Generator().manual_seed((self.seed * 1_000_003 + step) % 2**63)
-            each = torch.randn(len(self), *frames.shape[1:], generator=generator).to(frames)
-            shown = shown + self.noise * each[which]
+            each = torch.randn(len(self), len(frames) // rows, *frames.shape[1:], generator=generator).to(frames)
+            shown = shown + self.noise * each[self.rows(rows)].flatten(0, 1)
         return shown.clamp(0.0, 1.0)
 
 
