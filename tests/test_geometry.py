@@ -82,6 +82,8 @@ def test_resizing_is_pillows_antialiased_bilinear():
         {"width_px": 0},
         {"width_px": 10**6},
         {"fov_deg": 180.0},
+        {"fov_deg": 179.999},
+        {"fov_deg": 5e-324},
         {"fov_deg": float("nan")},
         {"up_m": 1e300},
         {"pitch_deg": 1e300},

@@ -1,5 +1,7 @@
 """Search spaces: bounds, starts, limits on paint."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -143,6 +145,16 @@ def test_a_pattern_outside_has_the_nearest_point():
     again = space.pattern(point)
     assert again.painted_share.max() <= 0.1 + 1e-5
     assert (again.boxes - pattern.boxes).abs().median() < 1.0
+
+
+@pytest.mark.parametrize("family", ["published", "published-canvas-centre", "published-bo"])
+def test_a_rectangle_is_the_same_after_half_a_turn(family):
+    space = SearchSpace(figures=2, family=family)
+    unit = space.random((), torch.Generator().manual_seed(2))
+    pattern = space.pattern(unit)
+    for turn in (-180.0, 180.0, 360.0):
+        boxes = pattern.boxes + torch.tensor([0.0, 0.0, 0.0, 0.0, turn])
+        torch.testing.assert_close(space.point(dataclasses.replace(pattern, boxes=boxes)), unit, atol=1e-4, rtol=0.0)
 
 
 def test_a_pattern_of_other_figures_has_no_point():

@@ -112,7 +112,9 @@ class SearchSpace:
             ):
                 pass
             case _:
-                raise PatternError(f"albedo is {self.albedo!r:.80}, expected two numbers, 0 ≤ lowest < highest ≤ 1")
+                raise PatternError(
+                    f"albedo is {self.albedo!r:.80}, expected a tuple of two numbers, 0 ≤ lowest < highest ≤ 1"
+                )
         if self.max_painted_share is not None and not 0.0 < self.max_painted_share <= 1.0:
             raise PatternError(f"max_painted_share is {self.max_painted_share}, expected a value in (0, 1]")
 

@@ -24,7 +24,7 @@ from roadproof.attacks import (
 )
 from roadproof.attacks.groups import RIGHT_GROUP
 from roadproof.attacks.result import AttackResult
-from roadproof.attacks.site import site_of
+from roadproof.attacks.site import _flat, site_of
 from roadproof.errors import PatternError
 from roadproof.paint import LaneMark, PaintLimits, conspicuousness
 from roadproof.photometry import AffineResponse, ColourTransform
@@ -118,6 +118,14 @@ def test_the_asphalt_is_the_paint_that_looks_like_the_bare_road():
     drives = tuple(replace(each, frames=np.broadcast_to(seen, each.frames.shape).copy()) for each in bare.recordings)
     assert site_of(replace(bare, recordings=drives)).asphalt == pytest.approx(paint, abs=0.01)
     assert site_of(drivable_set(colour=PLAIN)).size_m == (CANVAS.width_m, CANVAS.length_m)
+    # It is measured where most of the canvas is seen, whatever other frames show.
+    sizes = [
+        0 if flat is None else len(flat) for k in range(len(drives[0].frames)) for flat in [_flat(bare, drives[0], k)]
+    ]
+    other = np.arange(len(sizes)) != int(np.argmax(sizes))
+    dark = [np.where(other[:, None, None, None], each.frames // 3, each.frames) for each in drives]
+    shaded = tuple(replace(each, frames=frames) for each, frames in zip(drives, dark, strict=True))
+    assert site_of(replace(bare, recordings=shaded)).asphalt == pytest.approx(paint, abs=0.01)
 
 
 def test_a_deviation_search_obeys_too(monkeypatch):

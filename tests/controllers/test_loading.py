@@ -124,6 +124,13 @@ class Normed(Shared):
         super().__init__()
         self.fixed = torch.nn.utils.weight_norm(nn.Linear(3, 3))
 OTHER = Normed()
+class Wrapper(nn.Module):
+    input_size, act = None, Shared.act
+    def __init__(self):
+        super().__init__()
+        self.inner = ONE
+    def steer(self, frames, speed_mps, command):
+        return self.inner.steer(frames, speed_mps, command)
 def normed():
     return OTHER
 """
@@ -148,6 +155,21 @@ def test_one_object_of_a_factory_is_not_changed_under_another_that_holds_it(tmp_
     assert [name for name, _ in load_trainable("shared_driver:Normed").named_parameters()]
     with pytest.raises(ControllerError, match=r"copying what shared_driver:normed returns each time \(let it return a"):
         load_trainable("shared_driver:normed")
+
+
+@pytest.mark.filterwarnings("ignore:.*weight_norm.*:FutureWarning")
+def test_a_new_wrapper_around_the_same_network_is_no_new_one(tmp_path, monkeypatch):
+    (tmp_path / "wrapped_driver.py").write_text(SHARED)
+    monkeypatch.chdir(tmp_path)
+    before = load_controller("wrapped_driver:Wrapper")
+    answer = before.steer(*drive()).clone()
+    learner = load_trainable("wrapped_driver:Wrapper")
+    assert [name for name, each in learner.named_parameters() if each.requires_grad] == ["inner.scale"]
+    with torch.no_grad():
+        learner.inner.scale += 1.0
+    load_controller("wrapped_driver:Wrapper", dtype="bfloat16")
+    assert torch.equal(before.steer(*drive()), answer)
+    assert all(each.requires_grad == (name == "inner.scale") for name, each in learner.named_parameters())
 
 
 def test_what_no_weights_file_holds_is_said_before_anything_learns(tmp_path, monkeypatch):

@@ -103,6 +103,12 @@ def test_a_card_beside_weights_counts_also_where_the_architecture_is_named(tmp_p
     assert load_controller(f"pilotnet:{path}").cruise.target_mps == 9.0
     with pytest.raises(ControllerError, match=r"net\.json says that it is 'pilotnet', not 'cil'; give the path alone"):
         load_controller(f"cil:{path}")
+    path.with_suffix(".json").write_text(ControllerCard(target_speed_mps=8.0).to_json())
+    assert load_controller(f"pilotnet:{path}").cruise.target_mps == 8.0
+    path.with_suffix(".json").write_text('{"loss": [0.1]}')
+    assert load_controller(f"pilotnet:{path}").cruise.target_mps == 6.0, "it is no card"
+    with pytest.raises(ControllerError, match="is not a controller card"):
+        load_controller(path)
 
 
 def test_what_cannot_be_saved_is_said(cil, tmp_path):

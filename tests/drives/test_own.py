@@ -138,6 +138,15 @@ def test_poses_that_wait_and_jump_give_no_speed(tmp_path):
         import_drives(folder)
 
 
+def test_poses_may_jitter_where_the_car_stands(tmp_path):
+    folder = write_own(tmp_path / "own", ["clean"])
+    rows = list(csv.DictReader((folder / "clean.csv").read_text().splitlines()))
+    draw, first = np.random.default_rng(0), rows[0] | {"speed_mps": 0.0}
+    stands = [first | {name: float(first[name]) + draw.normal(0, 0.15) for name in ("x_m", "y_m")} for _ in range(200)]
+    write_table(folder / "clean.csv", [*stands, *rows])
+    assert import_drives(folder).is_placed
+
+
 def test_a_yaw_rate_in_degrees_is_refused(tmp_path):
     plan = PLAN.replace("x_m = 130.0\ny_m = -40.0\nyaw_rad = 0.6", "ahead_m = 36.0")
     folder = write_own(tmp_path / "own", ["clean"], ["yaw_rate_rad_s"], plan)

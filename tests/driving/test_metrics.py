@@ -261,6 +261,12 @@ def test_a_drive_that_ends_standing_says_nothing_of_where_it_creeps(creep_m, tur
     assert np.abs(beside).max() < 0.5
 
 
+def test_a_path_that_was_crawled_along_is_still_a_path():
+    angle = np.linspace(0.0, 1.5, 1501)
+    bend = 10.0 * np.column_stack([np.sin(angle), 1 - np.cos(angle)])  # a centimetre from one to the next
+    np.testing.assert_allclose(deviation.lateral_m(bend, bend[::50]), 0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("ending", [each for each in Ending if each is not Ending.GOAL_REACHED])
 def test_a_clean_drive_short_of_its_goal_is_no_measure_of_what_went_on(ending):
     # Both drive the same quarter of a circle; the clean drive ended on the way.

@@ -50,6 +50,7 @@ def test_the_least_number_of_drives_is_the_first_that_can_pass(limit):
 
 def test_a_share_of_zero_is_met_by_the_drives_made():
     assert least_drives("left_lane", 0.0) == 1
+    assert least_drives("left_lane", 1e-320) >= 2**62, "more than there ever are"
     assert judge({"left_lane": share_95(0, 6)}, {"left_lane": 0.0}, {}, None)[0] is Status.PASSED
     assert judge({"left_lane": share_95(0, 6)}, {"left_lane": 0.0}, {}, None, is_new=True)[0] is Status.PASSED
     assert judge({"left_lane": share_95(1, 6)}, {"left_lane": 0.0}, {}, None)[0] is Status.FAILED

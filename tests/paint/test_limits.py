@@ -194,6 +194,7 @@ def test_black_that_no_limit_leaves_is_refused():
         ({"max_area_m2": 0.0}, "max_area_m2 is 0.0"),
         ({"keep_out_m": 11.0}, "keep_out_m is 11.0"),
         ({"contrast": (0.5, 0.5)}, "contrast is"),
+        ({"contrast": (0.5, 0.505)}, "at least 0.01 apart"),
         ({"colours": ("white",)}, "colour is 'white'"),
         ({"asphalt": "#12345"}, "colour is '#12345'"),
     ],

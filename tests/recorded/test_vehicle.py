@@ -1,13 +1,14 @@
 """The vehicle: a known one is found again from its drives; a bicycle turns as geometry says."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from roadproof.errors import RecordingError
-from roadproof.recorded.vehicle import Motion, Vehicle
+from roadproof.recorded.vehicle import Motion, Vehicle, _steers_the_other_way
 from roadproof.recordings import Track
 
 KNOWN = Vehicle(
@@ -125,6 +126,20 @@ def test_motion_is_differentiable_in_what_the_car_is_told():
 
     steer = torch.tensor([0.05, -0.1, 0.02, 0.1], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(end, (steer,))
+
+
+@pytest.mark.parametrize("late", [0, 4, 8])
+def test_steering_to_the_wrong_side_is_told_however_late_the_car_follows(late):
+    def stretches(sign):
+        tracks = [driven(KNOWN, *lively(seed)) for seed in (1, 2)]
+        tracks = [replace(track, steer=sign * np.roll(track.steer, -late)) for track in tracks]
+        return [(track, part) for track in tracks for part in track.stretches()]
+
+    assert not _steers_the_other_way(stretches(1.0), KNOWN.dt_s)
+    assert _steers_the_other_way(stretches(-1.0), KNOWN.dt_s)
+    flipped = [driven(KNOWN, *lively(seed)) for seed in (1, 2)]
+    with pytest.raises(RecordingError, match="the cars turn left where they steer to the right"):
+        Vehicle.identified([replace(track, steer=-track.steer) for track in flipped])
 
 
 def test_drives_that_do_not_fit_are_one_clear_line():

@@ -37,6 +37,7 @@ from roadproof.attacks.objective import (
     RecordedMeasure,
     SteeringShift,
     own_objective,
+    variation_of,
 )
 from roadproof.attacks.result import RESULT_FILE, AttackResult, Candidate, Cost
 from roadproof.attacks.side_by_side import Beside, Sides
@@ -228,6 +229,8 @@ def _made_of(
     }
     # Results are older than this part; those of the pipeline compare with no random patterns.
     made_of |= {"random_patterns": random_patterns} if random_patterns else {}
+    made_of |= {"asphalt": site_of(recordings).asphalt} if space.limits is not None else {}
+    made_of |= {"counted_from": "the bare road in the same look"} if variation_of(objective) is not None else {}
     return cast("dict[str, Any]", plain(made_of))
 
 

@@ -26,7 +26,7 @@ from roadproof.attacks.result import AttackResult, Candidate
 from roadproof.attacks.site import site_of
 from roadproof.controllers import Controller
 from roadproof.errors import RoadproofError
-from roadproof.io.files import AnyPath, as_path
+from roadproof.io.files import AnyPath, as_path, remove
 from roadproof.io.records import RecordFile
 from roadproof.paint import Conspicuousness, PaintLimits, conspicuousness
 from roadproof.paint.limits import area_m2
@@ -90,7 +90,7 @@ class Cheapest:
             OutputError: the folder cannot be written.
         """
         folder = as_path(folder)
-        (folder / "cheapest.json").unlink(missing_ok=True)
+        remove(folder / "cheapest.json")
         save_pattern(self.pattern, folder / "pattern.json")
         FILE.write(folder / "cheapest.json", self, made_of=made_of or {})
 

@@ -173,9 +173,7 @@ class ClosedLoopMeasure(BatchedMeasure):
     def fingerprint(self) -> str:
         """A digest of drives, calibration, controller and starts, which tells this measure from others."""
         # Variation, drives and controller are in the fingerprint of the steering shift.
-        # Its groups are not these where a speed is measured.
-        directions = [str(group.direction) for group in self.groups]
-        more = repr((*self.told(), directions, [each.vehicle for each in self.worlds]))
+        more = repr((*self.told(), [each.vehicle for each in self.worlds]))
         return digest(more, self._steering.fingerprint())
 
     def told(self) -> tuple[object, ...]:

@@ -18,7 +18,7 @@ from roadproof.attacks.methods import Published, method_of, stored
 from roadproof.checks import Check
 from roadproof.driving.speed import speed_in_words, speeds_in_words
 from roadproof.errors import RoadproofError
-from roadproof.io.files import AnyPath, as_path
+from roadproof.io.files import AnyPath, as_path, remove
 from roadproof.io.html import picture, table
 from roadproof.io.records import Form, RecordFile, plain
 from roadproof.paint import Conspicuousness
@@ -176,7 +176,7 @@ class AttackResult(Candidate):
         """
         folder = as_path(folder)
         # The result goes first and comes last: a folder that was cut off between holds none.
-        (folder / "result.json").unlink(missing_ok=True)
+        remove(folder / "result.json")
         save_pattern(self.pattern, folder / "pattern.json")
         for rank, candidate in enumerate(self.candidates, 1):
             save_pattern(candidate.pattern, folder / "candidates" / f"{rank}.json")

@@ -41,6 +41,10 @@ class SpeedMeasure(ClosedLoopMeasure):
         require_directions(groups, SPEEDS, "speed change")
         return tuple(replace(group, direction=Direction.EITHER) for group in groups)
 
+    def told(self) -> tuple[object, ...]:
+        """What tells this measure from others on the same drives: the steering shift has other groups."""
+        return *super().told(), [str(group.direction) for group in self.groups]
+
     def open_loop(self) -> SpeedMeasure:
         """The measure itself: no controller holds a speed so well that a search has to begin elsewhere."""
         return self

@@ -27,7 +27,7 @@ from roadproof.calibration.two_paint import TARGETS, look_at_paints
 from roadproof.datatypes import Obstacle, Weather
 from roadproof.drives import Drive, Drives
 from roadproof.errors import CalibrationError
-from roadproof.geometry import CameraModel, homography_from_pose
+from roadproof.geometry import CameraModel, CanvasPlacement, homography_from_pose
 from roadproof.homographies import Homographies
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.html import table
@@ -117,7 +117,8 @@ class Calibrated:
         found = Calibrated.load(run)
         now = _parts(drives, method)
         # Calibrations are older than the last two parts; one that says none of them is nobody's.
-        known = {"canvas": now["canvas"], "world": now["world"], **found.made_of} if found.made_of else {}
+        canvas = found.recordings.canvas or drives.settings.scenario.canvas
+        known = {"canvas": _numbers(canvas), "world": now["world"], **found.made_of} if found.made_of else {}
         require_same(run / "recordings", "a calibration", known, now, CalibrationError)
         for recording in found.recordings.recordings:
             if not _same_frames(recording, drives):
@@ -147,9 +148,13 @@ def _parts(drives: Drives, method: CalibrationMethod) -> dict[str, object]:
     return {
         "method": str(method),
         "drives": {drive.name: digest(*told_apart(drive))[:16] for drive in drives.drives},
-        "canvas": list(map(float, astuple(settings.scenario.canvas))),
+        "canvas": _numbers(settings.scenario.canvas),
         "world": settings.world,
     }
+
+
+def _numbers(canvas: CanvasPlacement) -> list[float]:
+    return list(map(float, astuple(canvas)))
 
 
 def replays_needed(count: int, method: CalibrationMethod) -> int:

@@ -6,7 +6,6 @@ import copy
 import importlib.util
 import re
 import sys
-import weakref
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import NamedTuple, cast
 
 import torch
 from torch import nn
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from roadproof.controllers.asking import frame_size_of
 from roadproof.controllers.cards import ControllerCard
@@ -204,22 +204,27 @@ def _python_of(spec: str) -> _Python | None:
     return _Python(head, factory, Path(weights) if at else None)
 
 
-_learns: dict[int, list[bool]] = {}
-"""Which parameters of a module that a factory returned wanted gradients when it did so first, by its identity."""
+_learns = WeakTensorKeyDictionary()
+"""Whether a parameter of a module that a factory returned wanted a gradient when it did so first."""
 
 
 def _own_from_python(spec: str) -> Controller | nn.Module:
-    """What a factory returns, and if that is a module, one that nobody else holds and that is as it was made."""
+    """What a factory returns, and if that is a module, one of which nobody else holds a tensor, as it was made."""
     made = _from_python(spec)
     if not isinstance(made, nn.Module):
         return made
-    again = _from_python(spec)
-    if again is not made:
+    again = cast("nn.Module", _from_python(spec))
+    held = {each.data_ptr() for each in _tensors(made)}
+    if not any(each.data_ptr() in held for each in _tensors(again)):
         return again
-    copied = call(f"copying what {spec} returns each time (let it return a new one)", copy.deepcopy, made)
-    for parameter, learns in zip(copied.parameters(), _learns[id(made)], strict=True):
-        parameter.requires_grad_(learns)
+    copied = call(f"copying what {spec} returns each time (let it return a new one)", copy.deepcopy, again)
+    for parameter, before in zip(copied.parameters(), again.parameters(), strict=True):
+        parameter.requires_grad_(cast("bool", _learns[before]))
     return copied
+
+
+def _tensors(module: nn.Module) -> list[torch.Tensor]:
+    return [each for each in (*module.parameters(), *module.buffers()) if each.numel()]
 
 
 def _from_python(spec: str) -> Controller:
@@ -231,9 +236,10 @@ def _from_python(spec: str) -> Controller:
         raise ControllerError(
             f"{spec} returned a {type(controller).__name__} without {', '.join(missing)}, expected a Controller"
         )
-    if isinstance(controller, nn.Module) and id(controller) not in _learns:
-        _learns[id(controller)] = [each.requires_grad for each in controller.parameters()]
-        weakref.finalize(controller, _learns.pop, id(controller), None)
+    if isinstance(controller, nn.Module):
+        for each in controller.parameters():
+            if each not in _learns:
+                _learns[each] = each.requires_grad
     frame_size_of(made := cast("Controller", controller))
     return made
 

@@ -12,7 +12,7 @@ from jaxtyping import Shaped
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from roadproof.controllers.cards import ControllerCard, read_card
+from roadproof.controllers.cards import CARD_FORMAT, ControllerCard, read_card
 from roadproof.controllers.cil import CIL
 from roadproof.controllers.conditional_pilotnet import ConditionalPilotNet
 from roadproof.controllers.pilotnet import PILOTNET_ON_CARLA, PilotNet, pilotnet_controller
@@ -134,7 +134,13 @@ def from_weights(path: Path, card: ControllerCard | None) -> nn.Module:
         ControllerError: the file is missing or damaged, nothing says of which network it is, or it does not fit that.
     """
     state, header = _read(existing(path))
-    own = read_card(header, str(path)) if header is not None else card_beside(path)
+    if header is not None:
+        own = read_card(header, str(path))
+    else:
+        # Where the architecture is named, a file of the same name may be anything.
+        own = card_beside(path) if card is None or _is_card(path.with_suffix(".json")) else None
+    if own is not None and own.architecture is None and card is not None:
+        own = replace(own, architecture=card.architecture)
     if own is not None and card is not None and own.architecture != card.architecture:
         raise ControllerError(
             f"{path if header is not None else path.with_suffix('.json')} says that it is {own.architecture!r}, not "
@@ -188,6 +194,13 @@ def _fill(network: nn.Module, state: dict[str, Shaped[Tensor, "..."]], path: Pat
         if not tensor.float().isfinite().all() and not torch.equal(tensor.float(), expected[key].float()):
             raise ControllerError(f"{path}: tensor {key} has NaN or infinite values")
     network.load_state_dict(state)
+
+
+def _is_card(path: Path) -> bool:
+    try:
+        return CARD_FORMAT in path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def card_beside(path: Path) -> ControllerCard | None:

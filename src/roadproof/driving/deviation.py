@@ -25,10 +25,6 @@ LEAVES_LANE_M = 0.8
 1.9 m."""
 
 
-STANDS_M = 0.01
-"""Who moves by less from one observation to the next stands: a car that brakes or leans on a wall creeps."""
-
-
 END_M = 1.0
 """So far back from the end of a drive it is looked which way it went there: a car that hits something turns."""
 
@@ -140,19 +136,21 @@ def _beside(
     """What `lateral_m` gives, and how far beyond the path's end each position is, metres; below 0 before it."""
     _check_path(reference, "reference")
     _check_path(positions, "compared")
+    step = np.diff(reference, axis=0)
+    length = np.hypot(*step.T)
     # A car that stands has no direction.
-    moves = np.hypot(*np.diff(reference, axis=0).T) > STANDS_M
-    if not moves.any():
+    start, step, length = reference[:-1][length > 1e-6], step[length > 1e-6], length[length > 1e-6]
+    if not len(step):
         raise EpisodeError("the reference drive does not move, so nothing can be beside it; check the controller")
-    path = reference[np.concatenate([[True], moves])]
-    far = np.flatnonzero(np.hypot(*(path - path[-1]).T) >= END_M)
-    # The last step has no length: there it goes on as it went in the last metre.
-    step = np.concatenate([np.diff(path, axis=0), path[-1:] - path[far[-1] if len(far) else -2]])
-    start, length = path, np.hypot(*step.T)
-    keeps = length > 1e-6
-    start, step, length = start[keeps], step[keeps], length[keeps]
-    ahead = step / length[:, None]
-    length[-1] = 0.0
+    # Beyond its end it goes on as it went in the last metre: a car that stands creeps, one that was hit turns.
+    back = reference - reference[-1]
+    far = np.flatnonzero(np.hypot(*back.T) >= END_M)
+    onward = -back[far[-1] if len(far) else 0]
+    if np.hypot(*onward) <= 1e-6:
+        onward = step[-1]
+    start, step = np.concatenate([start, reference[-1:]]), np.concatenate([step, onward[None]])
+    ahead = step / np.hypot(*step.T)[:, None]
+    length = np.append(length, 0.0)
     away = positions[:, None] - start[None]
     along = (away * ahead).sum(-1)
     low, high = np.zeros(len(step)), length.copy()

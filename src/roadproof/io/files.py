@@ -216,6 +216,16 @@ def writing(path: Path) -> Generator[None]:
         ) from None
 
 
+def remove(path: Path) -> None:
+    """Remove a file, where there is one.
+
+    Raises:
+        OutputError: the system refuses to.
+    """
+    with writing(path):
+        path.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file as UTF-8, whole or not at all."""
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

@@ -140,8 +140,7 @@ class Vehicle:
                 f"steering explains {max(r2, 0):.0%} of the way the cars took, expected {_LEAST_R2:.0%} or more; check "
                 "that poses and steer belong to the same steps, or give the vehicle's wheelbase and steering range"
             )
-        kept, at_once, before = a.tolist()[:3]
-        if at_once + before > 0.0 and kept < 1.0:
+        if _steers_the_other_way(stretches, dt_s):
             raise RecordingError(
                 "the cars turn left where they steer to the right; expected steer and yaw_rad as in "
                 "docs/recordings.md: steer is positive to the right, yaw to the left"
@@ -224,6 +223,20 @@ class _Rows:
         slip = np.remainder(np.arctan2(dy, dx) - middle + np.pi, 2 * np.pi) - np.pi
         slipping = np.stack([kappa[now], one], 1)
         return _Rows(curving[moving], kappa[now][moving], pulling, pull, slipping[moving], slip[moving])
+
+
+def _steers_the_other_way(stretches: Sequence[tuple[Track, slice]], dt_s: float) -> bool:
+    """Whether cars turn left where they steered to the right, whatever delay of up to half a second is looked at."""
+    found: list[float] = []
+    for lag in range(max(1, round(0.5 / dt_s)) + 1):
+        pairs = [
+            (track.steer[rows][: len(kappa)], kappa) for track, rows in stretches for kappa in [curvatures(track, rows)]
+        ]
+        steer = np.concatenate([u[: len(k) - lag] for u, k in pairs if len(k) > lag] or [np.zeros(0)])
+        turned = np.concatenate([k[lag:] for _, k in pairs if len(k) > lag] or [np.zeros(0)])
+        if len(steer) > 1 and steer.std() > 1e-6 and turned.std() > 1e-9:
+            found.append(float(np.corrcoef(steer, turned)[0, 1]))
+    return bool(found) and max(found) > 0.5 and max(found) > 0.2 - min(found)
 
 
 def _pull(

@@ -260,4 +260,5 @@ def _read_frames(folder: Path, numbers: np.ndarray, view: CropResize) -> np.ndar
         return read_array(folder / "frames.npy", RecordingError, _AGAIN)
     pictures = (folder / "frames" / f"{number}.png" for number in numbers)
     size = view.width_px, view.height_px
-    return np.stack([read_picture(path, RecordingError, _AGAIN, size=size) for path in pictures])
+    frames = [read_picture(path, RecordingError, _AGAIN, size=size) for path in pictures]
+    return np.stack(frames) if frames else np.empty((0, view.height_px, view.width_px, 3), np.uint8)

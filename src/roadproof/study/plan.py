@@ -118,6 +118,9 @@ class Job(Conditions):
         told: dict[str, Any] = {"job_version": version, **asdict(self), "scenario": identity(self.scenario)}
         if isinstance(self.method, BlackBoxPlan) and self.method.start:
             told["begun_with"] = JOB_VERSIONS[GradOpt.word]
+        if self.variation or self.paint:
+            # Searches under a variation count from the bare road in the same look; limits know the asphalt better.
+            told["under_limits"] = 2
         # Jobs are older than these words; a map of the user's is known by what is in it, not by where it lies.
         tables = (
             (told, ("weights", "paint", "variation")),

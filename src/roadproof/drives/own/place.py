@@ -43,7 +43,7 @@ def track_of(own: OwnDrives, table: Table, *, alone: bool) -> Track:
         x_m, y_m, yaw_rad = (numbers[name] for name in POSE)
         _check_heading(table, x_m, y_m, yaw_rad, dt_s)
         if "speed_mps" not in numbers:
-            _check_every_row_moves(table, x_m, y_m)
+            _check_every_row_moves(table, x_m, y_m, dt_s)
         way = np.gradient(x_m) * np.cos(yaw_rad) + np.gradient(y_m) * np.sin(yaw_rad) if len(x_m) > 1 else x_m * 0
         speed = numbers.get("speed_mps", way / dt_s)
     elif "yaw_rate_rad_s" in numbers:
@@ -90,15 +90,15 @@ def _check_heading(
     dt_s: float,
 ) -> None:
     """Refuse headings in another unit, or counted from elsewhere, than the way that the poses take."""
-    # Over half a second: some log poses less often than rows.
+    # Over half a second: some log poses less often than rows. A metre is more than a pose jitters where a car stands.
     steps = max(1, round(0.5 / dt_s))
     dx, dy = x_m[steps:] - x_m[:-steps], y_m[steps:] - y_m[:-steps]
-    middle = np.unwrap(yaw_rad)[steps // 2 :][: len(dx)]
-    moves = np.hypot(dx, dy) > _LEAST_WAY_M / 2
+    yaw, speed = np.unwrap(yaw_rad), table.numbers.get("speed_mps", np.ones(len(x_m)))
+    moves = (np.hypot(dx, dy) > 2 * _LEAST_WAY_M) & (speed[steps:] >= 0) & (speed[:-steps] >= 0)
     if not moves.any():
         return
-    turned = np.remainder(np.arctan2(dy, dx) - middle + np.pi, 2 * np.pi) - np.pi
-    beside = float(np.median(np.abs(turned[moves])))
+    turned = np.arctan2(dy, dx) - (yaw[steps:] + yaw[:-steps]) / 2
+    beside = float(np.median(np.abs(np.remainder(turned + np.pi, 2 * np.pi) - np.pi)[moves]))
     if beside > _MOST_BESIDE_RAD:
         raise RecordingError(
             f"{table.drive.table}: the car moves {beside:.2f} rad beside its yaw_rad (median), expected about 0; give "
@@ -106,11 +106,17 @@ def _check_heading(
         )
 
 
-def _check_every_row_moves(table: Table, x_m: Float[np.ndarray, " n"], y_m: Float[np.ndarray, " n"]) -> None:
+def _check_every_row_moves(
+    table: Table, x_m: Float[np.ndarray, " n"], y_m: Float[np.ndarray, " n"], dt_s: float
+) -> None:
     """Refuse poses that wait and jump in turn, of which no speed can be made from row to row."""
+    half = max(1, round(0.25 / dt_s))
+    at = np.arange(half, len(x_m) - half)
+    # Where a car crawls, poses that are rounded wait too.
+    clear = np.hypot(x_m[at + half] - x_m[at - half], y_m[at + half] - y_m[at - half]) > _LEAST_WAY_M
     moves = np.hypot(np.diff(x_m), np.diff(y_m)) > 1e-6
-    turns = int((moves[1:] != moves[:-1]).sum())
-    if turns > max(6.0, len(moves) / 10):
+    turns = int((moves[at] != moves[at - 1])[clear].sum())
+    if turns > max(6.0, clear.sum() / 10):
         raise RecordingError(
             f"{table.drive.table}: poses change in {int(moves.sum())} of {len(moves)} steps, now and then, so they do "
             "not say how fast the car was; give speed_mps, or a row for each pose"
