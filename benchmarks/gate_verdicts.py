@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import statistics
 import subprocess
 import sys
@@ -26,9 +27,11 @@ import torch
 
 import roadproof
 from roadproof.controllers import ConditionalPilotNet, save_controller
+from roadproof.controllers.shipped import shipped_weights
 from roadproof.datatypes import Ending
 from roadproof.driving.rollout import rollout
 from roadproof.io.files import write_json
+from roadproof.io.identity import digest
 from roadproof.machine import made_with
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.recorded.world import RecordedWorld
@@ -115,9 +118,13 @@ def fails(town: TownSimulator, controller: ConditionalPilotNet, street: str) -> 
 
 def checked(team: Path, name: str, controller: str, seed: int) -> dict[str, Any]:
     """One check: its exit code and its seconds."""
-    kept = team / "done" / f"{name}-{seed}.json"
+    # A controller of the same name may be another: its weights tell.
+    weights = team / controller if (team / controller).is_file() else shipped_weights(controller)
+    told = digest(weights.read_bytes())[:16]
+    kept = team / "done" / f"{name}-{seed}-{told}.json"
     if kept.exists():
         return json.loads(kept.read_text())
+    shutil.rmtree(team / f"out-{name}-{seed}", ignore_errors=True)  # of one that was ended: its seconds are not known
     plan = team / f"{name}-{seed}.toml"
     scenarios = ", ".join(f'"{street}"' for street in STREETS)
     plan.write_text(PLAN.format(controller=controller, scenarios=scenarios, first=2 * seed, second=2 * seed + 1))

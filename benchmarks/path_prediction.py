@@ -128,6 +128,13 @@ def main() -> None:
     args = parser.parse_args()
     keep_freed_memory()  # as the command line does
     stored = json.loads(args.json.read_text()) if args.json.exists() else {"records": []}
+    # Older files are of seed 0.
+    known = (
+        stored.get("simulator", args.simulator.split(":")[0]),
+        stored.get("seed", 0 if stored["records"] else args.seed),
+    )
+    if known != (args.simulator.split(":")[0], args.seed):
+        parser.error(f"{args.json} is of simulator {known[0]}, seed {known[1]}; choose another file")
     cells = {one["cell"]: one for one in stored["records"] if "each" in one}
     for name in args.controllers:
         for scenario in (find_scenario(each) for each in args.scenarios):
@@ -140,6 +147,7 @@ def main() -> None:
             content = {
                 "made_with": made_with(),
                 "simulator": args.simulator.split(":")[0],
+                "seed": args.seed,
                 "records": [*cells.values(), summary("pooled", every)],
             }
             write_json(args.json, content)

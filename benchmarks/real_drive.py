@@ -65,7 +65,7 @@ table = "clean.csv"
 def written(arguments: argparse.Namespace) -> np.ndarray:
     """The stretch as a folder of one's own; returns the angles of its steering wheel, radians, left positive."""
     rows = list(csv.DictReader(arguments.steering.open()))[arguments.first : arguments.first + arguments.count]
-    arguments.out.mkdir(parents=True)
+    arguments.out.mkdir(parents=True, exist_ok=True)
     plan = PLAN.format(
         first=arguments.first,
         last=arguments.first + len(rows) - 1,

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import platform
 import resource
 import statistics
 import subprocess
@@ -100,7 +99,6 @@ def main() -> None:
         "graphics": arguments.graphics,
         "agents": {"cars": AGENTS, "pedestrians": AGENTS},
         "load_before": load_before,
-        "platform": platform.platform(),
         "made_with": made_with() | {"panda3d": version("panda3d")},
     }
     for name, value in result.items():

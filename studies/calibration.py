@@ -154,7 +154,8 @@ def judge(
     results: dict[CalibrationMethod, Calibrated] = {}
     for method in methods:
         began = time.process_time()
-        results[method] = calibrate(town, drives, method, folder=keep)
+        # Each in a folder of its own: one would read the replays of another.
+        results[method] = calibrate(town, drives, method, folder=keep / str(method))
         print(f"  {method}: {time.process_time() - began:.0f} s of one core", flush=True)
     replays = Replays(town, drives, keep)
     painted = {

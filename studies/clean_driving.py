@@ -107,7 +107,7 @@ def study(controllers: Sequence[str], names: Sequence[str], processes: int, out:
     with Progress() as bar:
         for controller in controllers:
             now = digest(shipped_weights(controller).read_bytes())[:16]
-            if weights.get(controller) != now:
+            if weights.setdefault(controller, now) != now:
                 drives.pop(controller, None)  # of other weights of this name
                 weights[controller] = now
             for name, wanted in conditions().items():

@@ -8,12 +8,14 @@ recorded world, whose first choice is driven from five starts at noon: the media
 drives that leave the lane, how conspicuous the pattern is. The cost of a limit is the deviation of `no limit` less its
 own. `cheapest` is the fewest square metres that are predicted to deviate by 0.8 m, driven from the same starts.
 
-Everything is kept in FOLDER; an interrupted study goes on there, and writes what it has after every row.
+Everything is kept in FOLDER; an interrupted study goes on there, and writes what it has after every row. Rows of other
+cells and limits that OUT holds stay there.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -161,6 +163,10 @@ def _folder(name: str) -> str:
     return "".join(letter if letter.isalnum() else "-" for letter in name)
 
 
+def _key(row: Row) -> tuple[object, ...]:
+    return row["controller"], row["scenario"], row["seed"], row["limit"]
+
+
 def table(rows: list[Row]) -> str:
     """The cost of every limit, over cells, as Markdown."""
     bare = {(row["controller"], row["scenario"]): row["deviation_m"] for row in rows if row["limit"] == NO_LIMIT}
@@ -193,7 +199,8 @@ def main() -> None:
     parser.add_argument("--limits", nargs="+", default=[*LIMITS, CHEAPEST], choices=[*LIMITS, CHEAPEST])
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    rows: list[Row] = []
+    stored: list[Row] = json.loads(asked.json.read_text(encoding="utf-8"))["rows"] if asked.json.exists() else []
+    rows = {_key(row): row for row in stored}
     with TownSimulator() as town:
         for spec in asked.controllers:
             for name in asked.scenarios:
@@ -206,10 +213,10 @@ def main() -> None:
                     seed=asked.seed,
                 )
                 for row in cell.rows(asked.limits):
-                    rows.append(row)
-                    write_json(asked.json, {"made_with": made_with(), "rows": rows})
+                    rows[_key(row)] = row
+                    write_json(asked.json, {"made_with": made_with(), "rows": list(rows.values())})
                     print(f"{spec}, {name}, {row['limit']}: {row['deviation_m']:.2f} m", flush=True)
-    print(table(rows))
+    print(table(list(rows.values())))
 
 
 if __name__ == "__main__":
