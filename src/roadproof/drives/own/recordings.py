@@ -35,6 +35,8 @@ from roadproof.recorded.poses import odd_ratio
 from roadproof.recordings import Recording, RecordingSet, Side, Track, evenly
 from roadproof.recordings.recording import PER_FRAME
 
+_LEAST_MPS = 1.0
+"""Slower cars do not tell whether a stated speed is that of the pictures."""
 WINDOW = Window(frames=40, least_px=8)
 """Frames that are kept of a drive, as a recording for the recorded world has them."""
 
@@ -92,9 +94,6 @@ def _with_camera(folder: Path, own: OwnDrives) -> tuple[OwnDrives, str]:
         camera, told = found.camera, f"; {found}"
     camera = fitted_camera(camera, own.ground, fov_known=own.chessboard is not None)
     return replace(own, camera=camera, chessboard=None), told
-
-
-_LEAST_MPS = 1.0
 
 
 def _with_motion(folder: Path, own: OwnDrives, table: Table) -> tuple[list[Table], str]:
