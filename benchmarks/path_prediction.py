@@ -129,11 +129,9 @@ def main() -> None:
     keep_freed_memory()  # as the command line does
     stored = json.loads(args.json.read_text()) if args.json.exists() else {"records": []}
     # Older files are of seed 0.
-    known = (
-        stored.get("simulator", args.simulator.split(":")[0]),
-        stored.get("seed", 0 if stored["records"] else args.seed),
-    )
-    if known != (args.simulator.split(":")[0], args.seed):
+    simulator = args.simulator.split(":")[0]
+    known = stored.get("simulator", simulator), stored.get("seed", 0 if stored["records"] else args.seed)
+    if known != (simulator, args.seed):
         parser.error(f"{args.json} is of simulator {known[0]}, seed {known[1]}; choose another file")
     cells = {one["cell"]: one for one in stored["records"] if "each" in one}
     for name in args.controllers:
@@ -146,7 +144,7 @@ def main() -> None:
             every = [one for each in cells.values() for one in each["each"]]
             content = {
                 "made_with": made_with(),
-                "simulator": args.simulator.split(":")[0],
+                "simulator": simulator,
                 "seed": args.seed,
                 "records": [*cells.values(), summary("pooled", every)],
             }

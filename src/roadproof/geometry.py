@@ -299,6 +299,10 @@ class CanvasPlacement:
         if not (self.width_m > 0 and self.length_m > 0):
             raise GeometryError(f"canvas is {self.width_m} m × {self.length_m} m, expected both extents above 0")
 
+    def ahead_m(self, x_m: float, y_m: float) -> float:
+        """How far a place in the world lies past the canvas' middle along the canvas, metres; below 0 before it."""
+        return (x_m - self.x_m) * math.cos(self.yaw_rad) + (y_m - self.y_m) * math.sin(self.yaw_rad)
+
     @property
     def world_from_canvas(self) -> Float[np.ndarray, "4 3"]:
         """Homogeneous world points (X, Y, Z, 1) from canvas pixels (x, y, 1)."""
@@ -308,6 +312,11 @@ class CanvasPlacement:
         per_y = -forward * (self.length_m / CANVAS_SIZE_PX)
         centre = np.array([self.x_m, self.y_m, self.z_m, 1.0])
         return np.column_stack([per_x, per_y, centre - (CANVAS_SIZE_PX - 1) / 2 * (per_x + per_y)])
+
+
+def wrapped_rad(angle_rad: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Angles within half a turn: −π to π, radians."""
+    return np.remainder(angle_rad + np.pi, 2 * np.pi) - np.pi
 
 
 def homography_from_pose(camera: CameraModel, state: VehicleState, canvas: CanvasPlacement) -> Homography:

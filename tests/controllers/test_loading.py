@@ -136,12 +136,22 @@ def normed():
 """
 
 
-@pytest.mark.filterwarnings("ignore:.*weight_norm.*:FutureWarning")
-def test_one_object_of_a_factory_is_not_changed_under_another_that_holds_it(tmp_path, monkeypatch):
-    (tmp_path / "shared_driver.py").write_text(SHARED)
+@pytest.fixture
+def held(tmp_path, monkeypatch):
+    """Writes the module of shared networks, and gives a controller that somebody holds, with its answer."""
     monkeypatch.chdir(tmp_path)
-    before = load_controller("shared_driver:make")
-    answer = before.steer(*drive()).clone()
+
+    def hold(spec):
+        (tmp_path / f"{spec.partition(':')[0]}.py").write_text(SHARED)
+        before = load_controller(spec)
+        return before, before.steer(*drive()).clone()
+
+    return hold
+
+
+@pytest.mark.filterwarnings("ignore:.*weight_norm.*:FutureWarning")
+def test_one_object_of_a_factory_is_not_changed_under_another_that_holds_it(held, tmp_path):
+    before, answer = held("shared_driver:make")
     tuned = load_trainable("shared_driver:make")
     assert [name for name, each in tuned.named_parameters() if each.requires_grad] == ["scale"], "the rest stays frozen"
     with torch.no_grad():
@@ -158,11 +168,8 @@ def test_one_object_of_a_factory_is_not_changed_under_another_that_holds_it(tmp_
 
 
 @pytest.mark.filterwarnings("ignore:.*weight_norm.*:FutureWarning")
-def test_a_new_wrapper_around_the_same_network_is_no_new_one(tmp_path, monkeypatch):
-    (tmp_path / "wrapped_driver.py").write_text(SHARED)
-    monkeypatch.chdir(tmp_path)
-    before = load_controller("wrapped_driver:Wrapper")
-    answer = before.steer(*drive()).clone()
+def test_a_new_wrapper_around_the_same_network_is_no_new_one(held):
+    before, answer = held("wrapped_driver:Wrapper")
     learner = load_trainable("wrapped_driver:Wrapper")
     assert [name for name, each in learner.named_parameters() if each.requires_grad] == ["inner.scale"]
     with torch.no_grad():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from threading import RLock
 from typing import TypedDict, Unpack
 
@@ -226,6 +226,11 @@ class ClosedLoopMeasure(BatchedMeasure):
                 # Not part of a search's cost: every process that values a group makes them again.
                 self.frames_evaluated = counted
         return self._bare[key]
+
+    def changed(self, world: RecordedWorld, rolled: Rolled, of: Callable[[Rolled], Float[Tensor, "_ t"]]) -> Tensor:
+        """A quantity of drives less that of the drives over the bare road from the same start in the same look."""
+        now, bare = of(rolled), of(self.bare(world))
+        return now - bare.repeat(len(now) // len(bare), 1)
 
     def _pictures(self, world: RecordedWorld, after: Approach | None) -> int:
         """Number of pictures that all drives over one pattern take, or those that go on from an approach."""

@@ -57,8 +57,7 @@ class DeviationMeasure(ClosedLoopMeasure):
         right_m = rolled.right_m
         if self.variation is not None:
             # What a look does to the drive over the bare road is not the paint's.
-            bare_m = self.bare(world).right_m
-            right_m = right_m - bare_m.repeat(len(right_m) // len(bare_m), 1)
+            right_m = self.changed(world, rolled, lambda drives: drives.right_m)
         return (self._saturation_m * torch.tanh(right_m / self._saturation_m)).mean(1)
 
     def predict(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:

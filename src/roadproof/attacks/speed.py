@@ -51,8 +51,7 @@ class SpeedMeasure(ClosedLoopMeasure):
 
     def read(self, world: RecordedWorld, rolled: Rolled) -> Float[Tensor, " r"]:
         """The mean change of the speed in each drive, m/s, positive where the car is faster."""
-        bare_mps = self.bare(world).speed_mps
-        return (rolled.speed_mps - bare_mps.repeat(len(rolled.speed_mps) // len(bare_mps), 1)).mean(1)
+        return self.changed(world, rolled, lambda drives: drives.speed_mps).mean(1)
 
     def predict(self, world: RecordedWorld, patterns: Pattern, looks: Looks | None) -> Float[np.ndarray, "r s"]:
         """The mean change of the speed, m/s, negative where the car is slower, of R patterns in each of S drives."""

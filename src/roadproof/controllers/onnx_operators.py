@@ -118,9 +118,8 @@ def _resize(a: Attributes, x: Inputs) -> Tensor:
     rounding = a.get("nearest_mode", b"round_prefer_floor") if mode == b"nearest" else None
     picture: Tensor = x[0]
     sizes, scales = _integers(_get(x, 3)), _get(x, 2)
-    if (sizes and sizes[:2] != [*picture.shape[:2]]) or (
-        not sizes and scales is not None and bool((scales[:2] != 1).any())
-    ):
+    stays = sizes[:2] == [*picture.shape[:2]] if sizes else scales is None or bool((scales[:2] == 1).all())
+    if not stays:
         raise ValueError("another number of pictures or channels")
     size = sizes[2:] if sizes else None
     factor = None if sizes or scales is None else [float(each) for each in scales[2:]]

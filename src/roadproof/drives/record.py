@@ -213,9 +213,8 @@ def _clean(
     harm = [event for event in episode.events if event.kind in _ENDS_IT and event.time_s <= last_s]
     notes = [f"{harm[0].kind} at {harm[0].time_s:.1f} s, before or on the canvas"] if harm else []
     canvas = settings.scenario.canvas
-    ahead_m = (episode.x_m[-1] - canvas.x_m) * math.cos(canvas.yaw_rad)
-    ahead_m += (episode.y_m[-1] - canvas.y_m) * math.sin(canvas.yaw_rad)
-    notes += [f"{episode.ending} before the canvas was passed"] if ahead_m < canvas.length_m / 2 else []
+    passed = canvas.ahead_m(float(episode.x_m[-1]), float(episode.y_m[-1])) >= canvas.length_m / 2
+    notes += [] if passed else [f"{episode.ending} before the canvas was passed"]
     return _drive(plan, episode, chosen, episode.steer, note="; ".join(notes))
 
 

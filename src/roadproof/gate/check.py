@@ -38,6 +38,7 @@ from roadproof.gate.verdict import Kind, Status, judge
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.identity import digest
 from roadproof.io.locks import working_in
+from roadproof.paint import Site
 from roadproof.patterns import raster, read_paint, save_pattern
 from roadproof.pipeline.budget import QUICK
 from roadproof.pipeline.film import STRIP, film_drives
@@ -174,16 +175,15 @@ class _Check:
             # Random ones keep to limits by the asphalt that is measured in each weather's recordings.
             patterns = patterns if attacks else patterns.joinpath(*place.weathers)
             paints = known_paints(plan, scenario, site, patterns)
-            stage = f"Driving {scenario.name}, {', '.join(place.weathers)}"
-            stretch = self._stretch(place, world, scenario, paints)
             if attacks:
-                stretch.drive_bare(
-                    place.factory, self.processes, lambda done, total: self.on_progress(stage, done, total, "")
+                bare = self._stretch(place, world, scenario, ())
+                self._drive(place, bare)
+                drives_well = any(not each.wrong for each in bare.bare(plan.weathers[0]))
+                paints += tuple(
+                    self._fresh(world, scenario, seed, size) if drives_well else self._unsearched(scenario, site, seed)
+                    for seed in plan.seeds
                 )
-                drives_well = any(not each.wrong for each in stretch.bare(plan.weathers[0]))
-                search = self._fresh if drives_well else self._unsearched
-                paints += tuple(search(world, scenario, seed, size) for seed in plan.seeds)
-                stretch = self._stretch(place, world, scenario, paints)
+            stretch = self._stretch(place, world, scenario, paints)
             told = {
                 key: (stretch.conditions(key, painted), painted)
                 for key in plan.keys
@@ -192,8 +192,12 @@ class _Check:
             }
             for key, (conditions, _) in told.items():
                 self._check_comparable(key, conditions)
-            stretch.drive(place.factory, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
+            self._drive(place, stretch)
             return [self._judged(place, stretch, key, *each) for key, each in told.items()]
+
+    def _drive(self, place: Place, stretch: Stretch) -> None:
+        stage = f"Driving {place.scenario.name}, {', '.join(place.weathers)}"
+        stretch.drive(place.factory, self.processes, lambda done, total: self.on_progress(stage, done, total, ""))
 
     def _stretch(self, place: Place, world: Simulator, scenario: Scenario, paints: tuple[Paint, ...]) -> Stretch:
         images = {paint.name: raster(paint.pattern) for paint in paints}
@@ -262,9 +266,9 @@ class _Check:
         drives = tuple((each, k) for each in plan.seeds for k in range(plan.starts.count))
         return Paint(name, Kind.FRESH, fresh(seed), found.pattern, path, drives)
 
-    def _unsearched(self, world: Simulator, scenario: Scenario, seed: int, _: tuple[int, int]) -> Paint:
+    def _unsearched(self, scenario: Scenario, site: Site, seed: int) -> Paint:
         """Any pattern, to see the bare road beside: no attack begins where the car does not arrive without paint."""
-        space = SearchSpace(figures=self.plan.figures, limits=self.plan.paint).on(site_at(world, scenario))
+        space = SearchSpace(figures=self.plan.figures, limits=self.plan.paint).on(site)
         path = self.folder / PATTERNS / scenario.name / f"not-searched-{seed}.json"
         pattern = space.drawn(1, seed)[0]
         save_pattern(pattern, path)

@@ -104,22 +104,13 @@ class Stretch:
             SimulatorError, ControllerError: as `driving.rollout.rollout` does.
             OutputError: the drives cannot be written.
         """
-        alone = self._all_alone()
+        alone = [each for weather in self.weathers for each in self._alone(weather).values()]
         total = len(alone) + len(self.weathers) * sum(len(paint.drives) for paint in self.paints)
         with here_or_beside(self.world, factory, processes) as pool:
             make_missing(pool, self.episodes, alone, lambda done: on_drive(done, total))
             painted = [each for weather in self.weathers for _, _, each in self._pairs(weather, self.paints)]
             total = len(alone) + len(painted)
             make_missing(pool, self.episodes, painted, lambda done: on_drive(len(alone) + done, total))
-
-    def drive_bare(self, factory: SimulatorFactory, processes: int, on_drive: Callable[[int, int], object]) -> None:
-        """Make the drives past the bare road alone, which an attack needs; all else is as in `drive`."""
-        alone = self._all_alone()
-        with here_or_beside(self.world, factory, processes) as pool:
-            make_missing(pool, self.episodes, alone, lambda done: on_drive(done, len(alone)))
-
-    def _all_alone(self) -> list[DriveConditions]:
-        return [each for weather in self.weathers for each in self._alone(weather).values()]
 
     def _pairs(self, weather: Weather, paints: Iterable[Paint]) -> list[tuple[Paint, DriveConditions, DriveConditions]]:
         """Patterns, with each drive over them after the one that it is compared with, where that went well."""

@@ -60,10 +60,12 @@ class PaintLimits:
             raise PatternError(f"max_area_m2 is {self.max_area_m2}, expected square metres above 0, and 10,000 at most")
         if self.keep_out_m is not None and not 0.0 <= self.keep_out_m <= MOST_M:
             raise PatternError(f"keep_out_m is {self.keep_out_m}, expected 0 to {MOST_M:g} m")
-        if self.contrast is not None and len(self.contrast) != 2:
-            raise PatternError(f"contrast is {self.contrast}, expected two numbers, the least and the most")
-        if self.contrast is not None and not 0.0 <= self.contrast[0] <= self.contrast[1] - 0.01 + 1e-9 <= 0.99 + 1e-9:
-            raise PatternError(f"contrast is {self.contrast}, expected 0 ≤ least < most ≤ 1, at least 0.01 apart")
+        if self.contrast is not None:
+            if len(self.contrast) != 2:
+                raise PatternError(f"contrast is {self.contrast}, expected two numbers, the least and the most")
+            least, most = self.contrast
+            if not (0.0 <= least <= most - 0.01 + 1e-9 and most <= 1.0):
+                raise PatternError(f"contrast is {self.contrast}, expected 0 ≤ least < most ≤ 1, at least 0.01 apart")
         for colour in (*self.colours, *([self.asphalt] if self.asphalt else [])):
             rgb_of(colour)
 

@@ -31,6 +31,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from roadproof.errors import RecordingError
+from roadproof.geometry import wrapped_rad
 from roadproof.recordings import Track
 from roadproof.traffic.agents import CAR_WHEELBASE_M
 
@@ -220,18 +221,17 @@ class _Rows:
         dx, dy = np.diff(track.x_m[rows])[now], np.diff(track.y_m[rows])[now]
         yaw = np.unwrap(track.yaw_rad[rows])
         middle = 0.5 * (yaw[1:] + yaw[:-1])[now]
-        slip = np.remainder(np.arctan2(dy, dx) - middle + np.pi, 2 * np.pi) - np.pi
+        slip = wrapped_rad(np.arctan2(dy, dx) - middle)
         slipping = np.stack([kappa[now], one], 1)
         return _Rows(curving[moving], kappa[now][moving], pulling, pull, slipping[moving], slip[moving])
 
 
 def _steers_the_other_way(stretches: Sequence[tuple[Track, slice]], dt_s: float) -> bool:
     """Whether cars turn left where they steered to the right, whatever delay of up to half a second is looked at."""
+    turns = [(track.steer[rows], curvatures(track, rows)) for track, rows in stretches]
+    pairs = [(steer[: len(kappa)], kappa) for steer, kappa in turns]
     found: list[float] = []
     for lag in range(max(1, round(0.5 / dt_s)) + 1):
-        pairs = [
-            (track.steer[rows][: len(kappa)], kappa) for track, rows in stretches for kappa in [curvatures(track, rows)]
-        ]
         steer = np.concatenate([u[: len(k) - lag] for u, k in pairs if len(k) > lag] or [np.zeros(0)])
         turned = np.concatenate([k[lag:] for _, k in pairs if len(k) > lag] or [np.zeros(0)])
         if len(steer) > 1 and steer.std() > 1e-6 and turned.std() > 1e-9:

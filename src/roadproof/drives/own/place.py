@@ -15,7 +15,7 @@ from roadproof.datatypes import VehicleState
 from roadproof.drives.own.plan import PLAN, GroundPoint, OwnDrives
 from roadproof.drives.own.table import POSE, Table
 from roadproof.errors import GeometryError, RecordingError
-from roadproof.geometry import CameraModel, CanvasPlacement
+from roadproof.geometry import CameraModel, CanvasPlacement, wrapped_rad
 from roadproof.recorded.poses import odd_ratio
 from roadproof.recordings import Track
 
@@ -98,7 +98,7 @@ def _check_heading(
     if not moves.any():
         return
     turned = np.arctan2(dy, dx) - (yaw[steps:] + yaw[:-steps]) / 2
-    beside = float(np.median(np.abs(np.remainder(turned + np.pi, 2 * np.pi) - np.pi)[moves]))
+    beside = float(np.median(np.abs(wrapped_rad(turned))[moves]))
     if beside > _MOST_BESIDE_RAD:
         raise RecordingError(
             f"{table.drive.table}: the car moves {beside:.2f} rad beside its yaw_rad (median), expected about 0; give "
@@ -183,9 +183,8 @@ def check_passes(table: Table, track: Track, canvas: CanvasPlacement) -> None:
     Raises:
         RecordingError: it does; the message says by how much.
     """
-    x_m, y_m = track.x_m - canvas.x_m, track.y_m - canvas.y_m
-    short_m = -float(x_m[-1] * math.cos(canvas.yaw_rad) + y_m[-1] * math.sin(canvas.yaw_rad)) - canvas.length_m / 2
-    if short_m > 0 and np.hypot(x_m, y_m).argmin() == len(track) - 1:
+    short_m = -canvas.ahead_m(float(track.x_m[-1]), float(track.y_m[-1])) - canvas.length_m / 2
+    if short_m > 0 and np.hypot(track.x_m - canvas.x_m, track.y_m - canvas.y_m).argmin() == len(track) - 1:
         raise RecordingError(
             f"drive {table.drive.name} ends {short_m:.1f} m before the canvas; give the rows of {table.drive.table} up "
             "to the canvas' end, or place it nearer"
