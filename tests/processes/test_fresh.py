@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -65,6 +66,22 @@ def test_ctrl_c_in_a_terminal_reaches_the_parent_alone():
             os.killpg(parent.pid, signal.SIGINT)
             time.sleep(0.05)
         assert parent.communicate() == ("3\nTrue\n", "")
+
+
+def test_ctrl_c_while_one_begins_comes_when_it_has_begun(monkeypatch):
+    """What minds the processes is known before it is started; an interruption between the two cannot end it."""
+    starts = threading.Thread.start
+
+    def interrupted(thread):
+        os.kill(os.getpid(), signal.SIGINT)
+        starts(thread)
+
+    with processes_beside(1) as pool:
+        monkeypatch.setattr(threading.Thread, "start", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            pool.submit(sum, [1, 2])
+        monkeypatch.undo()
+        assert pool.submit(sum, [3, 4]).result() == 7
 
 
 def test_what_one_prints_is_none_of_the_results(capfd):

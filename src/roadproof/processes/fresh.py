@@ -9,14 +9,16 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from roadproof import foreign
 from roadproof.machine import digits, keep_digits, keep_freed_memory
+
+_Given = ParamSpec("_Given")
+_Result = TypeVar("_Result")
 
 
 def processes_beside(count: int, begin: Callable[..., object] | None = None, *arguments: object) -> ProcessPoolExecutor:
@@ -33,7 +35,7 @@ def processes_beside(count: int, begin: Callable[..., object] | None = None, *ar
         arguments: arguments of `begin`.
     """
     given = (foreign.limit_s(), digits(), begin, arguments)
-    return ProcessPoolExecutor(count, mp_context=Fresh(), initializer=_begin, initargs=given)
+    return _Beside(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin, initargs=given)
 
 
 def remove_if_orphaned(folder: Path) -> None:
@@ -44,16 +46,19 @@ def remove_if_orphaned(folder: Path) -> None:
 _left_by_parent: list[Path] = []
 
 
-class _FreshProcess(SpawnProcess):
-    """A process to which a terminal's Ctrl-C does not come: it ends with its parent, and has nothing to say itself.
+class _Beside(ProcessPoolExecutor):
+    """Processes to which a terminal's Ctrl-C does not come: they end with their parent, and have nothing to say.
 
-    Its handler stays, so that a foreign call that does not come back can be ended by it.
+    Their handler stays, so that a foreign call that does not come back can be ended by it.
     """
 
-    def start(self) -> None:
-        """Begin; what is blocked here meanwhile stays so there, from its first import on."""
+    def submit(self, fn: Callable[_Given, _Result], /, *args: _Given.args, **kwargs: _Given.kwargs) -> Future[_Result]:
+        """Hold Ctrl-C back meanwhile: a process that begins here blocks it from its first import on, as this thread.
+
+        Nor can it come between making the thread that minds the processes and starting it; the pool could not end then.
+        """
         with _ctrl_c_later():
-            super().start()
+            return super().submit(fn, *args, **kwargs)
 
 
 @contextmanager
@@ -77,12 +82,6 @@ def _ctrl_c_later() -> Generator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if came:
             signal.raise_signal(signal.SIGINT)
-
-
-class Fresh(SpawnContext):
-    """Makes such processes, and what they share."""
-
-    Process = _FreshProcess  # pyright: ignore[reportAssignmentType]  # as the standard library's contexts have theirs
 
 
 def _begin(

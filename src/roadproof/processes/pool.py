@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import multiprocessing
 import os
 import pickle
 import tempfile
@@ -21,7 +22,7 @@ from typing import Any, Generic, TypeAlias, TypeVar, cast
 import torch
 
 from roadproof.errors import OutputError, RoadproofError, SimulatorError
-from roadproof.processes.fresh import Fresh, processes_beside, remove_if_orphaned
+from roadproof.processes.fresh import processes_beside, remove_if_orphaned
 from roadproof.processes.travel import arrived, pickled, travelling
 
 _DIED = "a driving process died; is there memory for all of them? try with fewer processes"
@@ -62,7 +63,7 @@ class Pool(Generic[Inside]):
         if self.processes > 1:
             # Never more than here: a controller's last digits depend on how many threads compute them.
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
-            self._stop = Fresh().Event()
+            self._stop = multiprocessing.get_context("spawn").Event()
             self._folder = tempfile.TemporaryDirectory(prefix="roadproof-", ignore_cleanup_errors=True)
             given = (self._opens, self._stop, threads, Path(self._folder.name))
             self._beside = [processes_beside(1, _begin_work, *given) for _ in range(self.processes)]
