@@ -121,7 +121,9 @@ class Cell:
             less = Cheapest.load(place)
         else:
             groups = BUDGET.method.groups(recordings)
-            searched = cheapest(recordings, self.controller, found, WANTED_M, groups=groups)
+            searched = cheapest(
+                recordings, self.controller, found, WANTED_M, groups=groups, checkpoints=place / "search"
+            )
             if searched is None:
                 print(f"{self.spec}, {self.scenario.name}: {cheapest_in_words(None, WANTED_M)}", flush=True)
                 return

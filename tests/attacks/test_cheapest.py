@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from recorded_drives import VEHICLE, drivable_set
 from roadproof.attacks import Cheapest, GradOpt, PathDeviation, attack, cheapest, site_of
 from roadproof.attacks.cheapest import _Narrowing, cheapest_in_words
 from roadproof.attacks.deviation import DeviationMeasure
+from roadproof.attacks.gradopt import Search
 from roadproof.attacks.groups import LEFT_GROUP, RIGHT_GROUP
 from roadproof.errors import PatternError, RoadproofError
 from roadproof.paint import PaintLimits, conspicuousness
@@ -80,12 +83,67 @@ def test_less_paint_still_reaches_the_deviation_and_keeps_the_limits(searched, t
     assert "Least paint that is predicted" in cheapest_in_words(less, wanted_m)
 
 
+@pytest.mark.slow
+def test_where_going_on_leads_nowhere_it_searches_afresh_and_goes_on_when_interrupted(searched, tmp_path, monkeypatch):
+    road, found = searched
+    wanted_m = 0.2 * found.predicted_range_m[0]
+    module = sys.modules["roadproof.attacks.cheapest"]
+    monkeypatch.setattr(module, "MOST_LEVELS", 2)
+    monkeypatch.setattr(module, "AFRESH", GradOpt(iterations=6, restarts=2, halving=False))
+    below, ways = _Narrowing.below, []
+
+    def in_a_dead_end(self, most_m2, kept):
+        on, afresh = below(self, most_m2, kept)
+        unseen = replace(on.space.limits, colours=("#6a6f6f",))  # that of the asphalt
+        for way in (replace(on, space=replace(on.space, limits=unseen)), afresh):
+            ways.append(way.level())
+            yield way
+
+    monkeypatch.setattr(_Narrowing, "below", in_a_dead_end)
+    asked = {"groups": [RIGHT_GROUP], "objective": GOAL, "checkpoints": tmp_path / "search"}
+
+    def interrupt(number, _area_m2):
+        if number == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cheapest(road, PullsToBrightPaint(), found, wanted_m, **asked, on_level=interrupt)
+
+    def written():
+        return {path.name: path.stat().st_mtime_ns for path in (tmp_path / "search").iterdir()}
+
+    kept = written()
+    assert sorted(kept) == ["1-afresh.safetensors", "1.safetensors"]
+    seen = []
+    less = cheapest(road, PullsToBrightPaint(), found, wanted_m, **asked, on_level=lambda *_: seen.append(written()))
+    assert kept.items() <= seen[1].items(), "a search was done twice"
+    assert not (tmp_path / "search").exists()
+    dead, afresh = ways[:2]
+    assert dead.predicted_m < wanted_m <= afresh.predicted_m
+    at = less.levels.index(afresh)
+    assert afresh.area_m2 <= 0.7 * less.levels[at - 1].area_m2 + 1e-3
+
+
+def test_a_search_afresh_may_go_to_the_other_side(searched, monkeypatch):
+    road, found = searched
+    site = site_of(road)
+    space = replace(found.space, limits=replace(found.space.limits, max_area_m2=1e4), site=None).on(site)
+    strong, weak = found.point_in(space), torch.full((3, len(space.names)), 0.5)
+    of_sides = Search(torch.stack([weak[None], strong[None]]), torch.zeros(2, 1), torch.zeros(1, 2, 1))
+    monkeypatch.setattr(GradOpt, "search", lambda *_, **_how: of_sides)
+    measure = GOAL.measure(road, PullsToBrightPaint(), [LEFT_GROUP, RIGHT_GROUP], device="cpu")
+    run = _Narrowing(measure, GOAL, 0, space, 0.1, 0, 3, weak[None, None])
+    _, afresh = run.below(1e4, None)
+    assert (run.group, afresh.group) == (0, 1)
+    torch.testing.assert_close(afresh.unit[0, 0], strong)
+
+
 @pytest.mark.parametrize("family", ["published", "published-bo", "free"])
 def test_the_figures_that_stay_are_the_same_without_the_one_that_goes(monkeypatch, family):
     space = SearchSpace(figures=2, family=family)
     unit = space.random((1, 1), torch.Generator().manual_seed(0))
     measure = DeviationMeasure.__new__(DeviationMeasure)
-    both = _Narrowing(measure=measure, space=space, wanted_m=0.1, seed=0, unit=unit)
+    both = _Narrowing(measure=measure, goal=GOAL, group=0, space=space, wanted_m=0.1, seed=0, figures=2, unit=unit)
     for kept in (0, 1):
         worth = torch.tensor([0.5, 0.5]).index_fill(0, torch.tensor([1 - kept]), 1.0)
         monkeypatch.setattr(_Narrowing, "_least_m", lambda _self, _space, _unit, worth=worth: worth)

@@ -4,23 +4,28 @@ From the strongest patterns found, in the recorded world:
 
     1. leave out figures, one after another, as long as the deviation stays: each time the one that is missed least;
     2. lower the limit of the area by a factor, search on from where the search is, and go on while the pattern that
-       comes of it still reaches the deviation; where it does not, try half of the step, some times.
+       comes of it still reaches the deviation;
+    3. where it does not, search afresh under that limit, to every side, as for the strongest pattern: with less paint
+       the car may have to go another way. Where that fails too, try half of the step, some times.
 
 What counts as reached is the least deviation over small errors, so that a drive over it should reach it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from roadproof.attacks.deviation import DeviationMeasure
-from roadproof.attacks.gradopt import Rung, gradopt
+from roadproof.attacks.closed_loop import ClosedLoopMeasure
+from roadproof.attacks.gradopt import Rung, Running, gradopt
 from roadproof.attacks.groups import Group
+from roadproof.attacks.methods import GradOpt
 from roadproof.attacks.objective import Objective, PathDeviation
 from roadproof.attacks.result import AttackResult, Candidate
 from roadproof.attacks.site import site_of
@@ -41,6 +46,9 @@ _LOWER, _SMALLEST_STEP = 0.7, 0.9
 _NO_LIMIT_M2 = 1e4
 RUNGS = (Rung(1, 8, 0.03),)
 """What is climbed below each limit of the area."""
+
+AFRESH = GradOpt()
+"""The search that is begun below a limit of the area where going on leads nowhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +132,7 @@ def cheapest(
     groups: Sequence[Group],
     objective: Objective | None = None,
     device: torch.device | str = "cpu",
+    checkpoints: Path | None = None,
     on_level: Callable[[int, float], object] = lambda _level, _area_m2: None,
 ) -> Cheapest | None:
     """The fewest square metres of paint that still take a controller so far aside.
@@ -136,6 +145,8 @@ def cheapest(
         groups: the groups of drives of the search before.
         objective: objective of the search before if it drove in the recorded world; `PathDeviation()` by default.
         device: torch device on which the search computes.
+        checkpoints: folder that keeps every search on the way, so that an interrupted one goes on; it is removed at the
+            end. None keeps nothing.
         on_level: called after every limit of the area with the number of limits tried and the least area so far, m².
 
     Returns:
@@ -150,20 +161,21 @@ def cheapest(
     check_wanted(wanted_m)
     if found.predicted_mps is not None:
         raise RoadproofError(f"cheapest is in metres of deviation, the search before was for the {found.objective}")
-    group = next((each for each in groups if str(each) == found.group), None)
-    if group is None:
+    names = [str(each) for each in groups]
+    if found.group not in names:
         raise RoadproofError(
-            f"the pattern was found for {found.group}, the groups are {', '.join(map(str, groups))}; "
+            f"the pattern was found for {found.group}, the groups are {', '.join(names)}; "
             "give the groups of the search before"
         )
     goal = objective if isinstance(objective, PathDeviation) else PathDeviation()
-    measure = goal.measure(recordings, controller, [group], device=device)
+    measure = goal.measure(recordings, controller, groups, device=device)
     site = site_of(recordings)
     # Any limit of the area that holds already makes the search know the size of the canvas.
     area = found.space.limits or PaintLimits()
     limits = replace(area, max_area_m2=area.max_area_m2 or _NO_LIMIT_M2)
     space = replace(found.space, limits=limits, site=None).on(site)
-    run = _Narrowing(measure, space, wanted_m, found.seed, found.point_in(space)[None, None].to(measure.device))
+    unit = found.point_in(space)[None, None].to(measure.device)
+    run = _Narrowing(measure, goal, names.index(found.group), space, wanted_m, found.seed, space.figures, unit)
     level = run.level()
     if level.predicted_m < wanted_m:
         return None
@@ -173,19 +185,23 @@ def cheapest(
             run, level = fewer, fewer.level()
             levels.append(level)
         on_level(number, levels[-1].area_m2)
-        lower = run.lowered(levels[-1].area_m2 * factor)
-        level = lower.level()
-        if level.predicted_m >= wanted_m:
-            run = lower
-            levels.append(level)
-        elif factor < _SMALLEST_STEP:
-            factor = factor**0.5
+        kept = None if checkpoints is None else checkpoints / f"{number}.safetensors"
+        for lower in run.below(levels[-1].area_m2 * factor, kept):
+            level = lower.level()
+            if level.predicted_m >= wanted_m:
+                run = lower
+                levels.append(level)
+                break
         else:
-            break
+            if factor >= _SMALLEST_STEP:
+                break
+            factor = factor**0.5
+    if checkpoints is not None:
+        shutil.rmtree(checkpoints, ignore_errors=True)
     pattern = run.pattern
     return Cheapest(
         pattern=pattern,
-        group=found.group,
+        group=names[run.group],
         wanted_m=wanted_m,
         predicted_m=levels[-1].predicted_m,
         conspicuousness=conspicuousness(pattern, run.space.site or site),
@@ -218,12 +234,18 @@ def check_wanted(wanted_m: float) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Narrowing:
-    """A search space that becomes narrower, and where the search is in it."""
+    """A search space that becomes narrower, and where the search is in it, for one of the groups of its measure.
 
-    measure: DeviationMeasure
+    `figures` counts those at first.
+    """
+
+    measure: ClosedLoopMeasure
+    goal: PathDeviation
+    group: int
     space: SearchSpace
     wanted_m: float
     seed: int
+    figures: int
     unit: Float[Tensor, "1 1 k n"]
 
     @property
@@ -254,13 +276,21 @@ class _Narrowing:
         best = int(least.argmax())
         return replace(self, space=space, unit=unit[:, [best]]) if float(least[best]) >= self.wanted_m else None
 
-    def lowered(self, most_m2: float) -> _Narrowing:
-        """The search after going on under a lower limit of the area, in m²."""
+    def below(self, most_m2: float, kept: Path | None) -> Iterator[_Narrowing]:
+        """The search under a lower limit of the area, in m²: after going on from here, then begun afresh."""
         assert self.space.limits is not None
         space = replace(self.space, limits=replace(self.space.limits, max_area_m2=most_m2))
-        search = gradopt(self.measure, space, RUNGS, seed=self.seed, starts=[self.unit[0].cpu()])
-        return replace(self, space=space, unit=search.best_unit)
+        here: Running = {"seed": self.seed, "objective": self.goal, "checkpoint": kept, "starts": [self.unit[0].cpu()]}
+        search = gradopt(self.measure.of_groups([self.group]), space, RUNGS, **here)
+        yield replace(self, space=space, unit=search.best_unit)
+        space = replace(space, figures=self.figures)
+        afresh = kept and kept.with_stem(f"{kept.stem}-afresh")
+        search = AFRESH.search(self.measure, space, seed=self.seed, objective=self.goal, checkpoint=afresh)
+        ahead = [k for k in range(len(self.measure.groups)) if k not in search.gave_way]
+        least = self.measure.of_groups(ahead).readings(space, search.best_unit)[1].amin(-1)
+        group, start = divmod(int(least.argmax()), least.shape[1])
+        yield replace(self, group=ahead[group], space=space, unit=search.best_unit[[group]][:, [start]])
 
     def _least_m(self, space: SearchSpace, unit: Float[Tensor, "1 s k n"]) -> Float[Tensor, " s"]:
         """The least deviation that each pattern is predicted to cause, metres, over small errors."""
-        return self.measure.readings(space, unit)[1].amin(-1)[0]
+        return self.measure.of_groups([self.group]).readings(space, unit)[1].amin(-1)[0]

@@ -193,7 +193,15 @@ def _less_paint(
 
     with progress("Looking for less paint", MOST_LEVELS) as show:
         less = cheapest(
-            drives, attacked, strongest, wanted_m, groups=groups, objective=objective, device=device, on_level=show
+            drives,
+            attacked,
+            strongest,
+            wanted_m,
+            groups=groups,
+            objective=objective,
+            device=device,
+            checkpoints=folder / "search",
+            on_level=show,
         )
     say(cheapest_in_words(less, wanted_m))
     if less is None:

@@ -200,6 +200,7 @@ class Stages:
                 groups=self.groups(recordings),
                 objective=self.budget.objective,
                 device=self.device,
+                checkpoints=folder / "search",
                 on_level=lambda level, area: self.on_progress("Looking for less paint", level, total, f"{area:.2f} m²"),
             )
             if less is None:

@@ -15,7 +15,7 @@ from torch.nn import Module
 
 from roadproof.attacks import TPE, BayesianOptimisation, GaussianProcess, GradOpt, Method, Objective, Published
 from roadproof.attacks.blackbox import AT_ONCE
-from roadproof.attacks.cheapest import MOST_LEVELS, RUNGS
+from roadproof.attacks.cheapest import AFRESH, MOST_LEVELS, RUNGS
 from roadproof.attacks.gradopt import DRAWN, Rung
 from roadproof.attacks.objective import ClosedLoop, SpeedChange, variation_of
 from roadproof.calibration import replays_needed
@@ -42,6 +42,9 @@ DRIVE_MB, FILM_MB, EPISODE_MB = 1.1, 7.0, 0.1
 PUBLISHED_S, PROCESS_S = (0.4, 8e-6), (0.1, 1e-5)
 """A guided proposal, of Bayesian optimisation as published and of Optuna's Gaussian process on one thread, takes a
 constant, and so much times the trials squared."""
+
+SEARCHED_AFRESH = 5
+"""Limits of the area under which a search for less paint begins afresh."""
 
 FURTHER = 0.25
 """Of what grows with the trials, Optuna's further proposals of a batch take a part: they go on from what was fitted."""
@@ -167,11 +170,13 @@ def of_cheapest(figures: int, objective: Objective, controller: Controller) -> W
         objective: objective of the search before.
         controller: controller that is timed.
     """
+    frame_s = frame_seconds(for_climbing(controller, _device_of(controller)))
     climbed = sum(rung.starts * rung.iterations * _pictures(rung, objective, STRETCH_STEPS) for rung in RUNGS)
     # Below each limit the pattern, and what it is without each of its figures, is only valued.
     valued = len(UNSURE) * STRETCH_STEPS * (1 + figures) / 3
-    count = MOST_LEVELS * (climbed * _looks(objective) + valued)
-    return Workload(seconds=count * frame_seconds(for_climbing(controller, _device_of(controller))), basis=_MEASURED)
+    seconds = MOST_LEVELS * (climbed * _looks(objective) + valued) * frame_s
+    afresh = of_search(AFRESH, objective, STRETCH_STEPS, controller).times(SEARCHED_AFRESH)
+    return Workload(seconds=seconds, basis=_MEASURED) + replace(afresh, megabytes=0.0)
 
 
 def _device_of(controller: Controller) -> torch.device:
