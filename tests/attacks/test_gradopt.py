@@ -33,7 +33,7 @@ from roadproof.datatypes import Control
 from roadproof.errors import ControllerError, OutputError, PatternError, RecordingError, RoadproofError
 from roadproof.paint.site import LaneMark
 from roadproof.patterns import Pattern, boxes_from_published
-from roadproof.photometry import AffineResponse, ColourTransform
+from roadproof.photometry import AffineResponse, ColourTransform, PixelMaps
 from roadproof.search_space import SearchSpace
 from scenes import LinearController, recording_set
 
@@ -367,6 +367,18 @@ def test_the_published_measure_sums_frames_as_the_paper_does():
     # Six frames: three of the clean drive and three of the one to the right.
     torch.testing.assert_close(published.values(space, unit), 6 * exact.values(space, unit), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(published.readings(space, unit)[0], exact.values(space, unit), rtol=1e-4, atol=1e-4)
+
+
+def test_the_published_search_does_without_pixel_maps_or_says_so():
+    bare, controller = recording_set(frames=2), pull_to_the_right()
+    shape = (2, *bare.recordings[0].frames.shape[1:3])
+    maps = PixelMaps(torch.ones(*shape, 3), torch.zeros(*shape, 3), torch.ones(shape))
+    with_maps = (dataclasses.replace(each, maps=maps) for each in bare.recordings)
+    mapped = dataclasses.replace(bare, recordings=tuple(with_maps))
+    with pytest.raises(RoadproofError, match="have it in pixel maps; calibrate with --method published"):
+        Published().measure(SteeringShift(), mapped, controller, (RIGHT_GROUP,), device="cpu")
+    Published().measure(SteeringShift(), bare, controller, (RIGHT_GROUP,), device="cpu")
+    Published(masks="antialiased").measure(SteeringShift(), mapped, controller, (RIGHT_GROUP,), device="cpu")
 
 
 @pytest.mark.parametrize("masks", ["binary", "antialiased"])

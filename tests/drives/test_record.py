@@ -10,7 +10,7 @@ import needs
 from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window, record, record_along
-from roadproof.drives.folder import read_settings, write_settings
+from roadproof.drives.folder import read_settings, require_same_map, write_settings
 from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.homographies import apply_homography
@@ -74,9 +74,12 @@ def test_a_recording_knows_a_map_by_what_is_in_it_wherever_it_lies(drives, tmp_p
     moved = own.rename(tmp_path / "record" / "own.xodr")
     settings = dataclasses.replace(settings, scenario=dataclasses.replace(LEFT, map_name=str(moved)))
     assert not write_settings(settings, tmp_path / "record")
+    require_same_map(settings, tmp_path / "record")
     moved.write_text("<OpenDRIVE />")
     with pytest.raises(RecordingError, match=r"holds a recording with scenario\.map "):
         write_settings(settings, tmp_path / "record")
+    with pytest.raises(RecordingError, match=r"own\.xodr has changed since the drives in .*record were recorded on it"):
+        require_same_map(settings, tmp_path / "record")
 
 
 def test_the_kept_frames_show_the_canvas(drives):

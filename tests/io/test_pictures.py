@@ -55,6 +55,16 @@ def test_bad_pictures_are_refused(tmp_path: Path, content: bytes, reason: str) -
     assert str(refused.value).endswith("copy it again")
 
 
+def test_the_size_is_looked_at_before_a_picture_is_unpacked(tmp_path: Path) -> None:
+    """Its data is cut off, so unpacking it would say so."""
+    path = tmp_path / "a.png"
+    path.write_bytes(png_claiming(10, 12))
+    with pytest.raises(RoadproofError, match="it has 10×12 pixels, expected 12×10"):
+        read_picture(path, RoadproofError, "again", size=(12, 10))
+    with pytest.raises(RoadproofError, match="cannot be read"):
+        read_picture(path, RoadproofError, "again", size=(10, 12))
+
+
 def test_a_missing_picture_is_said(tmp_path: Path) -> None:
     """With its path."""
     with pytest.raises(RoadproofError, match="is missing"):
