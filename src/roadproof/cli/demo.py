@@ -97,10 +97,11 @@ def _report(result: StressTest, out: Path) -> None:
     if result.rounds is not None and result.rounds.stopped:
         say(f"Searching on ended early: {result.rounds.stopped}")
     if (prediction := result.prediction) is not None:
+        apart_m = prediction.path_error_m
         say(
             f"Predicted in the recordings {prediction.predicted_m:.2f} m of deviation ({prediction.least_m:.2f} to "
-            f"{prediction.most_m:.2f} over small errors), driven {prediction.driven_m:.2f} m; "
-            f"{prediction.path_error_m:.2f} m between the paths on average"
+            f"{prediction.most_m:.2f} over small errors), driven {prediction.driven_m:.2f} m"
+            + ("" if apart_m is None else f"; {apart_m:.2f} m between the paths on average")
         )
     spent = [(stage, cost) for stage, cost in result.cost.items() if cost != StageCost()]
     drives = [f" ({cost.simulator_calls} drives)" if cost.simulator_calls else "" for _, cost in spent]

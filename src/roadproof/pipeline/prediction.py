@@ -35,7 +35,8 @@ class Prediction(Saved):
         most_mps: highest predicted change over those errors, m/s.
         driven_mps: mean change of the speed of the drive in the simulator, m/s.
         made_of: digest of the pattern, drives, recordings and controller; empty where nobody said.
-        path_error_m: mean distance between predicted and driven positions at the same instants, metres.
+        path_error_m: mean distance between predicted and driven positions at the same instants, metres; None where the
+            drive had ended before the canvas came into view.
         gap_m: largest distance of the predicted path across the heading from the recorded poses shown, metres.
         gap_rad: largest difference of heading from the recorded poses shown, radians.
         clean_xy: world x, y of the clean drive while the canvas is in view, metres, (t, 2).
@@ -47,7 +48,7 @@ class Prediction(Saved):
     least_m: float
     most_m: float
     driven_m: float
-    path_error_m: float
+    path_error_m: float | None
     gap_m: float
     gap_rad: float
     clean_xy: Float[np.ndarray, "t 2"]
@@ -112,7 +113,7 @@ def predict(
         least_m=float(deviations.min()),
         most_m=float(deviations.max()),
         driven_m=passage_deviation_m(clean, painted, canvas),
-        path_error_m=float(np.hypot(*(predicted[:both] - driven[:both]).T).mean()) if both else 0.0,
+        path_error_m=float(np.hypot(*(predicted[:both] - driven[:both]).T).mean()) if both else None,
         gap_m=float(rolled.left_m[usual].abs().max()),
         gap_rad=float(rolled.turned_rad[usual].abs().max()),
         clean_xy=path_of(clean)[seen],
