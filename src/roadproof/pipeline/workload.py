@@ -43,7 +43,7 @@ PUBLISHED_S, PROCESS_S = (0.4, 8e-6), (0.1, 1e-5)
 """A guided proposal, of Bayesian optimisation as published and of Optuna's Gaussian process on one thread, takes a
 constant, and so much times the trials squared."""
 
-SEARCHED_AFRESH = 5
+SEARCHED_AFRESH = 6
 """Limits of the area under which a search for less paint begins afresh."""
 
 FURTHER = 0.25
