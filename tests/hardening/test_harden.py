@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 import needs
 from carla_serving import straight_map
@@ -202,6 +203,7 @@ def test_a_stopped_hardening_goes_on_to_the_same_controller_verdict_and_page(tow
     learnt, before = load_controller(found.hardened), load_controller("pilotnet")
     assert isinstance(learnt, ConditionalPilotNet)
     assert not torch.equal(learnt.image.weight, before.image.weight)
+    assert {each.dtype for each in load_file(found.hardened).values() if each.is_floating_point()} == {torch.float16}
     again = run(town, whole, judge_on=())
     assert again.judgement is None
     assert torch.equal(load_controller(again.hardened).image.weight, learnt.image.weight)

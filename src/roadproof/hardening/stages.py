@@ -260,6 +260,6 @@ def _save(network: nn.Module, plan: HardeningPlan, number: int) -> None:
     path = plan.weights(number)
     origin = f"{plan.spec}, hardened for {number} rounds on {', '.join(each.name for each in plan.scenarios)}"
     if isinstance(network, CIL | ConditionalPilotNet | NetworkController) and not runs_code(plan.spec):
-        save_controller(network, path, origin=origin)
+        save_controller(network, path, dtype="float16", origin=origin)
         return
     write_tensors(path, tensors_of(network), {"roadproof-origin": origin})
