@@ -102,6 +102,26 @@ def test_the_least_paint_stands_beside_the_strongest(workplace, tmp_path, invoke
     assert not list((tmp_path / "cheapest").iterdir())
 
 
+def test_what_limits_cost_is_told_of_a_search_alone(workplace, tmp_path, invoke, monkeypatch):
+    monkeypatch.chdir(workplace)
+    quick = ["--method", "random", "--calls", "2", "--random-patterns", "0", "--figures", "1", "--max-area", "2"]
+    asked = ["attack", "run/recordings", "--controller", "paint_shy:paint_shy", *quick, "--contrast", "0", "0.3"]
+    code, printed = invoke(*asked, "--limit-costs", "--out", tmp_path / "attack", "--json")
+    assert code == 0, printed.err
+    told = answered(printed.out)["limits"]
+    assert told == stored(tmp_path / "attack" / "limits" / "limits.json")
+    assert [each["without"] for each in told["searches"]] == ["", "area", "contrast", "any"]
+    assert {each["driven_m"] for each in told["searches"]} == {None}
+    first, area = told["searches"][:2]
+    more_m = area["predicted_m"] - first["predicted_m"]
+    assert f"Without the limit on area: predicted {area['predicted_m']:.2f} m, {more_m:+.2f} m\n" in printed.err
+    code, printed = invoke("report", tmp_path)
+    assert code == 0, printed.err
+    page = (tmp_path / "report.html").read_text()
+    assert "What each limit on paint costs" in page
+    assert "Cost,<br>driven m" not in page, "nobody has driven"
+
+
 def test_what_a_search_predicted_is_said_in_metres(tmp_path, invoke):
     write_recorded(tmp_path)
     write_attack(tmp_path / "attack")
@@ -158,6 +178,14 @@ MISTAKES = {
     "cheapest in m/s": (
         [*ATTACK, "pilotnet", *SPEED, "--cheapest", "0.5"],
         "in metres of deviation, --objective",
+    ),
+    "limit costs without limits": (
+        [*ATTACK, "pilotnet", "--limit-costs"],
+        "no limit on paint; give one",
+    ),
+    "limit costs in m/s": (
+        [*ATTACK, "pilotnet", *SPEED, "--limit-costs", "--max-area", "4"],
+        "in metres of deviation",
     ),
     "runs": ([*EVALUATE, "--runs", "2"], "--runs is 2, but recordings hold no others"),
     "renders": ([*EVALUATE, "--recordings", "run/recordings"], "nothing is rendered in recordings"),

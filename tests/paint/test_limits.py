@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +15,7 @@ from roadproof.coverage import Shape
 from roadproof.errors import PatternError
 from roadproof.geometry import CANVAS_SIZE_PX
 from roadproof.paint import LaneMark, PaintLimits, Site, conspicuousness
+from roadproof.paint import limits as paint_limits
 from roadproof.paint.colours import PRINT, _hull
 from roadproof.paint.site import rgb_of
 from roadproof.search_space import SearchSpace
@@ -243,3 +245,17 @@ def test_conspicuousness_of_a_strip_is_as_measured_by_hand():
     over = Pattern((Shape.RECTANGLE,), torch.tensor([[199.5, 199.5, 10.0, 200.0, 20.0]]), fake.colours)
     assert conspicuousness(over, site).mark_distance_m == 0.0
     assert conspicuousness(strip, Site()).sentence == "1 figure"
+
+
+def test_limits_without_each_of_them():
+    known = {"asphalt": "#5a5a5b", "marks": (MIDDLE,)}
+    several = PaintLimits(max_area_m2=4.0, contrast=(0.0, 0.25), keep_out_m=0.3, **known)
+    assert several.relaxed == {
+        "area": PaintLimits(contrast=(0.0, 0.25), keep_out_m=0.3, **known),
+        "contrast": PaintLimits(max_area_m2=4.0, keep_out_m=0.3, **known),
+        "distance from marks": PaintLimits(max_area_m2=4.0, contrast=(0.0, 0.25), **known),
+        "any": PaintLimits(**known),
+    }
+    assert PaintLimits(printable=True).relaxed == {"print": PaintLimits()}
+    assert PaintLimits(**known).relaxed == {}
+    assert set(paint_limits.LIMITS) | set(known) == {each.name for each in fields(PaintLimits)}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from roadproof.datatypes import Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window
 from roadproof.driving.evaluation import Evaluation
 from roadproof.errors import RoadproofError
+from roadproof.paint import PaintLimits
 from roadproof.pipeline.budget import BUDGETS, Budget
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.film import Strip
 from roadproof.pipeline.selection import Selection
-from roadproof.pipeline.stress_test import STAGES, stress_test
+from roadproof.pipeline.stress_test import STAGES, StressTest, stress_test
 from roadproof.recordings import load_recordings
+from roadproof.report.page import write_report
 from roadproof.search_space import SearchSpace
 
 TINY = Budget(
@@ -91,6 +94,54 @@ def check_folder(folder, result):
     assert {each.group for each in result.selection.driven} == {"clean+right", "clean+left"}
     deviations = [each.trial.deviation_m for each in result.selection.driven]
     assert deviations[result.selection.chosen] == max(deviations)
+
+
+@pytest.mark.slow
+def test_limits_on_paint_are_told_by_what_each_costs(town, few_pictures, tmp_path):
+    once = GradOpt(iterations=1, restarts=1, halving=False)
+    budget = dataclasses.replace(TINY, objective=PathDeviation(every=8), method=once, select=1)
+    space = SearchSpace(figures=1, limits=PaintLimits(max_area_m2=2.0, printable=True))
+    asked = {"budget": budget, "space": space, "film": False, "limit_costs": True}
+    folder = tmp_path / "run"
+    result = run(town, folder, **asked)
+    costs = result.limit_costs
+    assert [each.without for each in costs.searches] == ["", "area", "print", "any"]
+    given, without_area = costs.searches[:2]
+    assert given.predicted_m == result.attack.predicted_m
+    assert given.conspicuousness.area_m2 <= 2.0 < without_area.conspicuousness.area_m2
+    assert given.driven_m == pytest.approx(result.selection.deviation_m)
+    assert costs.driven_cost_m(without_area) == without_area.driven_m - given.driven_m
+    assert costs.sentences[0] == (
+        f"Without the limit on area: predicted {without_area.predicted_m:.2f} m, "
+        f"{without_area.predicted_m - given.predicted_m:+.2f} m; driven {without_area.driven_m:.2f} m, "
+        f"{without_area.driven_m - given.driven_m:+.2f} m"
+    )
+    assert costs.sentences[2].startswith("Without any limit on paint: ")
+    assert result.cost["limits"].simulator_calls == 4
+    searched = {path: path.stat().st_mtime_ns for path in (folder / "limits").rglob("*.npz")}
+    assert run(town, folder, **asked).limit_costs == costs == StressTest.load(folder).limit_costs
+    assert {path: path.stat().st_mtime_ns for path in searched} == searched, "something was done twice"
+    page = write_report(folder).read_text()
+    assert "What each limit on paint costs" in page
+    assert f"{costs.predicted_cost_m(without_area):+.2f}</td>" in page
+    told = json.loads((folder / "result.json").read_text())["limits"]["searches"]
+    assert [each["driven_m"] for each in told] == [each.driven_m for each in costs.searches]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"budget": dataclasses.replace(TINY, objective=PathDeviation())}, "there is no limit on paint; give one"),
+        (
+            {"space": SearchSpace(figures=1, limits=PaintLimits(printable=True))},
+            "in metres of deviation, the search is for the st",
+        ),
+    ],
+)
+def test_limit_costs_without_limits_or_metres_are_refused_before_anything_is_driven(town, tmp_path, given, message):
+    with pytest.raises(RoadproofError, match=message):
+        run(town, tmp_path / "run", limit_costs=True, **given)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("processes", [0, 2])

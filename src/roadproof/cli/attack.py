@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,6 +71,7 @@ def attack(
         int, number("Random patterns a group that the self-check compares with; 0 for none.", 0, 100_000)
     ] = 100,
     cheapest: options.CheapestFor = None,
+    limit_costs: options.LimitCosts = False,
     seed: options.Seed = 0,
     device: options.Device = "cpu",
     dtype: Annotated[
@@ -94,7 +96,8 @@ def attack(
     from roadproof.controllers import load_controller
     from roadproof.controllers.precision import multiply_in
     from roadproof.coverage import Shape
-    from roadproof.pipeline.workload import of_cheapest, of_search
+    from roadproof.pipeline.limit_costs import relaxed_limits
+    from roadproof.pipeline.workload import Workload, of_cheapest, of_search
     from roadproof.recordings import load_recordings
     from roadproof.report.plots import draw_attack
     from roadproof.search_space import FAMILIES, SearchSpace
@@ -117,13 +120,15 @@ def attack(
     space = space.on(site_of(drives))
     if cheapest is not None:
         _check_cheapest(drives, goal)
+    searches = 1 + (len(relaxed_limits(space, goal)) if limit_costs else 0)
     attacked = load_controller(controller, device=device, dtype=dtype)
     multiply_in(dtype)
     _check_attacked(attacked, drives, searched, goal, device=device, dtype=dtype)
     chosen = searched.groups(drives, goal) if groups is None else parse_groups(groups, drives)
     frames = sum(len(each.frames) for each in drives.recordings)
     work = of_search(searched, goal, frames, attacked, groups=len(chosen))
-    begin(work if cheapest is None else work + of_cheapest(space.figures, goal, attacked), out)
+    less = Workload() if cheapest is None else of_cheapest(space.figures, goal, attacked)
+    begin(work.times(searches) + less, out)
     with progress("Searching", searched.steps(goal)) as on_step:
         result = kept_attack(
             out,
@@ -145,6 +150,8 @@ def attack(
     found = stored(out / "result.json")
     if cheapest is not None:
         found["cheapest"] = _less_paint(drives, attacked, result, cheapest, chosen, goal, device, out / "cheapest")
+    if limit_costs:
+        found["limits"] = _limit_costs(drives, attacked, result, chosen, goal, device, out / "limits")
     answer(found)
 
 
@@ -210,6 +217,37 @@ def _less_paint(
         return None
     less.save(folder)
     return stored(folder / "cheapest.json")
+
+
+def _limit_costs(
+    drives: RecordingSet,
+    attacked: Controller,
+    found: AttackResult,
+    groups: Sequence[Group],
+    objective: Objective,
+    device: str,
+    folder: Path,
+) -> dict[str, Any]:
+    """What each limit on paint costs, which the folder keeps, as its file has it."""
+    from roadproof.cli.progress import stages
+    from roadproof.pipeline.limit_costs import LimitCosts, Unlimited, search_without
+
+    with stages() as show:
+        searched = search_without(
+            folder,
+            drives,
+            attacked,
+            found,
+            objective=objective,
+            groups=groups,
+            device=device,
+            on_step=partial(show, "Searching without limits"),
+        )
+    told = (Unlimited.of("", found), *(Unlimited.of(name, each) for name, each in searched.items()))
+    costs = LimitCosts(searches=told)
+    costs.save(folder)
+    say(*costs.sentences)
+    return stored(folder / "limits.json")
 
 
 def _summarise(result: AttackResult, out: Path) -> None:

@@ -34,6 +34,7 @@ def demo(
     ] = "clear-noon",
     figures: options.Figures = 5,
     cheapest: options.CheapestFor = None,
+    limit_costs: options.LimitCosts = False,
     seed: options.Seed = 0,
     simulator: options.SimulatorSpec = "town",
     device: options.Device = "cpu",
@@ -48,8 +49,9 @@ def demo(
     from roadproof.cli.progress import stages
     from roadproof.controllers import load_controller
     from roadproof.pipeline.budget import BUDGETS
+    from roadproof.pipeline.limit_costs import relaxed_limits
     from roadproof.pipeline.stress_test import stress_test
-    from roadproof.pipeline.workload import of_cheapest, of_drives, of_run
+    from roadproof.pipeline.workload import of_cheapest, of_drives, of_finding, of_run
     from roadproof.search_space import SearchSpace
     from roadproof.simulators.loading import open_simulator
 
@@ -61,8 +63,12 @@ def demo(
     space = SearchSpace(figures=figures, limits=paint.limits)
     who = load_controller(controller, device=device)
     work = of_run(spent, who, processes=processes)
-    less = None if cheapest is None else of_cheapest(figures, spent.objective, who) + of_drives(1)
-    begin(work if less is None else work + less, out)
+    if cheapest is not None:
+        work += of_cheapest(figures, spent.objective, who) + of_drives(1)
+    if limit_costs:
+        searched = of_finding(replace(spent, rounds=0, select=1), who)
+        work += searched.times(len(relaxed_limits(space, spent.objective))) + of_drives(1)
+    begin(work, out)
     with open_simulator(simulator) as world, stages() as show:
         result = stress_test(
             world,
@@ -77,6 +83,7 @@ def demo(
             factory=partial(open_simulator, simulator),
             processes=processes,
             cheapest_m=cheapest,
+            limit_costs=limit_costs,
             on_progress=show,
         )
     keep_command(out)
@@ -85,6 +92,8 @@ def demo(
         less = result.cheapest
         driven = "" if less is None else f"; driven {less[1].deviation_m:.2f} m"
         say(cheapest_in_words(less and less[0], cheapest) + driven)
+    if result.limit_costs is not None:
+        say(*result.limit_costs.sentences)
     answer(stored(out / "result.json"))
 
 

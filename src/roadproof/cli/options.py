@@ -162,6 +162,10 @@ CheapestFor: TypeAlias = Annotated[
     float | None,
     number("Also find the fewest square metres of paint for so many metres of deviation.", 0.05, 100.0, default=False),
 ]
+LimitCosts: TypeAlias = Annotated[
+    bool,
+    typer.Option("--limit-costs", help="Also search without each limit on paint, to tell the metres that it costs."),
+]
 Figures: TypeAlias = Annotated[int, number("K, how many figures are painted.", 1, MAX_FIGURES)]
 Cars: TypeAlias = Annotated[int, number("Other cars on the road.", 0, MAX_CROWD)]
 Pedestrians: TypeAlias = Annotated[int, number("People about.", 0, MAX_CROWD)]

@@ -6,6 +6,7 @@ becomes a pattern that obeys, so no step of any search ever leaves them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
@@ -22,6 +23,17 @@ from roadproof.patterns import Pattern
 
 MOST_M = 10.0
 """The largest keep-out, metres."""
+
+LIMITS = {
+    "max_area_m2": "area",
+    "colours": "colours",
+    "printable": "print",
+    "contrast": "contrast",
+    "keep_out_m": "distance from marks",
+}
+"""The fields that limit something, and what they limit in words."""
+
+ANY = "any"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -68,6 +80,14 @@ class PaintLimits:
                 raise PatternError(f"contrast is {self.contrast}, expected 0 ≤ least < most ≤ 1, at least 0.01 apart")
         for colour in (*self.colours, *([self.asphalt] if self.asphalt else [])):
             rgb_of(colour)
+
+    @property
+    def relaxed(self) -> Mapping[str, PaintLimits]:
+        """These limits without one of them, by its name in `LIMITS`, and where there are several without `ANY`."""
+        usual = {each.name: each.default for each in fields(self)}
+        own = {name: usual[name] for name in LIMITS if getattr(self, name) != usual[name]}
+        without = {LIMITS[name]: replace(self, **{name: value}) for name, value in own.items()}
+        return without | ({ANY: replace(self, **own)} if len(own) > 1 else {})
 
     def site(self, known: Site) -> Site:
         """The known site, with what these limits themselves say of asphalt and marks in its place."""

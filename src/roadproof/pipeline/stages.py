@@ -26,6 +26,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
 from roadproof.pipeline.film import film_drives
+from roadproof.pipeline.limit_costs import LimitCosts, Unlimited, search_without
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
@@ -38,6 +39,9 @@ from roadproof.simulators.protocol import Simulator, world_of
 
 CHEAPEST = "cheapest"
 """The folder of a run with the least paint for a deviation."""
+
+LIMIT_COSTS = "limits"
+"""The folder of a run with what limits on paint cost."""
 
 _NONE = "roadproof-cheapest-none", 1
 
@@ -220,6 +224,37 @@ class Stages:
             on_drive=lambda _done, _best: self.on_progress("Looking for less paint", total, total, ""),
         )
         return less, driven
+
+    def limit_costs(self, recordings: RecordingSet, found: AttackResult, drives: Drives) -> tuple[LimitCosts, int]:
+        """What each limit on paint costs, predicted and driven once each; and the number of drives made for it."""
+        folder, title = self.folder / LIMIT_COSTS, "Searching without limits"
+        searched = search_without(
+            folder,
+            recordings,
+            self.controller,
+            found,
+            objective=self.budget.objective,
+            groups=self.groups(recordings),
+            device=self.device,
+            pool=self.pool,
+            on_step=lambda done, total, word: self.on_progress(title, done, total, word),
+        )
+        patterns = [found.candidates[0], *(each.candidates[0] for each in searched.values())]
+        driven = select_by_driving(
+            self.simulator,
+            self.controller,
+            self.scenario,
+            patterns,
+            best=len(patterns),
+            weather=self.budget.recorded_in[0],
+            folder=folder / "selection",
+            clean=drives.drives[0].episode,
+            pool=self.pool,
+        )
+        told = (Unlimited.of("", found), *(Unlimited.of(name, each) for name, each in searched.items()))
+        costs = LimitCosts(searches=told).driven(driven)
+        costs.save(folder)
+        return costs, driven.simulator_calls
 
     def predict(
         self, recordings: RecordingSet, pattern: Pattern, selection: Selection | None, rounds: Rounds | None

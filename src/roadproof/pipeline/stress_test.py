@@ -8,6 +8,7 @@
     RUN/prediction.npz the chosen pattern's predicted path beside the driven one (`pipeline.prediction`)
     RUN/round-1/       searching on where the attacked car went (`pipeline.rerecording`), where rounds are asked for
     RUN/cheapest/      the least paint for a deviation and the drive over it, where one is asked for
+    RUN/limits/        what each limit on paint costs, where that is asked for (`pipeline.limit_costs`)
     RUN/pattern.json   the pattern that was chosen in the end
     RUN/evaluation/    how bad that is, by weather, alone and in traffic (`driving.evaluate`), with the film of two
                        drives (`pipeline.film`) and composites beside renders (`pipeline.fidelity`)
@@ -37,18 +38,19 @@ from roadproof.limits import check_seed
 from roadproof.patterns import Pattern, save_pattern
 from roadproof.pipeline.budget import QUICK, Budget
 from roadproof.pipeline.fidelity import FIDELITY, Fidelity
+from roadproof.pipeline.limit_costs import LimitCosts, relaxed_limits
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.rerecording import Rounds
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import Ledger, StageCost, read_cost
-from roadproof.pipeline.stages import CHEAPEST, OnProgress, Stages, check_paint
+from roadproof.pipeline.stages import CHEAPEST, LIMIT_COSTS, OnProgress, Stages, check_paint
 from roadproof.processes import here_or_beside, require_opened, require_picklable
 from roadproof.recordings import pooled
 from roadproof.scenarios import Scenario
 from roadproof.search_space import SearchSpace
 from roadproof.simulators.protocol import Simulator, SimulatorFactory
 
-STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "predict", "evaluate", "film")
+STAGES = ("record", "calibrate", "attack", "select", "rounds", "cheapest", "limits", "predict", "evaluate", "film")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)
@@ -67,6 +69,7 @@ class StressTest:
         cost: cost of each stage since the run began, by its name.
         cheapest: the least paint for the deviation that was asked for, and the drive over it; None where none was
             asked for, or nothing found reaches it.
+        limit_costs: what each limit on paint costs; None where nobody asked.
     """
 
     attack: AttackResult
@@ -77,6 +80,7 @@ class StressTest:
     fidelity: Fidelity | None
     cost: dict[str, StageCost]
     cheapest: tuple[Cheapest, Selection] | None = None
+    limit_costs: LimitCosts | None = None
 
     @property
     def pattern(self) -> Pattern:
@@ -103,6 +107,7 @@ class StressTest:
         place, less = folder / "selection", folder / CHEAPEST
         selection = Selection.load(place) if place.is_dir() else None
         prediction, fidelity = folder / "prediction.npz", folder / "evaluation" / FIDELITY
+        limits = folder / LIMIT_COSTS
         return StressTest(
             attack=AttackResult.load(folder / "attack"),
             selection=selection,
@@ -114,6 +119,7 @@ class StressTest:
             cheapest=(Cheapest.load(less), Selection.load(less / "selection"))
             if (less / "cheapest.json").exists()
             else None,
+            limit_costs=LimitCosts.load(limits) if (limits / "limits.json").exists() else None,
         )
 
 
@@ -132,6 +138,7 @@ def stress_test(
     processes: int = 1,
     film: bool = True,
     cheapest_m: float | None = None,
+    limit_costs: bool = False,
     on_progress: OnProgress = lambda _stage, _done, _total, _word: None,
 ) -> StressTest:
     """Find the paint that makes a controller leave its lane in one scenario, and say how bad it is.
@@ -152,6 +159,8 @@ def stress_test(
             which takes three drives more.
         cheapest_m: the deviation, in metres, for which the least paint is looked for and driven over once; None for
             no such search.
+        limit_costs: whether to search without each limit on paint besides, and without any, and to drive once over what
+            each search found.
         on_progress: called after every step of every stage with the stage, steps done, all steps, and a word.
 
     Raises:
@@ -180,6 +189,8 @@ def stress_test(
         check_wanted(cheapest_m)
         if not isinstance(budget.objective, PathDeviation):
             raise RoadproofError("the cheapest pattern is looked for in the recorded world; search a path deviation")
+    if limit_costs:
+        relaxed_limits(stages.space, budget.objective)
     view = simulator.input
     if processes > 1:
         require_picklable(controller)
@@ -187,7 +198,7 @@ def stress_test(
     if isinstance(budget.objective, SpeedChange):
         require_pedals(controller)
     with working_in(folder), stages.pool:
-        return _all_of(stages, film=film, cheapest_m=cheapest_m)
+        return _all_of(stages, film=film, cheapest_m=cheapest_m, limit_costs=limit_costs)
 
 
 def _reset(scenario: Scenario, simulator: Simulator, _: None) -> None:
@@ -195,7 +206,7 @@ def _reset(scenario: Scenario, simulator: Simulator, _: None) -> None:
     simulator.reset(scenario)
 
 
-def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
+def _all_of(run: Stages, *, film: bool, cheapest_m: float | None, limit_costs: bool) -> StressTest:
     """Run all stages, one after another."""
     budget, on_progress = run.budget, run.on_progress
     ledger = Ledger(run.folder, run.made_of, STAGES)
@@ -233,6 +244,11 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
         with ledger.stage("cheapest"):
             less = run.cheapest(recordings, found, cheapest_m, drives[0])
             ledger.calls("cheapest", 0 if less is None else less[1].simulator_calls)
+    costs = None
+    if limit_costs:
+        with ledger.stage("limits"):
+            costs, calls = run.limit_costs(recordings, found, drives[0])
+            ledger.calls("limits", calls)
     with ledger.stage("predict"):
         prediction = run.predict(recordings, pattern, selection, rounds)
     with ledger.stage("evaluate"):
@@ -252,6 +268,7 @@ def _all_of(run: Stages, *, film: bool, cheapest_m: float | None) -> StressTest:
         fidelity=fidelity,
         cost=ledger.cost,
         cheapest=less,
+        limit_costs=costs,
     )
 
 

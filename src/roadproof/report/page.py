@@ -128,6 +128,8 @@ def result_of(run: Run) -> Fields:
             "driven_m": run.cheapest_driven and run.cheapest_driven.deviation_m,
             "levels": [asdict(level) for level in run.cheapest.levels],
         }
+    if run.limit_costs is not None:
+        content["limits"] = asdict(run.limit_costs)
     content["conspicuousness"] = {name: asdict(told) for name, told in _conspicuous(run)}
     calibration = None if run.calibration is None else asdict(run.calibration)
     return content | {"surrogate": surrogate or None, "calibration": calibration, "cost": run.costs}

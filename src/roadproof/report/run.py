@@ -28,10 +28,11 @@ from roadproof.io.files import bytes_of, check_closed
 from roadproof.patterns import Pattern, load_pattern
 from roadproof.pipeline.fidelity import FIDELITY, Fidelity
 from roadproof.pipeline.film import FILM, POSTER, STRIP, Strip
+from roadproof.pipeline.limit_costs import LimitCosts
 from roadproof.pipeline.prediction import Prediction
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stage_costs import StageCost, read_cost
-from roadproof.pipeline.stages import CHEAPEST
+from roadproof.pipeline.stages import CHEAPEST, LIMIT_COSTS
 from roadproof.recordings import RecordingSet, load_recordings
 from roadproof.simulators.protocol import PatternImage
 
@@ -91,6 +92,7 @@ class Run:
         commands: the commands that made the run, as they were given; none where it was made in Python.
         cheapest: the least paint for a deviation, where it was looked for.
         cheapest_driven: the drive over the least paint, where it was driven over.
+        limit_costs: what each limit on paint costs, where that was asked for.
     """
 
     folder: Path
@@ -106,6 +108,7 @@ class Run:
     commands: tuple[str, ...]
     cheapest: Cheapest | None
     cheapest_driven: Selection | None
+    limit_costs: LimitCosts | None
 
     @property
     def name(self) -> str:
@@ -172,6 +175,7 @@ def read_run(folder: Path) -> Run:
         cheapest_driven=Selection.load(path)
         if ((path := folder / CHEAPEST / "selection") / "selection.json").exists()
         else None,
+        limit_costs=_limit_costs(folder),
     )
     if run.drives is None and run.recordings is None and run.attack is None and run.judged is None:
         raise RoadproofError(
@@ -190,6 +194,11 @@ def _cheapest(folder: Path) -> Cheapest | None:
     # A search alone leaves it beside its own result.
     places = (folder / CHEAPEST, folder / "attack" / CHEAPEST)
     return next((Cheapest.load(place) for place in places if (place / "cheapest.json").exists()), None)
+
+
+def _limit_costs(folder: Path) -> LimitCosts | None:
+    places = (folder / LIMIT_COSTS, folder / "attack" / LIMIT_COSTS)
+    return next((LimitCosts.load(place) for place in places if (place / "limits.json").exists()), None)
 
 
 def _commands(folder: Path) -> tuple[str, ...]:
