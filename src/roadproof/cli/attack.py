@@ -230,7 +230,7 @@ def _limit_costs(
 ) -> dict[str, Any]:
     """What each limit on paint costs, which the folder keeps, as its file has it."""
     from roadproof.cli.progress import stages
-    from roadproof.pipeline.limit_costs import LimitCosts, Unlimited, search_without
+    from roadproof.pipeline.limit_costs import LimitCosts, search_without
 
     with stages() as show:
         searched = search_without(
@@ -243,8 +243,7 @@ def _limit_costs(
             device=device,
             on_step=partial(show, "Searching without limits"),
         )
-    told = (Unlimited.of("", found), *(Unlimited.of(name, each) for name, each in searched.items()))
-    costs = LimitCosts(searches=told)
+    costs = LimitCosts.of(found, searched)
     costs.save(folder)
     say(*costs.sentences)
     return stored(folder / "limits.json")

@@ -73,6 +73,11 @@ class LimitCosts:
 
     searches: tuple[Unlimited, ...]
 
+    @staticmethod
+    def of(found: AttackResult, searched: Mapping[str, AttackResult]) -> LimitCosts:
+        """What a search with all limits found, and others by the limit left out; nobody has driven over it yet."""
+        return LimitCosts(searches=tuple(Unlimited.of(name, each) for name, each in {"": found, **searched}.items()))
+
     def predicted_cost_m(self, one: Unlimited) -> float:
         """The predicted metres that a search found more than the one with all limits."""
         return one.predicted_m - self.searches[0].predicted_m

@@ -26,7 +26,7 @@ from roadproof.patterns import Pattern, raster
 from roadproof.pipeline.budget import Budget
 from roadproof.pipeline.fidelity import Fidelity, measure_fidelity
 from roadproof.pipeline.film import film_drives
-from roadproof.pipeline.limit_costs import LimitCosts, Unlimited, search_without
+from roadproof.pipeline.limit_costs import LimitCosts, search_without
 from roadproof.pipeline.prediction import Prediction, predict
 from roadproof.pipeline.rerecording import Rounds, search_on
 from roadproof.pipeline.selection import UNITS, Selection, chosen_by, select_by_driving
@@ -251,8 +251,7 @@ class Stages:
             clean=drives.drives[0].episode,
             pool=self.pool,
         )
-        told = (Unlimited.of("", found), *(Unlimited.of(name, each) for name, each in searched.items()))
-        costs = LimitCosts(searches=told).driven(driven)
+        costs = LimitCosts.of(found, searched).driven(driven)
         costs.save(folder)
         return costs, driven.simulator_calls
 
