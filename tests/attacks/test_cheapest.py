@@ -103,7 +103,7 @@ def test_where_going_on_leads_nowhere_it_searches_afresh_and_goes_on_when_interr
     asked = {"groups": [RIGHT_GROUP], "objective": GOAL, "checkpoints": tmp_path / "search"}
 
     def interrupt(number, _area_m2):
-        if number == 2:
+        if number == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -116,8 +116,7 @@ def test_where_going_on_leads_nowhere_it_searches_afresh_and_goes_on_when_interr
     assert sorted(kept) == ["1-afresh.safetensors", "1.safetensors"]
     seen = []
     less = cheapest(road, PullsToBrightPaint(), found, wanted_m, **asked, on_level=lambda *_: seen.append(written()))
-    assert kept.items() <= seen[1].items(), "a search was done twice"
-    assert not (tmp_path / "search").exists()
+    assert kept.items() <= seen[-1].items(), "a search was done twice"
     dead, afresh = ways[:2]
     assert dead.predicted_m < wanted_m <= afresh.predicted_m
     at = less.levels.index(afresh)

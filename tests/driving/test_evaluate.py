@@ -23,7 +23,7 @@ from roadproof.driving.evaluation import Evaluation, load_paint
 from roadproof.driving.infractions import infraction_points
 from roadproof.driving.rollout import rollout
 from roadproof.driving.starts import StartPlan, StartRange
-from roadproof.errors import ControllerError, EpisodeError, PatternError, SimulatorError
+from roadproof.errors import ControllerError, EpisodeError, OutputError, PatternError, SimulatorError
 from roadproof.patterns import Pattern, raster
 from roadproof.roads.maps import builtin_map_file
 from roadproof.scenarios import find_scenario, identity
@@ -361,12 +361,41 @@ def test_a_simulator_of_ones_own_with_other_settings_makes_other_drives(street, 
             ControllerError,
             r"act raised ZeroDivisionError at \S*bad_drivers\.py:\d+",
         ),
+        (
+            bad_drivers.FailingFunction,
+            ControllerError,
+            r"the driver raised ZeroDivisionError at \S*bad_drivers\.py:\d+",
+        ),
     ],
 )
 def test_what_fails_in_a_process_is_one_line_here(street, tmp_path, driver, error, message):
     with pytest.raises(error, match=message) as told:
         evaluate(TownSimulator, driver(), street, MAGENTA, folder=tmp_path, weathers=WEATHERS, runs=0, processes=2)
     assert "\n" not in str(told.value)
+
+
+def test_a_simulator_that_cannot_travel_is_one_line_before_anything_is_driven(street, tmp_path):
+    asked = {"folder": tmp_path / "drives", "weathers": WEATHERS, "runs": 0, "processes": 2}
+    with pytest.raises(SimulatorError, match=r"opens a simulator .* cannot travel there: .*; give a function of"):
+        evaluate(lambda: TownSimulator(), PaintShy(), street, MAGENTA, **asked)
+    assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_a_plan_of_starts_draws_as_its_range_does():
+    assert StartPlan(count=3, right_m=0.2).draw(3, 1) == StartRange(right_m=0.2).draw(3, 1)
+
+
+def test_no_trials_stand_beside_another_paint(town, street, tmp_path, monkeypatch):
+    asked = {"folder": tmp_path, "weathers": WEATHERS[:1], "starts": 0, "runs": 0}
+    evaluate(town, PaintShy(), street, MAGENTA, **asked)
+
+    def full(*_):
+        raise OutputError("No space left")
+
+    monkeypatch.setattr("roadproof.driving.evaluation.write_atomically", full)
+    with pytest.raises(OutputError):
+        evaluate(town, PaintShy(), street, magenta(100.0), **asked)
+    assert not (tmp_path / "evaluation.json").exists()
 
 
 def test_a_pattern_that_paints_nothing_is_refused(town, street, tmp_path):

@@ -79,9 +79,17 @@ def test_in_a_bend_the_passage_is_measured_along_the_drive():
     assert 20.0 * (angle[seen.stop - 1] - np.pi / 2) == pytest.approx(4.0, abs=0.16)
 
 
-def test_a_drive_that_ends_before_the_canvas_has_its_end_as_passage():
-    seen = deviation.passage(line(count=11), CanvasPlacement(x_m=300.0, y_m=0.0))
-    assert seen.stop == 11
+def test_a_drive_that_ends_before_the_canvas_has_as_passage_what_sees_it_and_at_least_its_end():
+    seen = deviation.passage(line(count=121), CanvasPlacement(x_m=85.0, y_m=0.0, length_m=10.0))
+    assert (line(count=121)[seen][[0, -1], 0] == (55.0, 60.0)).all()
+    assert deviation.passage(line(count=11), CanvasPlacement(x_m=300.0, y_m=0.0)) == slice(10, 11)
+
+
+@pytest.mark.parametrize("creeps_m", [0.0, 0.035])
+def test_a_car_that_stands_before_the_canvas_has_not_come_to_it(creeps_m):
+    back = np.column_stack([np.linspace(0.0, -creeps_m, 50), np.zeros(50)])
+    assert not deviation.sees_canvas(back, CanvasPlacement(x_m=13.0, y_m=0.0))
+    assert deviation.sees_canvas(line(count=3), CanvasPlacement(x_m=13.0, y_m=0.0))
 
 
 def test_lateral_offsets_are_left_positive_and_reach_beyond_the_ends():

@@ -247,7 +247,7 @@ def test_what_a_driver_gets_wrong_is_named(town):
         rollout(town, Large(), SHORT)
     with pytest.raises(ControllerError, match=r"act failed at .*test_rollout\.py:\d+: control steer is nan"):
         rollout(town, Straight(float("nan")), SHORT)
-    with pytest.raises(SimulatorError, match="control steer is nan"):
+    with pytest.raises(ControllerError, match=r"the driver failed at .*test_rollout\.py:\d+: control steer is nan"):
         rollout(town, lambda _: lambda _: Control(float("nan")), SHORT)
     with pytest.raises(ControllerError, match=r"answered 0\.5, expected a roadproof"):
         rollout(town, lambda _: lambda _: 0.5, SHORT)

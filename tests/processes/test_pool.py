@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from roadproof.errors import ControllerError, OutputError, TrainingError
+from roadproof.errors import ControllerError, OutputError, SimulatorError, TrainingError
 from roadproof.processes import Pool, spread, stopping
 from roadproof.processes.pool import _Left
 
@@ -236,6 +236,22 @@ class Lost:
 
     def __reduce__(self):
         return int, ("none",)
+
+
+class ToldTwiceError(Exception):
+    """It cannot be made again from its message alone."""
+
+    def __init__(self, what, where):
+        super().__init__(f"{what} in {where}")
+
+
+def raises(inside, number):
+    raise ToldTwiceError("no grip", "the bend")
+
+
+def test_an_exception_that_cannot_travel_back_is_told_all_the_same():
+    with pytest.raises(SimulatorError, match=r"a process raised ToldTwiceError.*: no grip in the bend"):
+        list(spread(raises, [1, 2], nullcontext, processes=2))
 
 
 def test_processes_stay_open_from_one_round_of_work_to_the_next(tmp_path):

@@ -201,6 +201,16 @@ class FailingInWorkers(Honest):
         return 1 / 0
 
 
+class FailingFunction:
+    """A driver that is a function; its policy fails in processes beside the first."""
+
+    def __call__(self, simulator):
+        return self.policy
+
+    def policy(self, seen):
+        return Control(0.0, throttle=1 / (multiprocessing.parent_process() is None))
+
+
 class DyingInWorkers(FailingInWorkers):
     def fail(self):
         os._exit(3)

@@ -13,7 +13,6 @@ What counts as reached is the least deviation over small errors, so that a drive
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -145,8 +144,8 @@ def cheapest(
         groups: the groups of drives of the search before.
         objective: objective of the search before if it drove in the recorded world; `PathDeviation()` by default.
         device: torch device on which the search computes.
-        checkpoints: folder that keeps every search on the way, so that an interrupted one goes on; it is removed at the
-            end. None keeps nothing.
+        checkpoints: folder that keeps every search on the way, so that an interrupted one goes on; whoever gave it
+            removes it when the result is kept. None keeps nothing.
         on_level: called after every limit of the area with the number of limits tried and the least area so far, m².
 
     Returns:
@@ -184,20 +183,19 @@ def cheapest(
         while (fewer := run.without_a_figure()) is not None:
             run, level = fewer, fewer.level()
             levels.append(level)
-        on_level(number, levels[-1].area_m2)
         kept = None if checkpoints is None else checkpoints / f"{number}.safetensors"
+        before = len(levels)
         for lower in run.below(levels[-1].area_m2 * factor, kept):
             level = lower.level()
             if level.predicted_m >= wanted_m:
                 run = lower
                 levels.append(level)
                 break
-        else:
+        on_level(number, levels[-1].area_m2)
+        if len(levels) == before:
             if factor >= _SMALLEST_STEP:
                 break
             factor = factor**0.5
-    if checkpoints is not None:
-        shutil.rmtree(checkpoints, ignore_errors=True)
     pattern = run.pattern
     return Cheapest(
         pattern=pattern,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -212,10 +213,12 @@ def _less_paint(
         )
     say(cheapest_in_words(less, wanted_m))
     if less is None:
+        shutil.rmtree(folder / "search", ignore_errors=True)
         for name in ("cheapest.json", "pattern.json", "pattern.png"):  # of another deviation, asked for before
             (folder / name).unlink(missing_ok=True)
         return None
     less.save(folder)
+    shutil.rmtree(folder / "search", ignore_errors=True)
     return stored(folder / "cheapest.json")
 
 

@@ -36,7 +36,8 @@ PAST_END_M = 2.0
 def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZON_M) -> slice:
     """The instants at which a clean drive has the canvas in view: from `horizon_m` before it to its end.
 
-    Distances are driven ones, measured from where the drive comes closest to the canvas' middle, so bends do no harm.
+    Distances are driven ones, measured from where the drive comes closest to the canvas' middle, so bends do no harm;
+    from the end of one that stops short of it, the way that is left counts straight on.
 
     Args:
         clean: path of the drive without paint: world x, y of its positions, metres, (n, 2).
@@ -48,10 +49,12 @@ def passage(clean: Path2D, canvas: CanvasPlacement, *, horizon_m: float = HORIZO
     """
     _check_path(clean, "clean")
     driven_m = np.concatenate([[0.0], np.hypot(*np.diff(clean, axis=0).T).cumsum()])
-    middle_m = driven_m[np.hypot(clean[:, 0] - canvas.x_m, clean[:, 1] - canvas.y_m).argmin()]
-    half_m = canvas.length_m / 2
+    nearest = int(np.hypot(clean[:, 0] - canvas.x_m, clean[:, 1] - canvas.y_m).argmin())
+    middle_m, half_m = driven_m[nearest], canvas.length_m / 2
+    if nearest == len(clean) - 1:
+        middle_m += max(0.0, -canvas.ahead_m(float(clean[-1, 0]), float(clean[-1, 1])))
     seen = np.flatnonzero((driven_m >= middle_m - half_m - horizon_m) & (driven_m <= middle_m + half_m))
-    return slice(int(seen[0]), int(seen[-1]) + 1)
+    return slice(int(seen[0]), int(seen[-1]) + 1) if len(seen) else slice(nearest, nearest + 1)
 
 
 def canvas_missed(scenario: str) -> EpisodeError:
@@ -63,8 +66,13 @@ def canvas_missed(scenario: str) -> EpisodeError:
 
 
 def sees_canvas(clean: Path2D, canvas: CanvasPlacement) -> bool:
-    """Whether a drive came so near to the canvas that a driver begins to see what is painted on it."""
+    """Whether a drive came so near to the canvas that a driver begins to see what is painted on it.
+
+    One that never got `END_M` from its start did not come anywhere: a car that stands creeps, in no direction.
+    """
     _check_path(clean, "clean")
+    if np.hypot(*(clean - clean[0]).T).max() < END_M:
+        return False
     nearest_m = np.hypot(clean[:, 0] - canvas.x_m, clean[:, 1] - canvas.y_m).min()
     return bool(nearest_m <= HORIZON_M + canvas.length_m / 2)
 

@@ -20,7 +20,7 @@ from roadproof.driving.trial import Trial
 from roadproof.errors import EpisodeError, PatternError
 from roadproof.io.files import AnyPath, as_path
 from roadproof.io.tables import each_once
-from roadproof.limits import check_seed
+from roadproof.limits import check_seed, is_whole
 from roadproof.patterns import Pattern, raster
 from roadproof.processes import Pool, here_or_beside, require_picklable
 from roadproof.scenarios import Scenario
@@ -125,10 +125,11 @@ def evaluate(
 def _check_numbers(
     weathers: Sequence[Weather], starts: int, runs: int, cars: int, pedestrians: int, processes: int
 ) -> None:
-    if not weathers or min(starts, runs, cars, pedestrians) < 0 or processes < 1:
+    numbers = (starts, runs, cars, pedestrians, processes)
+    if not weathers or not all(map(is_whole, numbers)) or min(numbers) < 0 or processes < 1:
         raise EpisodeError(
             f"{len(weathers)} weathers, {starts} starts, {runs} runs, {cars} cars, {pedestrians} pedestrians, "
-            f"{processes} processes; expected at least one weather and process, and nothing below 0"
+            f"{processes} processes; expected whole numbers, at least one weather and process, and nothing below 0"
         )
     each_once(weathers, "weathers", EpisodeError)
     if runs and not cars + pedestrians:

@@ -26,7 +26,7 @@ from roadproof.driving.intervals import Estimate, mean_95
 from roadproof.driving.starts import NOMINAL, USUAL_STARTS, StartRange
 from roadproof.driving.trial import Trial, runs_of
 from roadproof.errors import EpisodeError, RoadproofError
-from roadproof.io.files import AnyPath, as_path, is_plain_name, write_atomically
+from roadproof.io.files import AnyPath, as_path, is_plain_name, remove, write_atomically
 from roadproof.io.html import table
 from roadproof.io.records import Form, RecordFile
 from roadproof.patterns import read_paint
@@ -184,6 +184,8 @@ class Evaluation:
             ScenarioError: the scenario's map cannot be written beside it.
         """
         folder = as_path(folder)
+        # First, so that no trials stand beside another scenario or paint.
+        remove(folder / "evaluation.json")
         _save_scenario(self.scenario, folder)
         picture = Image.fromarray(paint)
         write_atomically(folder / "paint.png", lambda part: picture.save(part, format="PNG"))

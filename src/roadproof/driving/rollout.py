@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from functools import partial
 from inspect import signature
 from itertools import chain, count
 from typing import TypeAlias, TypeVar
 
 import numpy as np
 
+from roadproof import foreign
 from roadproof.controllers import Controller
 from roadproof.controllers.asking import next_act_of, require_size
 from roadproof.datatypes import Control, Ending, Observation, Weather
@@ -255,8 +257,14 @@ def look_again(
 
 
 def policy_of(driver: Controller | Driver[SimulatorT], simulator: SimulatorT) -> Policy:
-    """The policy of a driver for a drive that has just begun."""
-    return _acting(driver) if isinstance(driver, Controller) else driver(simulator)
+    """The policy of a driver for a drive that has just begun.
+
+    Raises:
+        ControllerError: the driver raises, now or later.
+    """
+    if isinstance(driver, Controller):
+        return _acting(driver)
+    return partial(foreign.call, "the driver", foreign.call("the driver", driver, simulator))
 
 
 def _acting(controller: Controller) -> Policy:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class StartRange:
             EpisodeError: the seed is out of range.
         """
         check_seed(seed, "seed", EpisodeError)
-        low, high = np.array([-self.right_m, -self.turned_rad, 0.0]), np.array(list(asdict(self).values()))
+        low, high = (-self.right_m, -self.turned_rad, 0.0), (self.right_m, self.turned_rad, self.faster_mps)
         drawn = np.random.default_rng((seed, 0x57A27)).uniform(low, high, (count, 3)).round(4)
         return tuple(StartOffset(right_m=r, turned_rad=t, faster_mps=f) for r, t, f in drawn.tolist())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -211,6 +212,7 @@ class Stages:
                 write_json(none, {"format": _NONE[0], "version": _NONE[1], "made_of": made_of})
                 return None
             less.save(folder, made_of)
+            shutil.rmtree(folder / "search", ignore_errors=True)
         driven = select_by_driving(
             self.simulator,
             self.controller,

@@ -22,10 +22,14 @@ from typing import Any, Generic, TypeAlias, TypeVar, cast
 import torch
 
 from roadproof.errors import OutputError, RoadproofError, SimulatorError
+from roadproof.foreign import in_one_line, place_of
 from roadproof.processes.fresh import processes_beside, remove_if_orphaned
-from roadproof.processes.travel import arrived, pickled, travelling
+from roadproof.processes.travel import arrived, pickled, require_opens_travels, travelling
 
-_DIED = "a driving process died; is there memory for all of them? try with fewer processes"
+_DIED = (
+    "a driving process died; is there memory for all of them? try with fewer processes; a script that makes some needs "
+    "`if __name__ == '__main__':` before what it does"
+)
 """What is said of one that did not even raise an exception."""
 
 Inside = TypeVar("Inside")
@@ -61,6 +65,7 @@ class Pool(Generic[Inside]):
 
     def __enter__(self) -> Pool[Inside]:
         if self.processes > 1:
+            require_opens_travels(self._opens)
             # Never more than here: a controller's last digits depend on how many threads compute them.
             threads = max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // self.processes))
             self._stop = multiprocessing.get_context("spawn").Event()
@@ -267,4 +272,18 @@ def _inside() -> Any:  # noqa: ANN401  # whatever the process works in
 
 
 def _call(travelled: bytes | Path, work: object) -> bytes:
-    return pickled(arrived(travelled)(_inside(), work))
+    try:
+        return pickled(arrived(travelled)(_inside(), work))
+    except Exception as error:
+        if _travels(error):
+            raise
+        # Nobody would hear of it: the process that should read it dies of it.
+        raise SimulatorError(f"a process raised {in_one_line(error, place_of(error))}") from None
+
+
+def _travels(error: Exception) -> bool:
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301  # our own
+    except Exception:  # of an author's own kind
+        return False
+    return True

@@ -12,7 +12,7 @@ from typing import Any, cast
 import torch
 
 from roadproof import foreign
-from roadproof.errors import ControllerError
+from roadproof.errors import ControllerError, SimulatorError
 
 _PICKLED = "several processes need a controller that can be pickled: define its class in a module, or use one process"
 
@@ -27,6 +27,21 @@ def require_picklable(driver: object) -> None:
         foreign.call("pickling the controller", pickle.dumps, driver)
     except ControllerError as error:
         raise ControllerError(f"{error}; {_PICKLED}") from error.__cause__
+
+
+def require_opens_travels(opens: object) -> None:
+    """Refuse what opens a simulator for each process beside this one, where it cannot travel there.
+
+    Raises:
+        SimulatorError: it cannot be pickled; the message says why and what to do.
+    """
+    try:
+        pickle.dumps(opens)
+    except Exception as error:  # of whatever a user's function holds
+        raise SimulatorError(
+            f"what opens a simulator for each process cannot travel there: {foreign.in_one_line(error)}; give a "
+            "function of a module, or functools.partial of one"
+        ) from error
 
 
 class _Processor(pickle.Pickler):
