@@ -19,6 +19,7 @@ from roadproof.paint import PaintLimits
 from roadproof.pipeline.budget import BUDGETS, Budget
 from roadproof.pipeline.fidelity import Fidelity
 from roadproof.pipeline.film import Strip
+from roadproof.pipeline.limit_costs import LimitCosts, Unlimited
 from roadproof.pipeline.selection import Selection
 from roadproof.pipeline.stress_test import STAGES, StressTest, stress_test
 from roadproof.recordings import load_recordings
@@ -126,6 +127,21 @@ def test_limits_on_paint_are_told_by_what_each_costs(town, few_pictures, tmp_pat
     assert f"{costs.predicted_cost_m(without_area):+.2f}</td>" in page
     told = json.loads((folder / "result.json").read_text())["limits"]["searches"]
     assert [each["driven_m"] for each in told] == [each.driven_m for each in costs.searches]
+
+
+def test_limit_costs_in_a_file_that_is_none_are_named(tmp_path):
+    one = Unlimited(without="", predicted_m=1.0, predicted_range_m=(0.9, 1.1), conspicuousness=None)
+    costs = LimitCosts(searches=(one, dataclasses.replace(one, without="area")))
+    costs.save(tmp_path)
+    assert LimitCosts.load(tmp_path) == costs
+    assert costs.sentences == ("Without the limit on area: predicted 1.00 m, +0.00 m",)
+    path = tmp_path / "limits.json"
+    content = json.loads(path.read_text())
+    content["searches"][1]["driven_m"] = 2.0
+    for searches in ([], content["searches"]):
+        path.write_text(json.dumps(content | {"searches": searches}))
+        with pytest.raises(RoadproofError, match=r"limits\.json .*expected one or more, and all driven or"):
+            LimitCosts.load(tmp_path)
 
 
 @pytest.mark.parametrize(

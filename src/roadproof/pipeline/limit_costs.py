@@ -69,9 +69,19 @@ class LimitCosts:
 
     Args:
         searches: what was found with all limits, then without each, then without any.
+
+    Raises:
+        RoadproofError: there are no searches, or some patterns alone were driven over.
     """
 
     searches: tuple[Unlimited, ...]
+
+    def __post_init__(self) -> None:
+        driven = sum(each.driven_m is not None for each in self.searches)
+        if not self.searches or driven not in (0, len(self.searches)):
+            raise RoadproofError(
+                f"{len(self.searches)} searches, {driven} of them driven over; expected one or more, and all driven or none"
+            )
 
     @staticmethod
     def of(found: AttackResult, searched: Mapping[str, AttackResult]) -> LimitCosts:
