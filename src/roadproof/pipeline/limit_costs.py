@@ -80,7 +80,7 @@ class LimitCosts:
         driven = sum(each.driven_m is not None for each in self.searches)
         if not self.searches or driven not in (0, len(self.searches)):
             raise RoadproofError(
-                f"{len(self.searches)} searches, {driven} of them driven over; expected one or more, and all driven or none"
+                f"{len(self.searches)} searches, {driven} driven over; expected one or more, and all driven or none"
             )
 
     @staticmethod
