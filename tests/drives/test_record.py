@@ -11,7 +11,7 @@ from paint_shy import PaintShy
 from roadproof.datatypes import Control, Event, EventKind, Weather
 from roadproof.drives import Drives, Swerve, Trajectories, Window, record, record_along
 from roadproof.drives.folder import read_settings, require_same_map, write_settings
-from roadproof.errors import OutputError, RecordingError, RoadproofError, ScenarioError
+from roadproof.errors import ControllerError, OutputError, RecordingError, RoadproofError, ScenarioError
 from roadproof.geometry import CIL_CAMERA, homography_from_pose
 from roadproof.homographies import apply_homography
 from roadproof.recordings import Side
@@ -160,9 +160,7 @@ def test_a_driver_that_never_sees_the_canvas_is_refused(town):
 
 
 def test_a_driver_that_answers_nan_is_refused(town):
-    from roadproof.errors import SimulatorError
-
-    with pytest.raises(SimulatorError, match="control steer is nan"):
+    with pytest.raises(ControllerError, match=r"the driver failed at .*test_record\.py:\d+: control steer is nan"):
         record(town, lambda _: lambda _: Control(float("nan")), LEFT)
 
 

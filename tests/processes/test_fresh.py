@@ -73,6 +73,7 @@ def test_ctrl_c_while_one_begins_comes_when_it_has_begun(monkeypatch):
     starts = threading.Thread.start
 
     def interrupted(thread):
+        monkeypatch.undo()  # the one that minds the processes alone: it begins another itself
         os.kill(os.getpid(), signal.SIGINT)
         starts(thread)
 
@@ -80,7 +81,6 @@ def test_ctrl_c_while_one_begins_comes_when_it_has_begun(monkeypatch):
         monkeypatch.setattr(threading.Thread, "start", interrupted)
         with pytest.raises(KeyboardInterrupt):
             pool.submit(sum, [1, 2])
-        monkeypatch.undo()
         assert pool.submit(sum, [3, 4]).result() == 7
 
 
