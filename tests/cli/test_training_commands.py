@@ -37,8 +37,8 @@ def test_without_the_large_weights_cards_are_shown_with_what_to_install(invoke, 
     monkeypatch.setitem(sys.modules, "roadproof_cil", None)
     code, printed = invoke("controllers")
     assert code == 0, printed.err
-    assert printed.out.count("not installed  ") == 2
-    assert "The weights of cil and cil-small are not installed: pip install 'roadproof[cil]'" in printed.out
+    assert printed.out.count("not installed  ") == 3
+    assert "The weights of cil, cil-hardened, cil-small are not installed: pip install 'roadproof[cil]'" in printed.out
     code, printed = invoke("controllers", "cil")
     assert code == 0
     assert " ".join(model_card("cil").cannot.split()) in " ".join(printed.out.split())

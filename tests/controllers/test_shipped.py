@@ -11,6 +11,8 @@ from roadproof.controllers import check_controller, load_controller, model_card,
 from roadproof.controllers.shipped import FOLDER, installed_weights, shipped_weights
 from roadproof.errors import ControllerError
 
+LARGE = ["cil", "cil-hardened", "cil-small"]
+
 
 @pytest.fixture
 def without_large(monkeypatch):
@@ -39,11 +41,11 @@ def test_what_is_shipped_is_small():
 
 
 def test_without_the_large_weights_the_small_ones_load(without_large):
-    assert [name for name in shipped_names() if installed_weights(name) is None] == ["cil", "cil-small"]
+    assert [name for name in shipped_names() if installed_weights(name) is None] == LARGE
     assert load_controller("pilotnet").input_size
 
 
-@pytest.mark.parametrize("name", ["cil", "cil-small"])
+@pytest.mark.parametrize("name", LARGE)
 def test_without_the_large_weights_their_controllers_have_cards_and_say_what_to_install(without_large, name):
     assert name in shipped_names()
     assert model_card(name).name == name

@@ -1,1 +1,1 @@
-"""The weights of roadproof's controllers `cil` and `cil-small`: two files, and no code."""
+"""The weights of roadproof's controllers `cil`, `cil-small` and `cil-hardened`: files, and no code."""

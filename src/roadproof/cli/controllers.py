@@ -31,7 +31,7 @@ def controllers(
         say(shown, wrapped=True)
     else:
         _show(cards[0])
-    if absent := " and ".join(card.name for card, size in zip(cards, megabytes, strict=True) if size is None):
+    if absent := ", ".join(card.name for card, size in zip(cards, megabytes, strict=True) if size is None):
         say(f"\nThe weights of {absent} are not installed: {INSTALL}")
     answer({"controllers": [asdict(card) | {"megabytes": size} for card, size in zip(cards, megabytes, strict=True)]})
 
